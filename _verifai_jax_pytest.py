@@ -88,7 +88,7 @@ class SpecFile(pytest.File):
         from verifai_jax.core.targets import TargetError
 
         if isinstance(excinfo.value, TargetError):
-            return str(excinfo.value)
+            return _clean(str(excinfo.value))
         return super().repr_failure(excinfo)
 
 
@@ -158,6 +158,30 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, Any, Any]
             _tell(pyfuncitem, now)
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, Any, pytest.TestReport]:
+    """Write what files, problems and simulators say as the command line does, for a terminal."""
+    report = yield
+    marked = getattr(getattr(item, "obj", None), _MARK, None) is not None
+    if not marked and not isinstance(item, ProblemItem):
+        return report
+    # A skip is a triple, which pytest has made of its own texts.
+    if report.longrepr is not None and not isinstance(report.longrepr, tuple):
+        text = str(report.longrepr)
+        report.longrepr = report.longrepr if _clean(text) == text else _clean(text)
+    report.user_properties = [
+        (name, _clean(value) if isinstance(value, str) else value)
+        for name, value in report.user_properties
+    ]
+    return report
+
+
+def _clean(text: str) -> str:
+    from verifai_jax.core.text import printable
+
+    return printable(text)
+
+
 def _session(item: pytest.Item) -> Any:
     from verifai_jax.checking import Session
 
@@ -183,7 +207,7 @@ def _failure(item: pytest.Item, found: Any, target: str | None) -> str:
     if outcome.replayed is not None:
         files += [str(one.path) for one in outcome.replayed.failing]
     if target is not None and files:
-        again = f"verifai-jax replay-counterexamples {target} {files[0]}"
+        again = shlex.join(["verifai-jax", "replay-counterexamples", target, files[0]])
     else:
         words = ["pytest", item.nodeid]
         if not files:

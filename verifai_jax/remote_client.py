@@ -407,15 +407,24 @@ def plain(text: object) -> str:
 
 def answer(point: Mapping[str, Any], simulate: Callable[[dict[str, Any], int], Any]) -> bytes:
     """Simulate one point of a `work` message, and return the frame to send back."""
+    owner = os.getpid()
     try:
         return encoded(point["id"], simulate(features_of(point["features"]), point["seed"]))
-    except Exception as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # sys.exit() in a simulator is its failure, not our end.
         return _framed({"type": "result", "id": point["id"], "error": described(error)})
+    finally:
+        if os.getpid() != owner:
+            os._exit(1)  # A forked copy of this process: its parent answers.
 
 
 def described(error: BaseException) -> str:
     """Write an error in one line, with the line of the simulator where it arose."""
-    words = " ".join(str(error).split())
+    try:
+        words = " ".join(str(error)[:3000].split())
+    except Exception:  # `__str__` is code of the simulator too.
+        words = "its text cannot be written"
     text = f"{type(error).__name__}: {words[:300]}{'...' * (len(words) > 300)}"
     libraries = (os.path.dirname(os.__file__), os.path.dirname(np.__path__[0]), __file__, "<")
     for step in reversed(traceback.extract_tb(error.__traceback__)):
@@ -500,7 +509,7 @@ def address_of(text: str) -> tuple[str, int]:
     **Raises:** `ValueError` for anything else.
     """
     host, _, port = text.rpartition(":")
-    if not host or not port.isdigit():
+    if not host or not port.isdecimal():
         raise ValueError(f"an address is HOST:PORT, such as 127.0.0.1:4567; got {text!r}")
     return host.removeprefix("[").removesuffix("]"), int(port)
 

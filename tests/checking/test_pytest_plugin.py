@@ -93,6 +93,22 @@ def test_a_failure_is_kept_replayed_first_and_fixed(project):
 
 
 @pytest.mark.thorough
+def test_what_steers_a_terminal_is_written_out(project):
+    project.makeini(SETTINGS)
+    write(project, 0.6)
+    corpus = project.path / "counterexamples"
+    corpus.mkdir()
+    (corpus / "evil\x1b[2J.json").write_text("{")
+    (project.path / "specs" / "broken.py").write_text('raise ValueError("\\x1b[2J\\u202e")\n')
+    result = run(project, "--junitxml", "report.xml", "-rA", "--continue-on-collection-errors")
+    text = result.stdout.str()
+    assert "evil\\x1b[2J.json" in text
+    assert "\x1b[2J" not in text
+    assert "\u202e" not in text
+    ElementTree.parse(project.path / "report.xml")
+
+
+@pytest.mark.thorough
 def test_a_decorated_function_with_fixtures_and_a_probability(project):
     write(project, 0.8)
     project.makepyfile(

@@ -106,3 +106,71 @@ def test_frames_with_missing_values_have_gaps():
     np.testing.assert_array_equal(trace["n"], [1, np.nan, 3])
     np.testing.assert_array_equal(trace["o"], [1, np.nan, 2.5])
     assert Trace({"x": HIDDEN}, dt=1.0).status in (None, Status.OK)
+
+
+def test_a_masked_feature_is_refused():
+    problem = vj.Problem("masked", {"a": vj.Box(0, 1)}, vj.blackbox(masked), "always x <= 1.9")
+    with unchecked(), pytest.raises(ValueError, match="a must be a number; got one that is masked"):
+        vj.simulate(problem, {"a": np.ma.masked_array(0.5, mask=True)}, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"valid": 2.5}, "valid must be how many samples count, from 1 to 3; got 2.5"),
+        ({"valid": "2"}, "valid must be .*; got '2'"),
+        ({"valid": True}, "valid must be .*; got True"),
+        ({"valid": [2]}, r"valid must be .*; got \[2\]"),
+        ({"valid": np.float64(2)}, "valid must be .*; got np.float64"),
+        ({"status": "ok"}, "status must be one of 0 .*; got 'ok'"),
+        ({"status": 0.5}, "status must be one of 0 .*; got 0.5"),
+        ({"dt": "fast"}, "the sampling period dt must be a number of seconds; got 'fast'"),
+        ({"dt": 1j}, "the sampling period dt must be a number"),
+        ({"dt": np.array([0.1])}, "the sampling period dt must be a number"),
+        ({"times": ["a", "b", "c"]}, "sample times must be numbers of seconds; got <U1"),
+        ({"times": np.array([0, 1, 2]) * 1j}, "sample times must be numbers of seconds"),
+        ({"times": np.arange(3).astype("M8[s]")}, "numbers of seconds; got datetime64.* since the"),
+        ({"times": np.array([0, None, 2])}, "that of sample 1 is masked or missing"),
+        ({"signals": {"x": ["a", "b", "c"]}}, "signal 'x' must hold real numbers; got <U1"),
+        ({"signals": {"x": np.zeros(3, "M8[s]")}}, "'x' must hold real numbers; got datetime64"),
+        ({"signals": {"x": [[1, 2], [3], [4]]}}, "'x' must be .*its rows have several lengths"),
+        ({"signals": {"\ud800": np.zeros(3)}}, "the name of a signal must be a text that UTF-8"),
+        ({"signals": {3: np.zeros(3)}}, "the name of a signal must be a text .*; got 3"),
+        ({"signals": [1, 2, 3]}, "signals must be a dictionary of arrays by name; got list"),
+    ],
+)
+def test_what_a_trace_cannot_be_made_of_is_said(options, told):
+    usual = {"signals": {"x": np.zeros(3)}} | (
+        {} if {"dt", "times"} & options.keys() else {"dt": 1}
+    )
+    with unchecked(), pytest.raises((TypeError, ValueError), match=told):
+        Trace(**(usual | options))
+
+
+def test_small_integers_do_not_wrap():
+    stamps = np.array([-128, 0, 127], np.int8)
+    with unchecked():
+        trace = Trace({"x": [1, 2**70, 3]}, times=stamps)
+        assert trace.clock().tolist() == [-128, 0, 127]
+        assert np.asarray(resample(trace, 1.0, "hold")["x"]).shape == (256,)
+        assert trace["x"].dtype == float
+        assert Trace({"x": np.zeros(2)}, dt=np.array(0.5)).dt == 0.5
+
+
+def test_names_that_utf8_cannot_hold_are_refused():
+    for make in (
+        lambda: vj.FeatureSpace({"\udc80": vj.Box(0, 1)}),
+        lambda: vj.Categorical("a", "\ud800"),
+        lambda: vj.Problem("\ud800", {"a": vj.Box(0, 1)}, masked, "always x > 0"),
+        lambda: vj.Problem("p", {"a": vj.Box(0, 1)}, masked, {"\ud800": "always x > 0"}),
+    ):
+        with pytest.raises(ValueError, match=r"must be a text that UTF-8 can hold; '.*surrogate"):
+            make()
+
+
+def test_columns_and_encodings_of_recordings(tmp_path):
+    (tmp_path / "odd.csv").write_text("time,p[²],p[0]\n0,1,2\n1,3,4\n")
+    assert read(tmp_path / "odd.csv")["p[²]"].tolist() == [1, 3]
+    (tmp_path / "latin.csv").write_bytes("time,größe\n0,1\n1,2\n".encode("latin-1"))
+    with pytest.raises(ValueError, match=r"latin\.csv cannot be read: .*UTF-8"):
+        read(tmp_path / "latin.csv")

@@ -322,3 +322,33 @@ def test_what_failed_is_raised_when_what_ended_has_been_reported():
     threading.Timer(0.05, late.set_result, [2]).start()
     gather([late], lambda place, result: seen.append((place, result)))
     assert seen[-1] == (0, 2)
+
+
+class Confused(ThreadPoolExecutor):
+    """Gives the answers of the first two calls in each other's place."""
+
+    def __init__(self):
+        super().__init__(1)
+        self.first = None
+
+    def submit(self, function, /, *arguments):
+        future = Future()
+        result = function(*arguments)
+        if self.first is None:
+            self.first = future, result
+            return future
+        if self.first != ():
+            (earlier, other), self.first = self.first, ()
+            earlier.set_result(result)
+            result = other
+        future.set_result(result)
+        return future
+
+
+@pytest.mark.thorough
+def test_an_answer_to_another_call_is_dropped_and_asked_again():
+    options = {"search": "uniform", "budget": 64, "batch": 64, "confirm": False, "progress": False}
+    alone = vj.falsify(DECAY, **options)
+    run = vj.falsify(DECAY, executor=Confused(), **options)
+    assert run.table.all.equals(alone.table.all)
+    assert "2 answers of workers belonged to other calls and were dropped" in run.notes

@@ -3,6 +3,7 @@
 import json
 import random
 import shutil
+import warnings
 
 import jax.numpy as jnp
 import numpy as np
@@ -131,13 +132,23 @@ def change(folder, other, chance):
         change_bytes(path, chance)
 
 
+def all_rows(table):
+    """Return the rows of a table, which warns where it is damaged."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        rows = table.all
+    told = [str(each.message) for each in caught]
+    assert told == ([f"the error table is damaged: {table.damage}"] if table.damage else [])
+    return rows
+
+
 def check(folder, problem, whole):
     """Load and resume a folder: the right rows, or an error in words."""
     try:
         run = vj.load(folder, problem)
     except (ValueError, OSError):  # All others are obscure.
         return
-    rows = run.table.all
+    rows = all_rows(run.table)
     right = whole.reindex(rows.index)
     if not run.damage:
         assert rows.equals(right)
@@ -148,7 +159,7 @@ def check(folder, problem, whole):
         resumed = vj.resume(folder, problem, budget=160)
     except (ValueError, OSError):
         # Whatever was whole is still there.
-        assert vj.load(folder, problem).table.all.equals(rows)
+        assert all_rows(vj.load(folder, problem).table).equals(rows)
         return
     assert not run.damage
     assert resumed.table.all.equals(whole)
@@ -182,14 +193,19 @@ def test_a_folder_that_is_whole_is_resumed(problem, whole, folders, tmp_path, mo
 def test_rows_that_are_not_those_of_the_checkpoint_are_told(problem, folders, tmp_path):
     folder = shutil.copytree(folders / "short", tmp_path / "run")
     frame = pd.read_parquet(folder / FINISHED)
-    frame.loc[40, "rho"] = np.float32(0.125)
+    frame.loc[40, "a"] = np.float32(0.125)
     frame.to_parquet(folder / FINISHED)
     run = vj.load(folder, problem)
     told = "the first 96 rows of the table .* are not those that its search had seen"
-    assert run.table.row(40)["rho"] == 0.125
+    assert run.table.row(40)["a"] == 0.125
     with pytest.raises(ValueError, match=f"cannot go on: {told}.*begin anew, from what it has"):
         vj.resume(folder, problem, budget=160)
-    again = vj.falsify(problem, budget=32, warm_start=run, **OPTIONS)
+    assert run.failure_rate is None
+    said = run.summary()
+    assert said.startswith("ramp: its rows have changed since they were written, so they say noth")
+    assert "violate" not in said
+    with pytest.warns(UserWarning, match=f"the error table is damaged: {told}"):
+        again = vj.falsify(problem, budget=32, warm_start=run, **OPTIONS)
     assert len(again.table) == 32
     # The checkpoint of another run, and the record of another one.
     shutil.copy(folders / "short" / FINISHED, folder / FINISHED)
@@ -197,6 +213,31 @@ def test_rows_that_are_not_those_of_the_checkpoint_are_told(problem, folders, tm
     shutil.copy(folders / "other" / STATE, folder / STATE)
     with pytest.raises(ValueError, match=r"run.json is not the one that search.npz was written"):
         vj.resume(folder, problem, budget=160)
+
+
+@pytest.mark.parametrize(
+    ("column", "values", "told"),
+    [
+        ("violated", None, "its column 'violated' must hold truth values; it holds values of type"),
+        ("rho", "low", "its column 'rho' must hold floating-point numbers; it holds"),
+        ("status", "fine", "its column 'status' must hold ok, nonfinite, .*; it holds 'fine'"),
+        ("rho", np.float32("nan"), "its column 'rho' lacks the robustness of a row that ended"),
+        ("violated", False, "its columns 'violated' and 'rho' contradict each other"),
+        ("a", "left", "its column 'a' must hold numbers; it holds"),
+    ],
+)
+def test_a_column_that_holds_what_it_cannot_is_named(
+    problem, folders, tmp_path, column, values, told
+):
+    folder = shutil.copytree(folders / "short", tmp_path / "run")
+    frame = pd.read_parquet(folder / FINISHED)
+    assert frame["violated"].any()
+    frame[column] = pd.Series([values] * len(frame), index=frame.index)
+    if isinstance(values, np.floating):
+        frame[column] = frame[column].astype(np.float32)
+    frame.to_parquet(folder / FINISHED)
+    with pytest.raises(ValueError, match=f"the table in .*run is damaged: {told}"):
+        vj.load(folder, problem)
 
 
 def test_a_run_is_not_written_over_what_somebody_has_added(problem, whole, folders, tmp_path):

@@ -68,6 +68,14 @@ def test_a_process_that_dies_loses_only_the_batch_in_flight(tmp_path):
     table.close()
 
 
+def damaged_rows(table):
+    """Return the rows of a table that warns where it is damaged."""
+    if not table.damage:
+        return table.all
+    with pytest.warns(UserWarning, match="the error table is damaged: "):
+        return table.all
+
+
 def test_damaged_bytes_cost_rows_and_not_the_process(tmp_path):
     table = ErrorTable(("x", "color"), tmp_path)
     colors = np.array(["red", "blue", "green"] * 4, object)
@@ -84,14 +92,15 @@ def test_damaged_bytes_cost_rows_and_not_the_process(tmp_path):
         (tmp_path / TAIL).write_bytes(damaged)
         # Of four batches one is lost, told unless it is the last, and the others are right.
         read = ErrorTable.load(tmp_path, table.features)
-        gone = next((i for i in range(4) if 12 * i not in read.all.index), None)
+        rows = damaged_rows(read)
+        gone = next((i for i in range(4) if 12 * i not in rows.index), None)
         assert len(read) == 48 if gone is None else len(read) == 36
         if gone is not None and gone < 3:
             assert read.missing == (range(12 * gone, 12 * gone + 12),)
             assert f"rows {12 * gone} to {12 * gone + 11} are missing" in read.damage
         else:
             assert gone is not None or turn % 2 == 0  # Bytes between two batches belong to none.
-        assert read.all.equals(table.all.loc[read.all.index])
+        assert rows.equals(table.all.loc[rows.index])
         with contextlib.suppress(TableError):
             read.resumed(12)
     (tmp_path / TAIL).write_bytes(whole)
@@ -112,7 +121,7 @@ def test_rows_that_are_missing_are_not_numbered_anew(tmp_path, short):
     read = ErrorTable.load(tmp_path, ("x",))
     assert read.missing == (range(4),)
     assert "is damaged: its bytes have changed; rows 0 to 3 are missing" in read.damage
-    assert read.all.equals(whole.loc[4:])
+    assert damaged_rows(read).equals(whole.loc[4:])
     assert len(read) == 6
     assert read.counterexamples.index.tolist() == [6, 9]
     assert (read.row(6)["x"], read.row(9)["x"], read.counts.violating) == (6.0, 9.0, 2)
@@ -121,7 +130,7 @@ def test_rows_that_are_missing_are_not_numbered_anew(tmp_path, short):
     second.unlink()
     read = ErrorTable.load(tmp_path, ("x",))
     assert read.missing == (range(8),)
-    assert read.all.index.tolist() == [8, 9]
+    assert damaged_rows(read).index.tolist() == [8, 9]
     for refused in (read.resumed, read.save):
         with pytest.raises(TableError, match="rows 0 to 7 are missing"):
             refused(tmp_path / "other" if refused == read.save else 9)

@@ -10,7 +10,8 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
-from verifai_jax.fuzzing.implicit import as_recorded, with_implicit
+from verifai_jax.falsification.derived import as_simulated
+from verifai_jax.fuzzing.implicit import with_implicit
 from verifai_jax.problem.behaviour import Behaviour
 from verifai_jax.search import Coverage
 
@@ -211,8 +212,10 @@ def test_the_problem_of_a_recorded_run_has_its_implicit_properties():
     ranges = {"x": (-0.1, 2.5), "n": (0, 3)}
     checked = with_implicit(LEVEL, None, None, ranges, None, "level")
     texts = {name: str(formula) for name, formula in checked.formulas.items()}
-    again = as_recorded(LEVEL, texts)
+    again = as_simulated(LEVEL, {"derived": checked.system.derived})
     assert {name: str(formula) for name, formula in again.formulas.items()} == texts
     assert again.system.ranges == ranges
-    assert as_recorded(LEVEL, {"spec": "always (x < 1.5)"}) is LEVEL
-    assert as_recorded(LEVEL, {"spec": "always (x < 1.5)", "other": "always (x < 2)"}) is LEVEL
+    assert again.behaviour == checked.behaviour
+    assert as_simulated(again, {"derived": checked.system.derived}) is again
+    assert as_simulated(LEVEL, {"derived": None}) is LEVEL
+    assert as_simulated(LEVEL, {"derived": {"ranges": 3}}) is LEVEL

@@ -138,7 +138,7 @@ def test_files_of_another_kind_are_refused(tmp_path):
     torn = tmp_path / "torn.npz"
     layers = (LAYERS[0], (jnp.zeros((3, 2)), jnp.zeros(2)))
     save_policy(Policy(layers, None, None, None, Discrete(2)), torn)
-    with pytest.raises(PolicyFileError, match=r"layers of shapes \[\(2, 2\), \(3, 2\)\]"):
+    with pytest.raises(PolicyFileError, match=r"array 'weight1' has shape \[3, 2\]"):
         load_policy(torn)
 
 
@@ -170,3 +170,53 @@ def test_a_file_says_what_it_was_made_with(tmp_path):
     sources = policy_sources(path)
     assert any(name.endswith("test_policy.py") for name, *_ in sources["files"])
     assert "jax" in sources["versions"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"weight1": None}, "'weight1' is missing"),
+        ({"weight1": None, "bias1": None, "n": 3}, "its network has 2 outputs, and .* need 3"),
+        ({"weight0": np.full((2, 2), np.nan)}, "'weight0' must hold finite floating-point"),
+        ({"weight0": np.array([["a"]])}, "'weight0' must hold finite floating-point"),
+        ({"bias0": np.zeros(0)}, r"'bias0' must have shape \[2\]; got \[0\]"),
+        ({"bias1": np.zeros((2, 1))}, r"'bias1' must have shape \[2\]; got \[2, 1\]"),
+        ({"weight0": np.zeros(2)}, r"'weight0' has shape \[2\]"),
+        ({"n": 10}, "its network has 2 outputs, and its actions need 10"),
+        ({"n": "two"}, "the number n of its actions must be an integer"),
+        ({"n": 2.5}, "the number n of its actions must be an integer"),
+        ({"mean": np.zeros(3), "scale": np.ones(3)}, r"'mean' must have shape \[2\]; got \[3\]"),
+        ({"mean": np.zeros(2)}, "it has only one of the arrays 'mean' and 'scale'"),
+        ({"mean": np.zeros(2), "scale": np.zeros(2)}, "'scale' must hold positive numbers"),
+        ({"weight7": np.zeros((2, 2))}, "it has an array 'weight7', which belongs to no layer"),
+        ({"squash": "yes"}, "its activation must be a text and squash true or false"),
+        ({"activation": 7}, "its activation must be a text"),
+        ({"action": None}, "its action must be an object of kind discrete or continuous"),
+        (
+            {"action": {"kind": "continuous", "low": 0.0, "high": float("inf"), "size": 2}},
+            "high of its action must be a finite",
+        ),
+        (
+            {"action": {"kind": "discrete", "n": 2, "size": 3}},
+            "its action must have n; got n, size",
+        ),
+    ],
+)
+def test_a_damaged_policy_is_named_at_load(tmp_path, changed, told):
+    path = tmp_path / "policy.npz"
+    save_policy(Policy(LAYERS, None, None, None, Discrete(2)), path)
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    about = json.loads(str(arrays.pop("about")))
+    for name, value in changed.items():
+        if name == "n":
+            about["action"]["n"] = value
+        elif name in ("squash", "activation", "action"):
+            about[name] = value
+        elif value is None:
+            del arrays[name]
+        else:
+            arrays[name] = value
+    np.savez(path, about=np.array(json.dumps(about)), **arrays)
+    with pytest.raises(PolicyFileError, match=rf"policy\.npz holds no policy: .*({told})"):
+        load_policy(path)

@@ -87,9 +87,14 @@ class Check:
 
         **Returns:** the outcome.
 
-        **Raises:** as `falsify`.
+        **Raises:** `ValueError` for a corpus that is a file; as `falsify`.
         """
         replayed = None
+        if corpus is not None and Path(corpus).is_file():
+            raise ValueError(
+                f"the corpus must be a folder of saved counterexamples, and {corpus} is a file; "
+                "verifai-jax replay-counterexamples replays a single one"
+            )
         if corpus is not None and Path(corpus).is_dir():
             replayed = replay(problem, corpus, rename=self.rename)
             if not replayed.passed:
@@ -187,7 +192,7 @@ class CheckOutcome:
     def __str__(self) -> str:
         if self.run is None:
             assert self.replayed is not None
-            return (
+            return printable(
                 f"{self.replayed}\n"
                 "  saved counterexamples are replayed first, and not all of these are fixed; "
                 "delete the file of a failure that is accepted"
@@ -196,8 +201,8 @@ class CheckOutcome:
         if self.rate is not None:
             parts.append(f"  {self._probability()}")
         for path in self.saved:
-            parts.append(printable(_describe_saved(path)))
-        return "\n".join(parts)
+            parts.append(_describe_saved(path))
+        return printable("\n".join(parts))
 
     def _probability(self) -> str:
         assert self.rate is not None

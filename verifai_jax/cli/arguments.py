@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import shlex
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -186,7 +187,7 @@ def load_judged_run(folder: Path, target: str | None) -> "Run":
     if len(run.table.failed) == run.simulations:
         raise CommandError(
             f"no simulation of the run in {folder} had a verdict, of {run.simulations:,}; "
-            f"verifai-jax replay {folder} ROW simulates one again",
+            f"verifai-jax replay {shlex.quote(str(folder))} ROW simulates one again",
             BROKEN,
         )
     return run
@@ -194,10 +195,7 @@ def load_judged_run(folder: Path, target: str | None) -> "Run":
 
 def load_run(folder: Path, target: str | None) -> "Run":
     """Load the run in a folder, with the problem named, or else the one that the run records."""
-    from verifai_jax.fuzzing.implicit import as_recorded
-
-    problem = load_problem(target or recorded_target(folder))
-    return read_run(folder, as_recorded(problem, read_record(folder)["formulas"]))
+    return read_run(folder, load_problem(target or recorded_target(folder)))
 
 
 def read_run(folder: Path, problem: "Problem | None" = None) -> "Run":
@@ -240,7 +238,7 @@ def _describe_place(folder: Path, record: str, missing: str) -> str:
         there = f"; in {beside} there are {', '.join(runs)}" if runs else ""
         return f"no run in {folder}: there is no such folder{there}"
     if is_sweep(folder):
-        goes_on = f"verifai-jax sweep --resume {folder} goes on with it"
+        goes_on = f"{resuming('sweep', folder, None, {})} goes on with it"
         return f"no run in {folder}: it is the folder of a sweep; {goes_on}"
     runs = sorted(path.name for path in folder.glob("*") if (path / record).is_file())
     if runs:
@@ -285,6 +283,35 @@ def refuse_with_resume(options: Mapping[str, object], noun: str) -> None:
     for option, value in options.items():
         if value is not None and value != ():
             raise click.UsageError(f"{option} is fixed in the {noun} that --resume goes on with")
+
+
+def target_apart(folder: Path, target: str | None) -> str | None:
+    """Return the target of a run where its folder alone does not name it for a command."""
+    from verifai_jax.core.targets import TargetError, target_of_project
+
+    if target is None:
+        return None
+    try:
+        target_of_project(target, folder, kind="problem", remedy="")
+    except TargetError:
+        return target
+    return None
+
+
+def resuming(command: str, folder: Path, target: str | None, options: Mapping[str, object]) -> str:
+    """Write the command that goes on with a folder, as a shell reads it.
+
+    **Arguments:**
+
+    - `command`: `falsify` or `sweep`.
+    - `target`: that the folder records; it is named where the record alone would not do.
+    - `options`: that the record does not hold, with their values; those that are None are left out.
+    """
+    apart = target_apart(folder, target)
+    words = ["verifai-jax", command, *([] if apart is None else [apart]), "--resume", str(folder)]
+    for option, value in options.items():
+        words += [] if value is None else [option, str(value)]
+    return shlex.join(words)
 
 
 def given_or_next(

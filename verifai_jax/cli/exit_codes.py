@@ -84,16 +84,16 @@ def command_error(error: BaseException, show_traceback: bool = False) -> Command
     A traceback is printed where it is asked for, and where the error is a bug of this package:
     neither a refusal, nor a failure that the package foresees, nor raised by the user's own code.
     """
+    from verifai_jax.core.text import printable
+
     message, code = _told(error)
     if show_traceback or not message:
-        traceback.print_exception(error, file=sys.stderr)
+        sys.stderr.write(printable("".join(traceback.format_exception(error))))
     if not message:
         message = (
             f"{type(error).__name__}: {error}\nThis is a bug of verifai_jax; please report it "
             "with the lines above"
         )
-    from verifai_jax.core.text import printable
-
     return CommandError(printable(message, _MOST_OF_AN_ERROR), code)
 
 

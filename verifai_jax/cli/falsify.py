@@ -1,6 +1,9 @@
 """`verifai-jax falsify specs/cartpole.py:balance --search uniform --budget 20000`."""
 
+import shlex
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
@@ -23,6 +26,8 @@ from verifai_jax.cli.arguments import (
     read_run,
     recorded_target,
     refuse_with_resume,
+    resuming,
+    target_apart,
 )
 from verifai_jax.cli.exit_codes import BROKEN, INTERRUPTED, CommandError
 from verifai_jax.cli.gates import RATE, Gate, check_gate, exceeds, fail_on
@@ -187,7 +192,8 @@ def falsify(
                 target=target,
                 executor=executor,
             )
-    print_run(run, pictures)
+    ends = {"--max-seconds": max_seconds, "--stop-after": stop_after, "--within": within}
+    print_run(run, pictures, {**ends, "--decide": decide, "--cluster": cluster})
     check_run(run, fail_on)
 
 
@@ -212,7 +218,7 @@ def _simulate_shard(
         problem=problem.name, part=str(part), simulations=simulations, budget=budget, folder=place
     )
     click.echo(f"  part         {place}")
-    click.echo(f"  merge        verifai-jax merge {place.parent}/*")
+    click.echo(f"  merge        verifai-jax merge {shlex.quote(str(place.parent))}/*")
 
 
 def _resumed_target(folder: Path) -> str:
@@ -239,8 +245,14 @@ def check_run(run: "Run", asked: Gate | None) -> None:
     check_gate(asked, failed)
 
 
-def print_run(run: "Run", pictures: bool) -> None:
+def print_run(
+    run: "Run", pictures: bool, options: Mapping[str, object] = MappingProxyType({})
+) -> None:
     """Print the summary of a run and how to see more of it.
+
+    **Arguments:**
+
+    - `options`: of the command, which the record does not hold and whoever resumes it gives again.
 
     **Raises:** `CommandError` where no simulation has a verdict.
     """
@@ -248,7 +260,7 @@ def print_run(run: "Run", pictures: bool) -> None:
     give_result(**describe_run(run))
     assert run.folder is not None
     if run.stopped == "interrupted":
-        click.echo(f"  resume       verifai-jax falsify --resume {run.folder}")
+        click.echo(f"  resume       {resuming('falsify', run.folder, run.target, options)}")
     click.echo(f"  table        {run.table_path}")
     if pictures and run.simulations:
         from verifai_jax.plotting import write_run_pictures
@@ -257,7 +269,10 @@ def print_run(run: "Run", pictures: bool) -> None:
             click.echo(f"  picture      {path}")
     failed = run.table.failed
     if len(failed) < run.simulations:
-        click.echo(f"  replay       verifai-jax replay {run.folder} {run.best.name}")
+        words = ["verifai-jax", "replay", str(run.folder), str(run.best.name)]
+        apart = target_apart(run.folder, run.target)
+        words += [] if apart is None else ["--problem", apart]
+        click.echo(f"  replay       {shlex.join(words)}")
         return
     if not run.simulations and run.stopped == "interrupted":
         raise CommandError("interrupted before the first batch was finished", INTERRUPTED)

@@ -78,7 +78,7 @@ def fuzz(
             progress=progress,
             target=target,
         )
-    print_run(run, pictures)
+    print_run(run, pictures, {"--max-seconds": max_seconds, "--stop-after": stop_after})
     parts = [
         {"of": part.where, "kind": part.what, "covered": part.covered, "total": part.total}
         for part in run.coverage.parts

@@ -153,4 +153,5 @@ def describe_run(run: Any) -> dict[str, Any]:
         "folder": run.folder,
         "table": run.table_path,
         "notes": run.notes,
+        "damage": run.damage,
     }

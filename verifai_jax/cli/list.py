@@ -1,5 +1,6 @@
 """`verifai-jax list specs`: the problems and studies there are."""
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -57,7 +58,7 @@ def list_targets(place: str | None) -> None:
     if path.is_dir() and not (shown or broken or inner):
         raise TargetError(f"{path}/ has no Python file with problems")
     for folder in inner:
-        click.echo(f"more in {folder}/: verifai-jax list {folder}")
+        click.echo(f"more in {folder}/: verifai-jax list {shlex.quote(str(folder))}")
     click.echo(f"searches: {', '.join(names())}")
     give_result(targets=listed, searches=names(), broken=broken)
     if broken:

@@ -17,6 +17,7 @@ from verifai_jax.cli.arguments import (
     on_cluster,
     plain_values,
     refuse_with_resume,
+    resuming,
     split_names,
 )
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
@@ -173,7 +174,9 @@ def sweep(
         result.plot(picture)
         click.echo(f"  picture      {picture}")
     if not record.complete:
-        click.echo(f"  resume       verifai-jax sweep --resume {folder}")
+        apart = None if cache == folder else cache
+        more = {"--cache": apart, "--max-seconds": max_seconds, "--cluster": cluster}
+        click.echo(f"  resume       {resuming('sweep', folder, target, more)}")
     elif all(status not in ("trained", "stopped") for status in result.table["status"]):
         raise CommandError("no configuration was trained, so nothing is known of any", BROKEN)
     check_gate(fail_on, {"unsafe": not len(result.safe)})
@@ -228,7 +231,8 @@ def _read_command(place: Path) -> dict[str, Any]:
 def _describe_place(place: Path) -> str:
     """Say what a place without finished work is."""
     if (place / "run.json").is_file():
-        return f": it is the folder of a run; verifai-jax falsify --resume {place} goes on with it"
+        goes_on = resuming("falsify", place, None, {})
+        return f": it is the folder of a run; {goes_on} goes on with it"
     if is_sweep(place):
         return ": its finished work is elsewhere; name it, --cache FOLDER, as when it began"
     if not place.exists():

@@ -72,7 +72,7 @@ def _slurm(parameters: dict[str, str]) -> Any:
     submitit = require("submitit", extra="slurm")
     jobs = int(parameters.pop("jobs", SLURM_JOBS))
     executor = submitit.AutoExecutor(folder="slurm_jobs", cluster="slurm")
-    given: dict[str, Any] = {k: int(v) if v.isdigit() else v for k, v in parameters.items()}
+    given: dict[str, Any] = {k: int(v) if v.isdecimal() else v for k, v in parameters.items()}
     executor.update_parameters(slurm_array_parallelism=jobs, **given)
     executor._max_workers = jobs
     executor.seconds_per_block = SLURM_SECONDS

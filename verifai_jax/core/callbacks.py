@@ -13,6 +13,8 @@ Nothing that a callback does changes a result; what it raises ends the computati
 from collections.abc import Callable, Iterable, Mapping
 from typing import TypeAlias
 
+from verifai_jax.core.locks import returning_once
+
 Values: TypeAlias = Mapping[str, float]
 """Numbers by name."""
 Callback: TypeAlias = Callable[[int, dict[str, float]], object]
@@ -43,4 +45,5 @@ def notify(callbacks: Iterable[Callback], step: int, values: Values) -> None:
     # What is not a number, as the return of no episode, is left out: loggers store it as one.
     known = {name: value for name, value in values.items() if value == value}
     for callback in callbacks:
-        callback(int(step), dict(known))
+        with returning_once():
+            callback(int(step), dict(known))

@@ -17,6 +17,31 @@ def is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
+def check_name(what: str, name: object, *, error: type[ValueError] = ValueError) -> str:
+    """Check a name that tables and files can hold.
+
+    **Arguments:**
+
+    - `what`: what it names, for the message: `the name of a signal`.
+    - `name`: name to check.
+    - `error`: type of the error to raise.
+
+    **Returns:** the name.
+
+    **Raises:** `error` for anything but a text that is not empty and that UTF-8 can hold.
+    """
+    if not isinstance(name, str) or not name:
+        raise error(f"{what} must be a text that is not empty; got {name!r}")
+    try:
+        name.encode()
+    except UnicodeEncodeError as cause:
+        raise error(
+            f"{what} must be a text that UTF-8 can hold; {name!r} has the lone surrogate "
+            f"{cause.object[cause.start]!r}"
+        ) from None
+    return name
+
+
 def check_fraction(
     name: str,
     value: object,

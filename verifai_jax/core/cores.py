@@ -28,7 +28,7 @@ def claim_cores() -> None:
     **Raises:** `ValueError` for a `VERIFAI_JAX_CORES` that is no positive integer.
     """
     wanted = os.environ.get("VERIFAI_JAX_CORES", "").strip()
-    if wanted and (not wanted.isdigit() or int(wanted) < 1):
+    if wanted and (not wanted.isdecimal() or int(wanted) < 1):
         raise ValueError(f"VERIFAI_JAX_CORES must be a positive integer; got {wanted!r}")
     cores = int(wanted) if wanted else available_cores()
     jax = sys.modules.get("jax")

@@ -46,6 +46,21 @@ if hasattr(os, "register_at_fork"):
 
 
 @contextlib.contextmanager
+def returning_once() -> Iterator[None]:
+    """Run code of the user that may fork: only the process that entered goes on behind it.
+
+    A copy of this process that comes back, as where an `exec` fails, ends without a word: it would
+    answer for its parent, and write into the folder of its parent's run.
+    """
+    owner = os.getpid()
+    try:
+        yield
+    finally:
+        if os.getpid() != owner:
+            os._exit(1)
+
+
+@contextlib.contextmanager
 def write_lock(place: Path | None) -> Iterator[None]:
     """Be the only one who writes to a place; None is no place.
 
@@ -108,7 +123,7 @@ def _open(path: str, flags: int) -> int:
 
 def _in_use(place: Path, owner: str) -> str:
     process, _, host = owner.partition(" ")
-    if not (process.isdigit() and host.isprintable()):
+    if not (process.isdecimal() and host.isprintable()):
         who = "another process"
     elif int(process) == os.getpid() and host == socket.gethostname():
         who = f"this process ({process}) already"

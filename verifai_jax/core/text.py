@@ -77,7 +77,7 @@ def _format_value(value: object) -> str:
 
 def format_error(error: BaseException) -> str:
     """Write an exception in one line: its type and the first line of its message, shortened."""
-    first = shorten((str(error).splitlines() or [""])[0], MOST_OF_A_MESSAGE)
+    first = shorten((storable(error).splitlines() or [""])[0], MOST_OF_A_MESSAGE)
     return f"{type(error).__name__}: {first}" if first else type(error).__name__
 
 
@@ -108,6 +108,25 @@ def printable(text: str, most: int | None = None) -> str:
     if text.isascii() and text.isprintable():
         return text
     return "".join(_escaped(each) if _steers(each) else each for each in text)
+
+
+def storable(text: object, most: int = 2000) -> str:
+    r"""Return a text of somebody's code as files and sockets can hold it, of bounded length.
+
+    A lone surrogate, which UTF-8 cannot hold, becomes its escape: `\ud800`.
+
+    **Arguments:**
+
+    - `text`: the text; anything else is written by `str`.
+    - `most`: characters that are kept, of its beginning and its end.
+    """
+    try:
+        written = text if isinstance(text, str) else str(text)
+    except BaseException as error:  # `__str__` is code of the user too, which may raise anything.
+        if isinstance(error, KeyboardInterrupt):
+            raise
+        written = f"({type(text).__name__} whose text cannot be written)"
+    return shorten(written, most).encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def _steers(character: str) -> bool:

@@ -21,6 +21,7 @@ from jax.core import Tracer
 from jax.errors import TracerArrayConversionError
 from jaxtyping import Array, Bool, Int, Real
 
+from verifai_jax.core.checks import check_name, is_number
 from verifai_jax.core.gaps import known_times, with_gaps
 from verifai_jax.core.lazy import late
 from verifai_jax.core.notebook import InNotebook
@@ -99,8 +100,14 @@ class Trace(InNotebook):
     notes: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.signals, Mapping):
+            raise TypeError(
+                f"signals must be a dictionary of arrays by name; got {type(self.signals).__name__}"
+            )
         if not self.signals:
             raise ValueError("a trace needs at least one signal; got none")
+        for name in self.signals:
+            check_name("the name of a signal", name)
         signals = {name: with_gaps(name, signal) for name, signal in self.signals.items()}
         object.__setattr__(self, "signals", signals)
         lengths = {}
@@ -125,8 +132,8 @@ class Trace(InNotebook):
                 "value that JAX traces"
             )
         if self.dt is not None:
-            check_period(self.dt)
-        if isinstance(self.times, np.ma.MaskedArray):
+            object.__setattr__(self, "dt", check_period(self.dt))
+        if self.times is not None:
             object.__setattr__(self, "times", known_times(self.times))
         if self.times is not None and np.shape(self.times) != (length,):
             raise ValueError(
@@ -144,18 +151,14 @@ class Trace(InNotebook):
 
     def _check_codes(self, length: int) -> None:
         """Refuse a count of valid samples, or a status, that is known and can be none."""
-        if _is_known(self.valid):
-            valid = np.asarray(self.valid)
-            whole = valid.dtype.kind in "iu"
-            if valid.ndim == 0 and not (whole and 1 <= int(valid) <= length):
-                raise ValueError(
-                    f"valid must be how many samples count, from 1 to {length}; got {valid}"
-                )
-        if _is_known(self.status):
-            status = np.asarray(self.status)
-            if status.ndim == 0 and int(status) not in list(Status):
-                known = ", ".join(f"{code.value} ({code.name})" for code in Status)
-                raise ValueError(f"status must be one of {known}; got {status}")
+        wanted = f"how many samples count, from 1 to {length}"
+        valid = check_code("valid", self.valid, wanted)
+        if valid is not None and not 1 <= valid <= length:
+            raise ValueError(f"valid must be {wanted}; got {valid}")
+        known = f"one of {', '.join(f'{code.value} ({code.name})' for code in Status)}"
+        status = check_code("status", self.status, known)
+        if status is not None and status not in list(Status):
+            raise ValueError(f"status must be {known}; got {status}")
 
     @classmethod
     def from_dataframe(
@@ -294,8 +297,37 @@ class Trace(InNotebook):
         return text
 
 
-def check_period(dt: float) -> None:
-    """Raise `ValueError` unless `dt` is a sampling period that JAX can compute with."""
+def check_code(name: str, value: Any, wanted: str) -> int | None:
+    """Check that a value of a trace is a whole number, or an array of whole numbers.
+
+    **Arguments:**
+
+    - `name`, `wanted`: what it is and what it must be, for the message.
+
+    **Returns:** the number where it is known and a single one, else None.
+
+    **Raises:** `ValueError` for texts, fractions, truth values and lists.
+    """
+    if value is None:
+        return None
+    kind = getattr(getattr(value, "dtype", None), "kind", None)
+    if kind is None:
+        # An index of Python: neither a truth value nor a number that happens to be whole.
+        kind = "i" if isinstance(value, int) and not isinstance(value, bool) else "O"
+    if kind not in "iu":
+        raise ValueError(f"{name} must be {wanted}; got {value!r}")
+    return int(value) if _is_known(value) and not np.ndim(value) else None
+
+
+def check_period(dt: Any) -> float:
+    """Return a sampling period that JAX can compute with.
+
+    **Raises:** `TypeError` for what is no number, `ValueError` for one that is too small or large.
+    """
+    if not is_number(dt):
+        if getattr(dt, "shape", None) != () or getattr(dt.dtype, "kind", "") not in "iuf":
+            raise TypeError(f"the sampling period dt must be a number of seconds; got {dt!r}")
+        dt = float(dt)
     if not dt > 0:
         raise ValueError(f"the sampling period dt must be positive; got {dt}")
     least = float(np.finfo(np.float32).tiny)
@@ -304,6 +336,7 @@ def check_period(dt: float) -> None:
             f"the sampling period dt must be a finite number of seconds, at least {least:z.3g}, "
             f"the least in single precision; got {dt}"
         )
+    return dt
 
 
 def without_wrapping(signal: Samples) -> Samples:

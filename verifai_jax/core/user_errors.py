@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import jax
 
 from verifai_jax.core.errors import nearest_names
-from verifai_jax.core.text import shorten
+from verifai_jax.core.text import storable
 from verifai_jax.core.user_files import is_notebook_cell, is_user_file
 from verifai_jax.core.waveform import IS_CALLED
 
@@ -32,6 +32,8 @@ MOST_CODE = 80
 """Characters of a line of code that a message quotes."""
 MOST_MESSAGE = 300
 """Characters of what a library or a simulator says."""
+MOST_READ = 4 * MOST_MESSAGE
+"""Characters of a message that are read at all: one of megabytes costs no time."""
 MOST_NAMES = 12
 """Names that a message lists."""
 
@@ -195,7 +197,7 @@ def explain_user_error(
     if step is None:
         return _said(error)
     line = _line(step.tb_frame.f_code, step.tb_lineno)
-    code = f" (`{shorten(line.code, MOST_CODE)}`)" if line.code else ""
+    code = f" (`{storable(line.code, MOST_CODE)}`)" if line.code else ""
     kept = isinstance(error, jax.errors.UnexpectedTracerError)
     more = (
         (AS_NATIVE if native else AS_PYTHON)
@@ -211,13 +213,13 @@ def format_user_error(error: BaseException) -> str:
     `RuntimeError: no road (sim.py, line 12, in simulate)`.
     """
     line = user_line(error)
-    return f"{_said(error)}{'' if line is None else f' ({line})'}"
+    return storable(f"{_said(error)}{'' if line is None else f' ({line})'}")
 
 
 def _sentence(error: BaseException, step: TracebackType, features: object) -> str:
     if advice := _advice_on_tracing(error):
         return advice
-    if isinstance(error, TypeError) and "Waveform" in str(error):
+    if isinstance(error, TypeError) and "Waveform" in storable(error):
         return f"{_said(error)}: {IS_CALLED}"
     if isinstance(error, KeyError) and error.args:
         return _missing_key(error.args[0], step, features) or _said(error)
@@ -237,10 +239,10 @@ def _advice_on_tracing(error: BaseException) -> str:
     for told in (error, error.__cause__):
         for kind, advice in TRACING:
             if isinstance(told, kind):
-                return WRITES if "array element" in str(error) else advice
+                return WRITES if "array element" in storable(error) else advice
     if not isinstance(error, TypeError | IndexError):
         return ""
-    words = str(error)
+    words = storable(error)
     found = (advice for part, advice in TRACING_BY_WORDS.items() if re.search(part, words))
     return next(found, "")
 
@@ -318,10 +320,11 @@ def _same_names(one: Mapping[Any, Any], other: object) -> bool:
 def _said(error: BaseException) -> str:
     """Return the type of an error and what it says, in one line of bounded length."""
     # JAX appends advice about its own tracebacks.
-    words = " ".join(str(error).partition("\n------")[0].split())
+    said = storable(error, MOST_READ)
+    words = " ".join(said.partition("\n------")[0].split())
     if len(words) > MOST_MESSAGE:
         words = f"{words[: MOST_MESSAGE - 3]}..."
-    kind = type(error).__name__
+    kind = storable(type(error).__name__, MOST_CODE)
     return f"{kind}: {words}" if words else kind
 
 

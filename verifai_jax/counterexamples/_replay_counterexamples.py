@@ -16,7 +16,7 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.core.sources import Change, Sources
-from verifai_jax.core.text import format_error, one_line
+from verifai_jax.core.text import format_error, one_line, printable
 from verifai_jax.core.trace import Status
 from verifai_jax.counterexamples.corpus import SavedCounterexample, read_corpus, renamed
 from verifai_jax.evaluation.backends import resolved
@@ -124,7 +124,7 @@ class CorpusReplay(InNotebook):
             lines.append(f"  {one.path.name}  {one.state}{robustness}{before}{note}")
         if others := len(self.of(OTHER)):
             lines.append(f"  {others} more file{'s' * (others != 1)} of other problems")
-        return "\n".join(lines)
+        return printable("\n".join(lines))
 
     __repr__ = __str__
 
@@ -174,9 +174,31 @@ def replay_counterexamples(
         together = (entry.seed, entry.precision, entry.backend)
         batches.setdefault(together, []).append((path, entry, columns))
     for (seed, precision, backend), batch in batches.items():
-        results |= _replay_batch(problem, seed, precision, backend, batch)
+        results |= _replay_each(problem, seed, precision, backend, batch)
     ordered = tuple(results[path] for path in sorted(results))
     return CorpusReplay(problem.name, Path(folder), ordered)
+
+
+def _replay_each(
+    problem: Problem,
+    seed: int,
+    precision: str,
+    backend: str | None,
+    batch: list[tuple[Path, SavedCounterexample, Any]],
+) -> dict[Path, ReplayedCounterexample]:
+    """Replay counterexamples together; where that fails one by one, to name those that fail."""
+    try:
+        return _replay_batch(problem, seed, precision, backend, batch)
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
+        problem.check()  # What is wrong with the problem is no fault of a file.
+        if len(batch) == 1:
+            ((path, entry, _),) = batch
+            reason = one_line(format_error(error))
+            return {path: ReplayedCounterexample(path, INVALID, np.nan, _least(entry), reason)}
+    results: dict[Path, ReplayedCounterexample] = {}
+    for each in batch:
+        results |= _replay_each(problem, seed, precision, backend, [each])
+    return results
 
 
 def _replay_batch(
@@ -264,6 +286,14 @@ def _least(entry: SavedCounterexample) -> float:
 
 def _misfit(space: FeatureSpace, columns: Mapping[str, Any]) -> str:
     """Return why the space has no place for a counterexample; empty where it has."""
+    try:
+        return _why_not_in(space, columns)
+    except (ValueError, TypeError, KeyError, OverflowError, AttributeError) as error:
+        # Such as a text where the space has a number.
+        return one_line(format_error(error))
+
+
+def _why_not_in(space: FeatureSpace, columns: Mapping[str, Any]) -> str:
     missing = [name for name in space.columns if name not in columns]
     unknown = [name for name in columns if name not in space.columns]
     if missing or unknown:

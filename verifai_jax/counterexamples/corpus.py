@@ -11,7 +11,9 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Mapping
+import shlex
+import sys
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ import numpy as np
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.keys import run_keys
+from verifai_jax.core.text import format_error, one_line
 from verifai_jax.counterexamples._shrink import shrink as shrink_row
 from verifai_jax.counterexamples.selection import columns_at, problem_of
 from verifai_jax.evaluation.replay import replay
@@ -77,7 +80,8 @@ class SavedCounterexample:
         path = folder / self.name
         content: dict[str, Any] = {"format": FORMAT, **asdict(self)}
         if self.target is not None:
-            content["reproduce"] = f"verifai-jax replay-counterexamples {self.target} {path}"
+            words = ["verifai-jax", "replay-counterexamples", self.target, str(path)]
+            content["reproduce"] = shlex.join(words)
         # Tests of one problem may write it at once, each in a process of its own.
         partial = path.with_suffix(f".{os.getpid()}.part")
         partial.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
@@ -92,8 +96,8 @@ class SavedCounterexample:
         """
         try:
             content = json.loads(path.read_text())
-        except (OSError, ValueError) as error:
-            raise CorpusError(f"{path} cannot be read: {error}") from None
+        except (OSError, ValueError, RecursionError) as error:
+            raise CorpusError(f"{path} cannot be read: {one_line(format_error(error))}") from None
         form = content.get("format") if isinstance(content, dict) else None
         if form != FORMAT:
             raise CorpusError(
@@ -103,17 +107,63 @@ class SavedCounterexample:
         if missing:
             raise CorpusError(f"{path} lacks {', '.join(missing)}")
         values = {field.name: content[field.name] for field in fields(cls)}
-        for name in ("formulas", "features", "robustness"):
-            if not isinstance(values[name], dict):
-                raise CorpusError(f"{path}: {name} must be an object; got {values[name]!r}")
-        for name in ("seed", "row"):
-            if isinstance(values[name], bool) or not isinstance(values[name], int):
-                raise CorpusError(f"{path}: {name} must be a whole number; got {values[name]!r}")
-        if values["precision"] not in ("float32", "float64"):
-            raise CorpusError(
-                f"{path}: precision must be float32 or float64; got {values['precision']!r}"
-            )
+        for name, (fits, wanted) in _FORMS.items():
+            if not fits(values[name]):
+                raise CorpusError(
+                    f"{path}: {name} must be {wanted}; got {one_line(repr(values[name]), 100)}"
+                )
         return cls(**values)
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_entry(value: object) -> bool:
+    return value is None or isinstance(value, bool | str) or (_is_number(value) and _is_real(value))
+
+
+def _is_real(value: Any) -> bool:
+    return abs(value) <= sys.float_info.max  # Neither NaN nor an integer beyond all floats.
+
+
+def _is_up_to(most: int) -> Callable[[object], bool]:
+    def fits(value: object) -> bool:
+        return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most
+
+    return fits
+
+
+def _maps_to(fits: Callable[[object], bool]) -> Callable[[object], bool]:
+    return lambda value: isinstance(value, dict) and all(map(fits, value.values()))
+
+
+def _is_pair(value: object) -> bool:
+    return isinstance(value, list) and len(value) == 2
+
+
+_FORMS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "problem": (_is_text, "a text"),
+    "target": (lambda value: value is None or _is_text(value), "a text or null"),
+    "formulas": (_maps_to(_is_text), "an object of texts"),
+    "features": (_maps_to(_is_entry), "an object of finite numbers, texts, truth values and nulls"),
+    "robustness": (
+        _maps_to(lambda value: value is None or (_is_number(value) and _is_real(value))),
+        "an object of finite numbers and nulls",
+    ),
+    "seed": (_is_up_to(2**63 - 1), "a whole number from 0 to 2**63 - 1"),
+    "row": (_is_up_to(2**31 - 1), "a whole number from 0 to 2**31 - 1"),
+    "precision": (lambda value: value in ("float32", "float64"), "float32 or float64"),
+    "backend": (lambda value: value is None or _is_text(value), "a text or null"),
+    "verdict": (_is_text, "a text"),
+    "changed": (lambda value: value is None or _maps_to(_is_pair)(value), "an object of pairs"),
+    "found": (lambda value: isinstance(value, dict), "an object"),
+}
+"""For each entry of a file whether a value can be it, and what it must be, in words."""
 
 
 def save_counterexamples(
@@ -216,7 +266,9 @@ def _sources(run: Run, row: int) -> dict[str, Any]:
 
 
 def read_corpus(folder: str | Path) -> tuple[dict[Path, SavedCounterexample], dict[Path, str]]:
-    """Read the files of a corpus: a folder, or one file.
+    """Read the files of a corpus: a folder with those below it, or one file.
+
+    Every file whose name ends in `.json`, in whatever case, belongs to it; what is hidden does not.
 
     **Returns:** the counterexamples by path, and what is wrong with the other files.
 
@@ -225,7 +277,11 @@ def read_corpus(folder: str | Path) -> tuple[dict[Path, SavedCounterexample], di
     place = Path(folder)
     if not place.exists():
         raise FileNotFoundError(f"there is no corpus of counterexamples in {place}")
-    paths = sorted(place.glob("*.json")) if place.is_dir() else [place]
+    paths = [place]
+    if place.is_dir():
+        below = (path.relative_to(place) for path in sorted(place.rglob("*")))
+        seen = (path for path in below if not any(part.startswith(".") for part in path.parts))
+        paths = [place / path for path in seen if path.suffix.lower() == ".json"]
     entries, damaged = {}, {}
     for path in paths:
         try:

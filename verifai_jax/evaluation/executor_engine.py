@@ -16,12 +16,13 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Key, UInt32
 
 from verifai_jax.core.devices import describe_processor
 from verifai_jax.core.executors import (
     Executor,
     Future,
+    WorkerError,
     check_executor,
     count_workers,
     gather,
@@ -35,7 +36,7 @@ from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.remarks import Remarks
 from verifai_jax.evaluation.steering import NOTHING, Steering
 from verifai_jax.evaluation.verdicts import RowVerdict, Verdicts
-from verifai_jax.evaluation.worker import ARRAYS, BlockMode, evaluate_block
+from verifai_jax.evaluation.worker import ARRAYS, BlockMode, evaluate_block, question_of
 from verifai_jax.problem.problem import Problem
 
 AT_FIRST = 8
@@ -46,6 +47,8 @@ WORTH_KEEPING = 0.01
 """Seconds of a simulation from which on finished rows are journalled before their batch is."""
 IN_FLIGHT = 3
 """Blocks on their way for each worker, so that none waits for the next one."""
+MOST_DROPPED = 100
+"""Answers to other calls after which an executor is given up."""
 MOST_AHEAD = 1 << 22
 """Rows at most that are on their way at a time."""
 
@@ -107,12 +110,14 @@ class ExecutorEngine:
         self._seconds: float | None = None  # Of a row, once one is known.
         self._notes: dict[str, None] = {}
         self._remarks = Remarks()
+        self._dropped = 0  # Answers that belonged to other calls.
         self._recalling: HostEngine | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Decisions of the workers' engines that a user may not expect, and other processors."""
-        return (*self._notes, *self._remarks.texts)
+        dropped = f"{self._dropped} answers of workers belonged to other calls and were dropped"
+        return (*self._notes, *self._remarks.texts, *([dropped] if self._dropped else []))
 
     @property
     def block(self) -> int:
@@ -168,6 +173,25 @@ class ExecutorEngine:
             raise ValueError(
                 f"the problem {self.problem.name!r} cannot be sent to the workers: {error}"
             ) from error
+
+    def is_answer(
+        self, result: dict[str, Any], words: UInt32[np.ndarray, "2"], first: int, u: Any
+    ) -> bool:
+        """Return whether a result is that of this call; count one that is not.
+
+        **Raises:** `WorkerError` where too many are not.
+        """
+        question = question_of(self._shipment, words, first, u)
+        if result.get("question", question) == question:
+            return True
+        self._dropped += 1
+        if self._dropped > MOST_DROPPED:
+            raise WorkerError(
+                f"{self._dropped} answers of the executor belonged to other calls than the one "
+                "whose future they came by; what was finished before is kept: resume with another "
+                "executor"
+            )
+        return False
 
     def step(self, count: int) -> int:
         """Return the rows of the next block of so many: all workers have one, for not too long."""
@@ -289,9 +313,12 @@ class Pending:
 
             def ended(place: int, result: dict[str, Any]) -> None:
                 begin, stop, _ = self._sent[place]
-                u = self._u[begin:stop]
-                found[begin] = self._engine.receive(result, u, self._first + begin)
+                u, first = self._u[begin:stop], self._first + begin
                 self._ended += 1
+                if not self._engine.is_answer(result, self._words, first, u):
+                    self._unsent.appendleft((begin, stop))  # It is asked again.
+                    return
+                found[begin] = self._engine.receive(result, u, first)
 
             gather([future for _, _, future in self._sent], ended, self.send)
             self._verdicts = Verdicts.concatenate([found[begin] for begin in sorted(found)])

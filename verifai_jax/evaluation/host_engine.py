@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, Integer, Key, PyTree
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
+from verifai_jax.core.text import storable
 from verifai_jax.core.trace import Status, Trace, without_wrapping
 from verifai_jax.core.user_errors import format_user_error
 from verifai_jax.evaluation.journal import Journal
@@ -37,7 +38,7 @@ from verifai_jax.evaluation.verdicts import (
 )
 from verifai_jax.mtl.setting import period
 from verifai_jax.problem.problem import Problem
-from verifai_jax.systems.base import Outcome, System
+from verifai_jax.systems.base import Outcome, System, outcome_of
 from verifai_jax.systems.blackbox._blackbox import plain_leaves
 
 BLOCK = 32
@@ -223,8 +224,12 @@ class HostEngine:
 
     def _together(self, features: PyTree, keys: Key[Array, " n"], rows: "_Rows") -> None:
         count = len(rows.messages)
+        outcome = outcome_of(partial(self.system.simulate_batch, features, keys))
+        if outcome.status != Status.OK:
+            rows.messages[:] = [outcome.message] * count
+            return
         try:
-            trace = _checked(self.system.simulate_batch(features, keys), count)
+            trace = _checked(outcome.trace, count)
             self.remarks.add(trace.notes, count)
             if _is_plain(trace):
                 rows.rho[:], rows.status[:], rows.holds[:], marks, rows.steering[:] = self.monitor(
@@ -236,7 +241,7 @@ class HostEngine:
                     each = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], trace)
                     rows.show(i, on_host_clock(each))
                 return
-        except (Exception, SystemExit) as error:
+        except Exception as error:
             rows.messages[:] = [format_user_error(error)] * count
             return
         # Row by row, so that one with a wrong code, or a clock of its own, costs no other.
@@ -284,10 +289,7 @@ class HostEngine:
                 yield from self.system.simulate_each(features, seeds)
             return
         for i, (each, seed) in enumerate(zip(features, seeds, strict=True)):
-            try:
-                yield i, Outcome(self.system(each, seed))
-            except (Exception, SystemExit) as error:  # sys.exit() in a simulator is its failure.
-                yield i, Outcome(None, Status.ERROR, format_user_error(error))
+            yield i, outcome_of(partial(self.system, each, seed))
 
     def _block_verdicts(
         self, features: PyTree, rows: Sequence[int], traces: Sequence[Trace]
@@ -340,7 +342,7 @@ class _Waiting:
         block = self._blocks.pop(form)
         verdicts = self._decide([row for row, _, _ in block], [trace for _, trace, _ in block])
         for (row, _, message), verdict in zip(block, verdicts, strict=True):
-            self.keep(row, verdict._replace(message=verdict.message or message))
+            self.keep(row, verdict._replace(message=verdict.message or storable(message)))
 
 
 class _Rows:
@@ -380,6 +382,7 @@ def _trace(outcome: Outcome) -> tuple[Trace | None, RowVerdict]:
         given = type(trace).__name__
         message = f"TypeError: the system must return a Trace; it returned {given}"
         trace, status = None, Status.ERROR
+    message = storable(message)
     try:
         return None if trace is None else pad_trace(trace), _without_verdict(status, message)
     except Exception as error:

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from verifai_jax.core.text import MOST_OF_A_MESSAGE, storable
+
 
 @dataclass
 class Remarks:
@@ -16,7 +18,7 @@ class Remarks:
         """Take in the notes of a simulation, or those that several have together."""
         self.simulations += simulations
         for note, times in notes.items():
-            self._count(note, simulations, times)
+            self._count(storable(note, MOST_OF_A_MESSAGE), simulations, times)
 
     def join(self, other: Mapping[str, Any]) -> None:
         """Take in the remarks of a worker, as `to_data` gives them."""

@@ -93,7 +93,7 @@ def evaluate_block(
 
     **Returns:** arrays by the names of `ARRAYS`; the `leaves` of the features; `messages`; the
     `seconds` without compilation; the `processor`; the engine's `notes`; the `remarks` of the
-    simulations.
+    simulations; the `question` that this answers.
     """
     problem = shipment.thing
     if mode.backend is not None:
@@ -111,7 +111,18 @@ def evaluate_block(
     result["leaves"] = [np.asarray(leaf) for leaf in jax.tree.leaves(verdicts.features)]
     result |= {"messages": verdicts.messages, "seconds": seconds, "notes": notes}
     result["remarks"] = remarks.to_data()
+    result["question"] = question_of(shipment, key, first, u)
     return result | {"processor": describe_processor()}
+
+
+def question_of(
+    shipment: Shipment[Problem],
+    key: UInt32[np.ndarray, "2"],
+    first: int,
+    u: Float[np.ndarray, "n d"],
+) -> tuple[str, tuple[int, ...], int, int]:
+    """Return what tells a call of `evaluate_block` from all others of a run."""
+    return shipment.token, tuple(int(word) for word in key), int(first), len(u)
 
 
 def _on_host(

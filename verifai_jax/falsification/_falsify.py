@@ -26,6 +26,7 @@ from verifai_jax.core.sources import Sources
 from verifai_jax.core.stopwatch import Stopwatch
 from verifai_jax.core.user_errors import explain_user_error, format_user_error
 from verifai_jax.evaluation.backends import Choice, resolved
+from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
 from verifai_jax.falsification.model_changes import (
     ANOTHER_MODEL,
@@ -35,6 +36,7 @@ from verifai_jax.falsification.origin import origin_of
 from verifai_jax.falsification.run import (
     RECORD,
     Run,
+    as_made,
     check_not_continued,
     load,
     write_record,
@@ -317,11 +319,12 @@ def resume(
     with locked(folder):
         if isinstance(run, str | Path):
             run = load(run, problem)
+            problem = run.problem  # As the run simulated it.
         elif run.folder is not None:
             check_not_continued(run, run.folder)
         called = check_callbacks(callbacks)
-        return _resume(
-            run, problem, search, budget, ends, progress, called, executor, even_if_changed
+        return as_made(
+            _resume(run, problem, search, budget, ends, progress, called, executor, even_if_changed)
         )
 
 
@@ -337,7 +340,8 @@ def _resume(
     even_if_changed: bool,
 ) -> Run:
     """Go on with a run whose folder is locked; `ends` is completed from the run."""
-    problem = problem or run.problem
+    made = {"derived": run.derived, "space_data": run.space_data}
+    problem = run.problem if problem is None else as_simulated(problem, made)
     if problem is None:
         raise ValueError(f"resuming {run.name!r} needs its problem: resume(folder, problem)")
     if search is None:
@@ -518,6 +522,7 @@ def _run_rounds(
             confirm=rounds.confirms,
             guide=None if problem.guide is None else problem.guide.to_json(),
             sources=models,
+            derived=problem.system.derived,
             notes=(*chosen, *notes, *rounds.notes),
         )
 

@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from jaxtyping import Int, Shaped
 
+from verifai_jax.core.text import one_line
+from verifai_jax.core.trace import Status
+
 if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
@@ -63,6 +66,52 @@ def to_frame(
 def from_frame(frame: "pd.DataFrame") -> Columns:
     """Return the columns of a DataFrame."""
     return {str(name): frame[name].to_numpy() for name in frame.columns}
+
+
+def wrong_column(columns: Columns, numbers: Sequence[str] = ()) -> str:
+    """Say which column holds what it cannot; empty where all are as they were written.
+
+    **Arguments:**
+
+    - `columns`: with `status`, `violated` and `rho`.
+    - `numbers`: names of features that are numbers.
+    """
+    known = [status.name.lower() for status in Status]
+    for each in columns["status"].tolist():
+        if not (isinstance(each, str) and each in known):
+            found = one_line(repr(each), 60)
+            return f"its column 'status' must hold {', '.join(known)}; it holds {found}"
+    for name, values in columns.items():
+        wanted = _KINDS.get(name, "f" if name == "rho" or name.startswith("rho.") else "")
+        if not wanted or values.dtype.kind in wanted:
+            continue
+        if wanted == "O" and values.dtype == object and {*map(type, values)} <= _TEXTS:
+            continue
+        return f"its column {name!r} must hold {_WORDS[wanted]}; it holds {_held(values)}"
+    for name in numbers:
+        if name in columns and columns[name].dtype.kind not in "biuf":
+            return f"its column {name!r} must hold numbers; it holds {_held(columns[name])}"
+    proper, rho = columns["status"] == "ok", columns["rho"]
+    if np.any(proper & np.isnan(rho)):
+        return "its column 'rho' lacks the robustness of a row that ended properly"
+    violated = columns["violated"]
+    if np.any(proper & (((rho < 0) & ~violated) | ((rho > 0) & violated))):
+        return "its columns 'violated' and 'rho' contradict each other"
+    return ""
+
+
+_KINDS = {"violated": "b", "gradient_finite": "b", "differentiated": "b", "message": "O"}
+"""Kinds of NumPy's types that columns have, beside those of robustness."""
+_TEXTS = {str, float, type(None)}
+"""Types in a column of texts; a NaN of pandas is an absent one."""
+_WORDS = {"b": "truth values", "f": "floating-point numbers", "O": "texts"}
+
+
+def _held(values: Shaped[np.ndarray, " n"]) -> str:
+    if values.dtype != object:
+        return f"numbers of type {values.dtype}"
+    kinds = {type(value).__name__: None for value in values}
+    return f"values of type {', '.join([*kinds][:3])}"
 
 
 def to_arrow(columns: Columns) -> "pa.RecordBatch":

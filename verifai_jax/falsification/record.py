@@ -1,6 +1,7 @@
 """The record of a run, `run.json`: everything about it but its table and its checkpoint."""
 
 import json
+import re
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -51,6 +52,7 @@ ADDED = (
     "guide",
     "origin",
     "sources",
+    "derived",
 )
 """Entries that may be absent, as from the records of 0.1."""
 DECIDING = (
@@ -112,6 +114,21 @@ def record_checksum(record: Mapping[str, Any]) -> int:
     return zlib.crc32(json.dumps(deciding, sort_keys=True).encode())
 
 
+def numeric_features(record: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the feature columns that are numbers, as far as the recorded space says so."""
+    space = record.get("space_data") or {"features": []}
+    known = {name: domain.get("kind") for name, domain in space["features"]}
+    return tuple(
+        column
+        for column in record["features"]
+        if known.get(re.sub(r"(\[\d+\])+$", "", column)) in _NUMERIC
+    )
+
+
+_NUMERIC = ("Box", "DiscreteBox", "Normal", "TruncatedNormal", "LogUniform", "LogNormal", "Signal")
+"""Kinds of domains, the usual ones, whose columns are numbers."""
+
+
 def _rows_beside(folder: Path) -> str:
     """Say how the rows of a folder are read without its record."""
     if (folder / FINISHED).is_file():
@@ -151,7 +168,10 @@ def _is_space(value: object) -> bool:
     if not isinstance(value, dict) or not isinstance(value.get("features"), list):
         return value is None
     pairs = all(
-        isinstance(each, list) and len(each) == 2 and isinstance(each[0], str)
+        isinstance(each, list)
+        and len(each) == 2
+        and isinstance(each[0], str)
+        and isinstance(each[1], dict)
         for each in value["features"]
     )
     return pairs and (value.get("where", 0) is None or isinstance(value.get("where"), str))
@@ -194,5 +214,6 @@ _FORMS: dict[str, Callable[[Any], bool]] = {
     "guide": _is_mapping,
     "origin": lambda value: value in ("", *ORIGINS),
     "sources": _is_sources,
+    "derived": _is_mapping,
 }
 """What each entry of a record must be."""

@@ -30,6 +30,7 @@ from verifai_jax.falsification.checkpoint import (
     read_checkpoint,
     write_checkpoint,
 )
+from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.model_changes import (
     NEAR,
     ROUNDING,
@@ -45,6 +46,7 @@ from verifai_jax.falsification.record import (
     FORMAT,
     RECORD,
     RECORDED,
+    numeric_features,
     read_record,
     record_checksum,
 )
@@ -101,6 +103,8 @@ class Run(InNotebook):
     - `sources`: what the model was made of when the run began, and again where it went on with
       another one: files with their hashes, and versions, as plain data; empty where that is not
       recorded.
+    - `derived`: what a verb made of the problem that it was given, as plain data; None where it was
+      simulated as it was.
     - `damage`: what of its files could not be read, in words; such a run cannot be resumed.
     """
 
@@ -141,6 +145,7 @@ class Run(InNotebook):
     sources: Sequence[Mapping[str, Any]] = ()
     damage: str = ""
     origin: str = ""
+    derived: Mapping[str, Any] | None = None
 
     @property
     def simulations(self) -> int:
@@ -199,8 +204,10 @@ class Run(InNotebook):
         return self._rate(confirmed, sum(counts.values()) - confirmed - counts.get("refuted", 0))
 
     def _rate(self, failures: int, undecided: int) -> Rate | None:
+        if not self.prior or self.has_several_models or self.table.changed:
+            return None
         without = self.table.counts.without_verdict
-        if not self.prior or self.simulations == without or self.has_several_models:
+        if self.simulations == without:
             return None
         stopped_by_outcomes = self.stopped in ("stop_after", "stop_when")
         interval = anytime_interval if stopped_by_outcomes else clopper_pearson
@@ -512,6 +519,7 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
     record = read_record(folder)
     features = tuple(record["features"])
     if problem is not None:
+        problem = as_simulated(problem, record)
         texts = {name: str(formula) for name, formula in problem.formulas.items()}
         for what, recorded, given in (
             ("name", record["name"], problem.name),
@@ -528,7 +536,9 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
             problem = problem.on_backend(record["backend"])
     begun = ErrorTable.exists(folder) or record["stopped"] != "running"
     # A run that was cut off before its first batch came to the disk has no rows yet.
-    table = ErrorTable.load(folder, features) if begun else ErrorTable(features)
+    table = ErrorTable(features)
+    if begun:
+        table = ErrorTable.load(folder, features, numeric_features(record))
     damage, checkpoint = [table.damage] if table.damage else [], None
     try:
         checkpoint = read_checkpoint(folder)
@@ -546,15 +556,17 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
             f"of {folder} are missing or damaged"
         )
     elif checkpoint and not table.missing and checkpoint[ROWS_CHECKSUM] != table.digest(seen):
-        damage.append(
+        changed = (
             f"the first {seen} rows of the table in {folder} are not those that its search had "
             f"seen: they have changed, or are of another run; {ANEW}"
         )
+        table.distrust(changed)
+        damage.append(changed)
     elif not len(table) and record["stopped"] != "running" and not (folder / FINISHED).exists():
         damage = damage or [f"{folder / TAIL} is damaged: it has no row that can be read"]
     elif checkpoint is None and not damage and len(table) and record["stopped"] != "running":
         damage.append(f"{folder / STATE} is missing, which says what its rows are; {ANEW}")
-    return Run(
+    run = Run(
         table=table,
         folder=folder,
         problem=problem,
@@ -563,3 +575,9 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
         **{name: record[name] for name in RECORDED},
         **{name: record[name] for name in ADDED if name in record},
     )
+    return as_made(run)
+
+
+def as_made(run: Run) -> Run:
+    """Return a run as the verb that made it does: one of `fuzz` has its coverage."""
+    return run if run.derived is None else late("verifai_jax.fuzzing.run", "as_fuzz_run")(run)

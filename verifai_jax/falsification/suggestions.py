@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from verifai_jax.core.locks import returning_once
 from verifai_jax.core.text import format_error, one_line
 from verifai_jax.features.given import given_features, given_rows
 from verifai_jax.problem.problem import Problem
@@ -87,7 +88,9 @@ class Suggestions:
         """
         number = len(self.asked) + 1
         points, wrong = [], []
-        for i, each in enumerate(_listed(self.search.suggest(question), self.search.source)):
+        with returning_once():
+            suggested = self.search.suggest(question)
+        for i, each in enumerate(_listed(suggested, self.search.source)):
             try:
                 if i >= self.search.points:
                     raise SuggestionError(f"only {self.search.points} were asked for")

@@ -19,7 +19,14 @@ SHOWN = 0.005
 
 
 def summarize(run: Run) -> str:
-    """Write the summary of a run, every number of it from its table."""
+    """Write the summary of a run, every number of it from its table.
+
+    Of a table whose rows have changed no number is written.
+    """
+    if run.table.changed:
+        lines = [f"{run.name}: its rows have changed since they were written, so they say nothing"]
+        lines += [f"  damaged      {run.damage}", f"  search       {run.search}, seed {run.seed}"]
+        return printable("\n".join(lines))
     counts = run.table.counts
     violating, failed = counts.violating, counts.without_verdict
     lines = [f"{run.name}: {_headline(run, violating)}"]

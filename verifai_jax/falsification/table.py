@@ -14,6 +14,7 @@ process that dies loses at most the batch in flight. Every 1 048 576 rows become
 
 import contextlib
 import json
+import warnings
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -37,6 +38,7 @@ from verifai_jax.falsification.columns import (
     row_numbers,
     to_arrow,
     to_frame,
+    wrong_column,
 )
 from verifai_jax.falsification.counts import Counts, claimed_rows, count, violating_rows
 from verifai_jax.falsification.segments import (
@@ -87,6 +89,8 @@ class ErrorTable(InNotebook):
 
     - `missing`: ranges of rows that are missing, as their files are damaged or gone.
     - `damage`: what is damaged and what is missing, in words; empty where nothing is.
+    - `changed`: whether rows are others than those that were written, so that no number of the
+      table can be relied on.
 
     **Raises:** `ValueError` for a feature with a reserved name.
     """
@@ -106,6 +110,7 @@ class ErrorTable(InNotebook):
         self.features = tuple(features)
         self.missing: tuple[range, ...] = ()
         self.damage = ""
+        self.changed = False
         self._folder = None if folder is None else folder.absolute()
         self._tail = None if self._folder is None else Tail(self._folder)
         self._segments: list[Segment] = []
@@ -170,7 +175,12 @@ class ErrorTable(InNotebook):
 
     @property
     def all(self) -> "pd.DataFrame":
-        """Every simulation asked for, once, indexed by row number."""
+        """Every simulation asked for, once, indexed by row number.
+
+        Where rows are missing or have changed since they were written, a `UserWarning` says so.
+        """
+        if self.damage:
+            warnings.warn(f"the error table is damaged: {self.damage}", stacklevel=2)
         if self._frame is None:
             self._join()
             frames = [segment.read() for segment in self._segments]
@@ -253,13 +263,21 @@ class ErrorTable(InNotebook):
         return self._concatenate([*safe])
 
     @classmethod
-    def load(cls, folder: Path, features: tuple[str, ...]) -> "ErrorTable":
+    def load(
+        cls, folder: Path, features: tuple[str, ...], numbers: Sequence[str] = ()
+    ) -> "ErrorTable":
         """Read a table back, finished or cut off; its segments are read when they are wanted.
 
         What is damaged is left out: `missing` and `damage` say what.
 
+        **Arguments:**
+
+        - `folder`: of the table.
+        - `features`: names of the feature columns.
+        - `numbers`: those among them that are numbers, where that is known.
+
         **Raises:** `FileNotFoundError` where there is none; `TableError` for a `table.parquet` that
-        is damaged, or a column that is missing.
+        is damaged, or a column that is missing or holds what it cannot.
         """
         if not cls.exists(folder):
             raise FileNotFoundError(
@@ -275,7 +293,7 @@ class ErrorTable(InNotebook):
             table._take(0, from_frame(frame))
         for first, batch in batches:
             table._take(first, from_frame(batch.to_pandas()))
-        table._check()
+        table._check(numbers)
         return table
 
     @staticmethod
@@ -523,11 +541,16 @@ class ErrorTable(InNotebook):
             self._note(f"rows {self._next} to {first - 1} are missing")
             self._next = first
 
+    def distrust(self, sentence: str) -> None:
+        """Note that rows have changed since they were written, in words."""
+        self.changed = True
+        self._note(sentence)
+
     def _note(self, sentence: str) -> None:
         self.damage = f"{self.damage}; {sentence}" if self.damage else sentence
 
-    def _check(self) -> None:
-        """Refuse a table without a column that it must have, or of several forms."""
+    def _check(self, numbers: Sequence[str]) -> None:
+        """Refuse a table without a column that it must have, or with one of another type."""
         parts = [segment.names for segment in self._segments]
         parts += [tuple(batch) for _, batch in self._batches]
         if not parts or not len(self):
@@ -543,6 +566,9 @@ class ErrorTable(InNotebook):
             raise TableError(
                 f"the table in {self._folder} is damaged: only some of its rows have {name!r}"
             )
+        for _, batch in self._batches:
+            if wrong := wrong_column(batch, numbers):
+                raise TableError(f"the table in {self._folder} is damaged: {wrong}")
 
 
 def _read_finished(path: Path) -> "pd.DataFrame":

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree, Shaped
 
+from verifai_jax.core.checks import check_name
 from verifai_jax.features.domain import (
     MOST_LEVELS,
     MOST_REAL,
@@ -62,6 +63,8 @@ class Categorical(Domain):
             raise ValueError(f"a Categorical has at most {MOST_LEVELS} choices")
         known: set[object] = set()
         for choice in self.choices:
+            if str(choice):
+                check_name("a choice", str(choice))  # As the table shows it.
             keys: set[object] = {str(choice)}  # All that the table shows of most objects.
             if isinstance(choice, int | float):
                 most = 2**31 - 1 if isinstance(choice, int) else MOST_REAL

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
+from verifai_jax.core.checks import check_name
 from verifai_jax.core.errors import check_names
 from verifai_jax.features.box import Box
 from verifai_jax.features.domain import Domain, Row, dotted
@@ -39,6 +40,7 @@ class Struct(Domain):
         for name, domain in fields.items():
             if not isinstance(name, str) or not name.strip():
                 raise ValueError(f"the name of a field must be a text; got {name!r}")
+            check_name("the name of a field", name)
             if isinstance(domain, Mapping):
                 raise TypeError(f"{name} must be a domain; a dictionary of them goes into Struct")
             if not isinstance(domain, Domain):

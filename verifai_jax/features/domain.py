@@ -250,6 +250,8 @@ def on_device(numbers: Array | np.ndarray) -> Array:
 
 def as_number(value: object, what: str) -> float:
     """Convert to one number; `what` names it in the error."""
+    if np.ma.is_masked(value):
+        raise ValueError(f"{what} must be a number; got one that is masked")
     if not isinstance(value, bool | np.bool_ | str | bytes):
         try:
             return float(value)  # pyright: ignore[reportArgumentType]
@@ -260,6 +262,8 @@ def as_number(value: object, what: str) -> float:
 
 def as_numbers(value: object, name: str) -> Float[np.ndarray, "*shape"]:
     """Convert a concrete number or an array of them to float64; `name` names it in the error."""
+    if np.ma.is_masked(value):
+        raise ValueError(f"{name} must be a number; got one that is masked")
     try:
         numbers = np.asarray(value)
         if numbers.dtype == object:

@@ -10,7 +10,6 @@ the formulas that is nearest to breaking.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields
 from pathlib import Path
 
 from verifai_jax.core.errors import suggests_options
@@ -19,7 +18,7 @@ from verifai_jax.core.trace import Trace
 from verifai_jax.falsification import falsify
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.fuzzing.implicit import with_implicit
-from verifai_jax.fuzzing.run import FuzzRun
+from verifai_jax.fuzzing.run import FuzzRun, as_fuzz_run
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Coverage, Search
 
@@ -78,4 +77,4 @@ def fuzz(
         batch=batch, seed=seed, max_seconds=max_seconds, stop_after=stop_after, folder=folder,
         precision=precision, backend=backend, confirm=confirm, progress=progress, target=target,
     )  # fmt: skip
-    return FuzzRun(**{field.name: getattr(run, field.name) for field in fields(run)})
+    return as_fuzz_run(run)

@@ -8,6 +8,7 @@ counterexamples are rows like any other: replayed, shrunk, counted.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -16,14 +17,11 @@ from jaxtyping import Array, Key
 
 from verifai_jax.core.checks import is_number
 from verifai_jax.core.trace import Status, Trace
-from verifai_jax.core.user_errors import format_user_error
 from verifai_jax.features import Domain, FeatureSpace
-from verifai_jax.mtl import Formula, always, parse, signal
-from verifai_jax.mtl.expression import Number
-from verifai_jax.mtl.formula import Predicate
+from verifai_jax.mtl import Formula, always, signal
 from verifai_jax.problem.behaviour import Behaviour
 from verifai_jax.problem.problem import Problem
-from verifai_jax.systems.base import Features, Outcome, Seed, System, as_system
+from verifai_jax.systems.base import Features, Outcome, Seed, System, as_system, outcome_of
 from verifai_jax.systems.blackbox._blackbox import plain_leaves
 
 FINITE = "finite"
@@ -39,6 +37,9 @@ HOLDS = 1e6
 
 Ranges = Mapping[str, tuple[float, float]]
 """The range within which each signal must stay."""
+
+Cells = Mapping[str, tuple[float, float, int]]
+"""For each signal the low and the high end of its cells, and their number."""
 
 CELLS_OF_A_RANGE = 4
 """Cells into which a signal with a range is cut where nobody says how many."""
@@ -56,10 +57,19 @@ class CheckedSystem(System):
     - `ranges`: of signals; what is not finite is replaced by the middle, as it is reported anyway.
     - `verdicts`: whether a simulation that raises, hangs or is not finite gets a trace that breaks
       a property, instead of a status without a verdict.
+    - `cells`: of signals, as given to `fuzz`; they are for the record of the run.
     """
 
-    def __init__(self, system: System, ranges: Ranges, verdicts: bool) -> None:
+    def __init__(
+        self, system: System, ranges: Ranges, verdicts: bool, cells: Cells | None = None
+    ) -> None:
         self.system, self.ranges, self.verdicts = system, dict(ranges), verdicts
+        self.cells = cells
+        self.derived = {
+            "ranges": {name: [float(end) for end in ends] for name, ends in ranges.items()},
+            "cells": None if cells is None else {n: [*map(float, c)] for n, c in cells.items()},
+            "without_formula": verdicts,
+        }
         self.__wrapped__ = getattr(system, "__wrapped__", system)
         self.black_box = system.black_box
         self.lanes, self.forward_up_to = system.lanes, system.forward_up_to
@@ -79,12 +89,16 @@ class CheckedSystem(System):
     def __repr__(self) -> str:
         return repr(self.system)
 
+    def _of(self, system: System) -> "CheckedSystem":
+        return CheckedSystem(system, self.ranges, self.verdicts, self.cells)
+
     def __call__(self, features: Features, key: Seed = None) -> Trace:
         if not (self.black_box and self.verdicts):
             return self._checked(self.system(features, key))
+        trace = outcome_of(partial(self.system, features, key)).trace
         try:
-            return self._checked(self.system(features, key))
-        except (Exception, SystemExit):
+            return self._failed() if trace is None else self._checked(trace)
+        except Exception:
             return self._failed()
 
     def check(self, features: Features) -> None:
@@ -101,16 +115,16 @@ class CheckedSystem(System):
         return self.system.can_refine
 
     def refined(self, factor: Any) -> System:
-        return CheckedSystem(self.system.refined(factor), self.ranges, self.verdicts)
+        return self._of(self.system.refined(factor))
 
     def renewed(self) -> System:
         renewed = self.system.renewed()
         if renewed is self.system:
             return self
-        return CheckedSystem(renewed, self.ranges, self.verdicts)
+        return self._of(renewed)
 
     def with_backend(self, name: str) -> System:
-        return CheckedSystem(self.system.with_backend(name), self.ranges, self.verdicts)
+        return self._of(self.system.with_backend(name))
 
     def why_not(self, backend: str) -> str | None:
         return self.system.why_not(backend)
@@ -145,10 +159,7 @@ class CheckedSystem(System):
             yield from self.system.simulate_each(features, seeds)
             return
         for i, (each, seed) in enumerate(zip(features, seeds, strict=True)):
-            try:
-                yield i, Outcome(self.system(plain_leaves(each), seed))
-            except (Exception, SystemExit) as error:
-                yield i, Outcome(None, Status.ERROR, format_user_error(error))
+            yield i, outcome_of(partial(self.system, plain_leaves(each), seed))
 
     def _failed(self) -> Trace:
         """Return the trace of a simulation that did not end properly."""
@@ -198,7 +209,7 @@ def with_implicit(
     space: FeatureSpace | Mapping[str, Domain] | None,
     system: Callable[..., Trace] | None,
     ranges: Ranges,
-    cells: Mapping[str, tuple[float, float, int]] | None,
+    cells: Cells | None,
     name: str,
 ) -> Problem:
     """Return a problem with the implicit properties, beside its own formulas if it has some.
@@ -217,6 +228,7 @@ def with_implicit(
     for key, (low, high) in ranges.items():
         properties[f"{RANGE}{key}"] = always((signal(key) >= low) & (signal(key) <= high))
     own_behaviour = None if problem is None or cells is not None else problem.behaviour
+    given = cells
     if cells is None:
         cut = ranges if len(ranges) <= MOST_CUT else {}
         cells = {key: (low, high, CELLS_OF_A_RANGE) for key, (low, high) in cut.items()}
@@ -228,44 +240,32 @@ def with_implicit(
             raise ValueError(f"fuzz has a property {taken[0]!r} of its own; rename that formula")
         own = problem.formulas
         behaviour = own_behaviour or Behaviour(cells, own.values())
-        checked = CheckedSystem(problem.system, ranges, verdicts=False)
+        checked = CheckedSystem(problem.system, ranges, verdicts=False, cells=given)
         # What has no order beside the priority is as good as none.
         return replace(problem, system=checked, spec={**own, **properties}, behaviour=behaviour)
     if space is None or system is None:
         raise ValueError("fuzz needs a problem, or space= and system=")
     properties = {COMPLETED: always(signal(COMPLETED) > 0), **properties}
-    checked = CheckedSystem(as_system(system), ranges, verdicts=True)
+    checked = CheckedSystem(as_system(system), ranges, verdicts=True, cells=given)
     behaviour = Behaviour(cells, properties.values())
     return Problem(name, space, checked, properties, behaviour=behaviour)
 
 
-def as_recorded(problem: Problem, formulas: Mapping[str, str]) -> Problem:
+def as_recorded(problem: Problem, derived: Mapping[str, Any]) -> Problem:
     """Return a problem with the implicit properties that a run of `fuzz` recorded.
 
     **Arguments:**
 
-    - `problem`: with its own formulas alone.
-    - `formulas`: of the run, their texts by name.
+    - `problem`: with its own formulas alone; for a run without any its name, its space and its
+      system count.
+    - `derived`: `CheckedSystem.derived` of the run.
 
-    **Returns:** the problem itself where the run has no implicit properties.
+    **Raises:** `ValueError`, `TypeError`, `KeyError` for a record that describes no such problem.
     """
-    added = {name: text for name, text in formulas.items() if name not in problem.formulas}
-    ranges = {
-        name.removeprefix(RANGE): _ends(parse(text))
-        for name, text in added.items()
-        if name.startswith(RANGE)
-    }
-    if FINITE not in added or len(added) != 1 + len(ranges) or None in ranges.values():
-        return problem
-    known = {name: ends for name, ends in ranges.items() if ends is not None}
-    return with_implicit(problem, None, None, known, None, problem.name)
-
-
-def _ends(formula: Formula) -> tuple[float, float] | None:
-    """Return the ends of a range from its property; None for another formula."""
-    numbers = [
-        part.right.value
-        for part in formula.subformulas()
-        if isinstance(part, Predicate) and isinstance(part.right, Number)
-    ]
-    return (numbers[0], numbers[1]) if len(numbers) == 2 else None
+    ranges = {name: (low, high) for name, (low, high) in derived["ranges"].items()}
+    cells = derived["cells"]
+    if cells is not None:
+        cells = {name: (low, high, int(count)) for name, (low, high, count) in cells.items()}
+    if derived["without_formula"]:
+        return with_implicit(None, problem.space, problem.system, ranges, cells, problem.name)
+    return with_implicit(problem, None, None, ranges, cells, problem.name)

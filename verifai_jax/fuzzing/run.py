@@ -1,6 +1,6 @@
 """The result of fuzzing: a run, what it covered, and the simulations that extended coverage."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -59,3 +59,10 @@ class FuzzRun(Run):
 
     def __repr__(self) -> str:
         return self.summary()
+
+
+def as_fuzz_run(run: Run) -> FuzzRun:
+    """Return a run of `fuzz` with what belongs to it: its coverage and its corpus."""
+    if isinstance(run, FuzzRun):
+        return run
+    return FuzzRun(**{field.name: getattr(run, field.name) for field in fields(run)})

@@ -138,6 +138,12 @@ def _file_columns(path: Path) -> dict[str, Any]:
         raise ValueError(f"a recording is a .csv or a .parquet file; got {path.name}")
     try:
         table = readers[path.suffix.lower()](path)
+        names = table.column_names
+    except UnicodeDecodeError as error:
+        raise ValueError(
+            f"{path} cannot be read: the names of its columns are no UTF-8 ({error}); save it as "
+            "UTF-8"
+        ) from None
     except (pyarrow.ArrowInvalid, OSError) as error:
         # A row with more cells than the first line has names is often one of decimal commas.
         advice = ". Decimal commas need semicolons between the columns"
@@ -145,7 +151,6 @@ def _file_columns(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} cannot be read: {error}{advice}") from None
     if table.num_rows == 0:
         raise ValueError(f"{path} has no rows")
-    names = table.column_names
     _refuse_repeated(str(path), names)
     return {name: table.column(name) for name in names}
 
@@ -221,7 +226,7 @@ def vector_columns(names: Collection[str]) -> dict[str, list[str]]:
     vectors: dict[str, dict[int, str]] = {}
     for name in names:
         stem, bracket, index = name.partition("[")
-        if bracket and index.endswith("]") and index[:-1].isdigit():
+        if bracket and index.endswith("]") and index[:-1].isdecimal():
             vectors.setdefault(stem, {})[int(index[:-1])] = name
     return {
         stem: [parts[i] for i in range(len(parts))]

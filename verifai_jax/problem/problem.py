@@ -15,6 +15,7 @@ from typing import Any
 import jax
 from jaxtyping import Array, Float, Key
 
+from verifai_jax.core.checks import check_name
 from verifai_jax.core.errors import missing_name
 from verifai_jax.core.lazy import late
 from verifai_jax.core.notebook import InNotebook, text_html
@@ -113,6 +114,7 @@ class Problem(InNotebook):
     ) -> None:
         if not isinstance(name, str) or not name.strip():
             raise ProblemError(f"a problem needs a name; got {name!r}")
+        check_name("the name of a problem", name, error=ProblemError)
         if isinstance(space, Mapping):
             space = FeatureSpace(space)
         if not isinstance(space, FeatureSpace):
@@ -126,6 +128,8 @@ class Problem(InNotebook):
         named = spec if isinstance(spec, Mapping) else {"spec": spec}
         if not named:
             raise ProblemError("spec has no formula; give a formula or a dictionary of them")
+        for key in named:
+            check_name("the name of a formula", key, error=ProblemError)
         formulas = {name: _formula(name, formula) for name, formula in named.items()}
         values = {
             "name": name,

@@ -11,6 +11,7 @@ The file holds numbers and text, never code.
 import dataclasses
 import itertools
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -22,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
+from verifai_jax.core.checks import check_count, is_number
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.sources import made_here, sources_of
 from verifai_jax.core.text import one_line
@@ -202,30 +204,99 @@ def load_policy(path: str | Path) -> Policy:
 
     **Returns:** the policy, with JAX arrays of float32.
 
-    **Raises:** `FileNotFoundError`; `PolicyFileError` for a file of another kind.
+    **Raises:** `FileNotFoundError`; `PolicyFileError` for a file of another kind, and for arrays
+    that are missing, not finite, or of shapes that do not fit to each other and to the actions.
     """
     arrays, about = _read(path)
     try:
-        action = dict(about["action"])
-        kind = _KINDS[action.pop("kind")](**action)
-        count = sum(name.startswith("weight") for name in arrays)
-        layers = tuple(
-            (jax.device_put(arrays[f"weight{i}"]), jax.device_put(arrays[f"bias{i}"]))
-            for i in range(count)
-        )
-        shapes = [weight.shape for weight, _ in layers]
-        chained = all(a[1] == b[0] for a, b in itertools.pairwise(shapes))
-        if not layers or not chained:
-            raise KeyError(f"layers of shapes {shapes}")
+        kind = _action_of(about["action"])
+        layers, rest = _layers_of(arrays)
         optional = {
-            name: jax.device_put(arrays[name]) if name in arrays else None
+            name: jax.device_put(rest.pop(name)) if name in rest else None
             for name in ("mean", "scale", "log_std")
         }
+        if rest:
+            raise ValueError(f"it has an array {min(rest)!r}, which belongs to no layer")
         # Files of before these two were fields have tanh networks that are not squashed.
         how = {name: about[name] for name in ("activation", "squash") if name in about}
-        return Policy(layers=layers, action=kind, **optional, **how)
-    except (KeyError, TypeError, ValueError) as error:
+        if not isinstance(how.get("squash", False), bool) or not isinstance(
+            how.get("activation", ""), str
+        ):
+            raise ValueError(f"its activation must be a text and squash true or false; got {how}")
+        policy = Policy(layers=layers, action=kind, **optional, **how)
+        _check_fits(policy)
+        return policy
+    except KeyError as error:
+        why = f"{error.args[0]!r} is missing or unknown"
+        raise PolicyFileError(f"{path} holds no policy: {one_line(why)}") from error
+    except (TypeError, ValueError, AttributeError) as error:
         raise PolicyFileError(f"{path} holds no policy: {one_line(str(error))}") from error
+
+
+def _action_of(data: object) -> Action:
+    """Return the kind of action that a file describes.
+
+    **Raises:** `ValueError` for data that describes none.
+    """
+    if not isinstance(data, dict) or data.get("kind") not in list(_KINDS):
+        raise ValueError(f"its action must be an object of kind {' or '.join(_KINDS)}")
+    kind = _KINDS[data["kind"]]
+    numbers = {name: value for name, value in data.items() if name != "kind"}
+    wanted = [field.name for field in dataclasses.fields(kind)]
+    if sorted(numbers) != sorted(wanted):
+        raise ValueError(f"its action must have {', '.join(wanted)}; got {', '.join(numbers)}")
+    for name, value in numbers.items():
+        if name in ("low", "high"):
+            if not is_number(value) or not math.isfinite(value):
+                raise ValueError(f"{name} of its action must be a finite number; got {value!r}")
+        else:
+            check_count(f"the number {name} of its actions", value)
+    return kind(**numbers)
+
+
+def _layers_of(arrays: Mapping[str, np.ndarray]) -> tuple[Layers, dict[str, np.ndarray]]:
+    """Return the layers of a file whose shapes fit together, and the other arrays.
+
+    **Raises:** `KeyError` for one that is missing, `ValueError` for one that no policy has.
+    """
+    for name, array in arrays.items():
+        if array.dtype.kind != "f" or not np.all(np.isfinite(array)):
+            raise ValueError(f"its array {name!r} must hold finite floating-point numbers")
+    rest = dict(arrays)
+    count = max(1, sum(name.startswith("bias") for name in arrays))
+    layers = tuple((rest.pop(f"weight{i}"), rest.pop(f"bias{i}")) for i in range(count))
+    inputs = None
+    for i, (weight, bias) in enumerate(layers):
+        if weight.ndim != 2 or inputs not in (None, weight.shape[0]) or 0 in weight.shape:
+            raise ValueError(f"its array 'weight{i}' has shape {list(weight.shape)}")
+        inputs = weight.shape[1]
+        if bias.shape != (inputs,):
+            raise ValueError(
+                f"its array 'bias{i}' must have shape [{inputs}]; got {list(bias.shape)}"
+            )
+    return tuple((jax.device_put(weight), jax.device_put(bias)) for weight, bias in layers), rest
+
+
+def _check_fits(policy: Policy) -> None:
+    """Check that the network gives the actions that the policy is said to have.
+
+    **Raises:** `ValueError` for another number of outputs, or a scale that does not fit.
+    """
+    action, outputs = policy.action, policy.layers[-1][0].shape[1]
+    wanted = action.n if isinstance(action, Discrete) else action.size
+    if outputs != wanted:
+        raise ValueError(f"its network has {outputs} outputs, and its actions need {wanted}")
+    sizes = {"mean": policy.layers[0][0].shape[0], "scale": policy.layers[0][0].shape[0]}
+    for name, size in {**sizes, "log_std": wanted}.items():
+        array = getattr(policy, name)
+        if array is not None and array.shape != (size,):
+            raise ValueError(
+                f"its array {name!r} must have shape [{size}]; got {list(array.shape)}"
+            )
+    if (policy.mean is None) != (policy.scale is None):
+        raise ValueError("it has only one of the arrays 'mean' and 'scale'")
+    if policy.scale is not None and not np.all(np.asarray(policy.scale) > 0):
+        raise ValueError("its array 'scale' must hold positive numbers")
 
 
 def policy_notes(path: str | Path) -> dict[str, Any]:
@@ -233,7 +304,7 @@ def policy_notes(path: str | Path) -> dict[str, Any]:
 
     **Raises:** `FileNotFoundError`; `PolicyFileError` for a file of another kind.
     """
-    return _read(path)[1].get("notes", {})
+    return _plain_data(path, "notes")
 
 
 def policy_sources(path: str | Path) -> dict[str, Any]:
@@ -244,14 +315,24 @@ def policy_sources(path: str | Path) -> dict[str, Any]:
 
     **Raises:** `FileNotFoundError`; `PolicyFileError` for a file of another kind.
     """
-    return _read(path)[1].get("sources", {})
+    return _plain_data(path, "sources")
+
+
+def _plain_data(path: str | Path, name: str) -> dict[str, Any]:
+    data = _read(path)[1].get(name, {})
+    if not isinstance(data, dict):
+        raise PolicyFileError(f"{path} is damaged: its {name} must be an object")
+    return data
 
 
 def _read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        return arrays, json.loads(str(arrays.pop("about")))
+        about = json.loads(str(arrays.pop("about")))
+        if not isinstance(about, dict):
+            raise ValueError("what it says about itself is no object")
+        return arrays, about
     except FileNotFoundError:
         raise
     except Exception as error:

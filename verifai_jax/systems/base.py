@@ -8,15 +8,17 @@
 All else has a default here: a system offers more by overriding it.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import jax
 from jaxtyping import Array, Int, Key, PyTree
 
 from verifai_jax.core.compilation import Effort
+from verifai_jax.core.locks import returning_once
 from verifai_jax.core.notebook import ForUsers
 from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.user_errors import format_user_error
 
 Features: TypeAlias = PyTree
 """The features of one simulation, as `FeatureSpace.unflatten` gives them; or of a batch."""
@@ -33,6 +35,25 @@ class Outcome(NamedTuple):
     trace: Trace | None
     status: Status = Status.OK
     message: str = ""
+
+
+def outcome_of(simulate: Callable[[], Any]) -> Outcome:
+    """Simulate once in this process, and return what came of it.
+
+    Whatever a simulator raises is the end of its own row, as it is in a worker: `sys.exit()` and
+    exceptions that are no `Exception` too. Only Ctrl-C ends the run.
+
+    **Arguments:**
+
+    - `simulate`: calls the system.
+    """
+    try:
+        with returning_once():
+            return Outcome(simulate())
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        return Outcome(None, Status.ERROR, format_user_error(error))
 
 
 class System(ForUsers):
@@ -52,11 +73,13 @@ class System(ForUsers):
     - `backends`: names of the engines that can simulate this system, for one with several.
     - `backend`: the engine in use, or `"auto"` until a run decides; None without `backends`.
     - `likely`: the engine that is likely the fastest on a CPU.
+    - `derived`: how a verb made this system of the one that it was given, as plain data for the
+      record of a run; None for a system of a person's own.
     """
 
     _internal = frozenset((
         "abstract", "backend", "backends", "black_box", "can_fold", "can_refine",
-        "can_simulate_batch", "can_simulate_each", "effort", "exact_step", "fold",
+        "can_simulate_batch", "can_simulate_each", "derived", "effort", "exact_step", "fold",
         "forward_up_to", "known_signals", "lanes", "likely", "may_draw", "refined", "renewed",
         "reverse_hint", "simulate_batch", "simulate_each", "switches", "traced_factor",
         "unroll", "why_error", "why_not", "with_backend",
@@ -75,6 +98,7 @@ class System(ForUsers):
     backends: tuple[str, ...] = ()
     backend: str | None = None
     likely: str | None = None
+    derived: Mapping[str, Any] | None = None
 
     def __call__(self, features: Features, key: Seed = None) -> Trace:
         """Simulate once, the same trace for the same features and key."""

@@ -22,7 +22,8 @@ from jaxtyping import Array, Key
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.gaps import with_gaps
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.locks import returning_once
+from verifai_jax.core.trace import Status, Trace, check_code
 from verifai_jax.systems.base import Features, FunctionSystem, Outcome, Seed, System, as_system
 from verifai_jax.systems.blackbox.workers import Pool
 
@@ -130,9 +131,10 @@ class Simulation:
     declared: TraceForm
 
     def __call__(self, features: Features, seed: int) -> Trace:
-        return self.declared.accept(
-            self.function(features, seed) if self.seeded else self.function(features)
-        )
+        arguments = (features, seed) if self.seeded else (features,)
+        with returning_once():
+            trace = self.function(*arguments)
+        return self.declared.accept(trace)
 
     @property
     def known_signals(self) -> tuple[str, ...] | None:
@@ -306,7 +308,9 @@ class VectorisedBlackBox(System):
         return self.declared.abstract()
 
     def _simulate(self, features: Features, seeds: np.ndarray, n: int) -> Trace:
-        trace = self.function(features, seeds) if self.seeded else self.function(features)
+        arguments = (features, seeds) if self.seeded else (features,)
+        with returning_once():
+            trace = self.function(*arguments)
         if not isinstance(trace, Trace):
             raise TypeError(f"the system must return a Trace; it returned {type(trace).__name__}")
         return self._checked(trace, n)
@@ -421,6 +425,9 @@ def stack_traces(
     """
     signals = {name: with_gaps(name, signal) for name, signal in signals.items()}
     first = None if times is None else np.asarray(times)[0]
+    for name, value in (("valid", valid), ("status", status)):
+        known = None if value is None else np.asarray(value)
+        check_code(name, known, "a whole number for each row")
     Trace({name: np.asarray(signal)[0] for name, signal in signals.items()}, dt, first)
     # A Trace is checked as one; unflattening is how JAX makes a batch of them.
     whole = Trace({name: np.zeros(1) for name in signals}, 1.0, held=held, finite=finite)

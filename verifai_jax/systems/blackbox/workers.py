@@ -22,6 +22,7 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from multiprocessing import Pipe, spawn
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -46,6 +47,9 @@ POLL_SECONDS = 0.5
 """Time between two checks that a silent worker is alive."""
 SLOW_IMPORT_SECONDS = 30.0
 """Time until the log says that a worker is still importing."""
+
+DROPPED = "an answer of a worker belonged to another simulation and was dropped"
+"""The note of a simulation before whose answer there came one to another question."""
 
 REMEMBERED = 1 << 16
 """Simulations of which a pool remembers in which worker they were."""
@@ -322,6 +326,7 @@ class _Worker:
 
     def __init__(self, setup: bytes) -> None:
         self.number = next(_numbers)
+        self.asked = self.dropped = 0
         self.pipe, theirs = Pipe()
         try:
             self.process = subprocess.Popen(
@@ -362,20 +367,34 @@ class _Worker:
     def simulate(self, task: tuple[Features, int], timeout: float | None) -> Outcome | None:
         """Return the outcome of one simulation; None if the process died."""
         begun = time.monotonic()
+        self.asked += 1
         try:
-            self.pipe.send(task)
+            self.pipe.send((self.asked, *task))
             while True:
                 left = math.inf if timeout is None else begun + timeout - time.monotonic()
                 # A process that it has started may hold the pipe open after its death.
                 if self.pipe.poll(min(max(left, 0.0), POLL_SECONDS)):
-                    return self.pipe.recv()
+                    number, outcome = self.pipe.recv()
+                    if number == self.asked:
+                        return self._noted(outcome)
+                    # Such as of a copy of the worker that its simulator has forked.
+                    self.dropped += 1
+                    continue
                 if self.process.poll() is not None:
                     return None
                 if left <= 0:
                     message = f"the simulation took longer than {timeout:zg} s"
                     return Outcome(None, Status.TIMEOUT, message)
-        except (EOFError, OSError):
+        except Exception:  # The pipe is closed, or somebody else has written into it.
             return None
+
+    def _noted(self, outcome: Outcome) -> Outcome:
+        """Return an outcome that says how many answers to other questions came before it."""
+        if not self.dropped or outcome.trace is None:
+            return outcome
+        notes = {**outcome.trace.notes, DROPPED: self.dropped}
+        self.dropped = 0
+        return outcome._replace(trace=replace(outcome.trace, notes=notes))
 
     def kill(self) -> None:
         """Kill the process, and those that it has started."""
@@ -496,11 +515,12 @@ def _answer(pipe: Connection, simulation: Callable[[Features, int], Trace]) -> N
     **Raises:** `EOFError` or `OSError` when the pipe is closed.
     """
     while True:
-        features, seed = pipe.recv()
+        number, features, seed = pipe.recv()
         try:
-            reply = pickle.dumps(Outcome(simulation(features, seed)))
+            reply = pickle.dumps((number, Outcome(simulation(features, seed))))
         except BaseException as error:  # sys.exit() in a simulator is its failure, not our end.
-            reply = pickle.dumps(Outcome(None, Status.ERROR, format_user_error(error)))
+            failed = Outcome(None, Status.ERROR, format_user_error(error))
+            reply = pickle.dumps((number, failed))
         pipe.send_bytes(reply)
 
 

@@ -1,0 +1,52 @@
+"""The problem that a run simulated, made again from the one that a person gives.
+
+    as_simulated(problem, record)       # with the properties of `fuzz`, and with features held
+
+A verb may simulate another problem than the one that it is given: `fuzz` adds properties of its
+own, `--only` holds features. Whoever goes on with the run names the problem as they wrote it.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from verifai_jax.core.lazy import late
+from verifai_jax.problem.problem import Problem
+
+
+def as_simulated(problem: Problem, record: Mapping[str, Any]) -> Problem:
+    """Return the problem that a run recorded, made of the one that was given.
+
+    **Arguments:**
+
+    - `problem`: as a person wrote it, or the one of the run itself, which stays as it is.
+    - `record`: of the run.
+
+    **Returns:** the given problem where nothing was made of it, or where it cannot be made.
+    """
+    problem = _with_held(problem, record)
+    derived = record.get("derived")
+    if derived is None or problem.system.derived is not None:
+        return problem
+    try:
+        return late("verifai_jax.fuzzing.implicit", "as_recorded")(problem, derived)
+    except (TypeError, ValueError, AttributeError, KeyError):
+        return problem  # What differs is said where the two are compared.
+
+
+def _with_held(problem: Problem, record: Mapping[str, Any]) -> Problem:
+    """Hold the features that the run held, at the nominal values of the problem."""
+    space = record.get("space_data")
+    if space is None:
+        return problem
+    held = {name for name, domain in space["features"] if _is_held(domain)}
+    varied = [name for name in problem.space.domains if name not in held]
+    if not held or not varied:
+        return problem
+    try:
+        return problem.only(*varied)
+    except ValueError:
+        return problem
+
+
+def _is_held(domain: object) -> bool:
+    return isinstance(domain, Mapping) and domain.get("kind") == "Fixed"
