@@ -24,7 +24,7 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import SimulationProgress
-from verifai_jax.core.text import format_time
+from verifai_jax.core.text import format_seconds
 from verifai_jax.counterexamples import confirm
 from verifai_jax.counterexamples.description import describe_predicate
 from verifai_jax.counterexamples.fixed_key import hold_key
@@ -404,7 +404,7 @@ def _cause(numbers: _Numbers, features: dict[str, Any], key: Any, number: int) -
         why = replayed.explain()
     except ValueError:
         return rho, ""
-    at = f"{format_time(why.time, 4)} s"
+    at = format_seconds(why.time, 4)
     predicate = why.predicate
     if isinstance(predicate, Predicate):
         return rho, describe_predicate(predicate, why, at)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax.core.figure import Axes, Figure
-from verifai_jax.core.text import format_time
+from verifai_jax.core.text import format_seconds
 from verifai_jax.core.waveform import HELD, Waveform, acting_spans, control_times, is_waveform
 from verifai_jax.counterexamples._explain import Explained, Influence
 from verifai_jax.counterexamples._shrink import Shrunk
@@ -107,7 +107,7 @@ def draw_decision(axes: Axes, why: Explanation) -> None:
         late = place > len(clock) / 2
         # Beside the instant's line, at the end of it that is away from the curve.
         axes.annotate(
-            f"{shown} at {format_time(clock[place], 4)} s",
+            f"{shown} at {format_seconds(clock[place], 4)}",
             (clock[place], 0.05 if values[place] > (low + high) / 2 else 0.93),
             xycoords=("data", "axes fraction"),
             xytext=(-5 if late else 5, 0),

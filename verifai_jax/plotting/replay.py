@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.figure import Axes, Figure
-from verifai_jax.core.text import format_time, shorten
+from verifai_jax.core.text import format_seconds, shorten
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import is_waveform
 from verifai_jax.evaluation.replay import Replay
@@ -347,7 +347,7 @@ def _mark(axes: Axes, trace: Trace, signal: str, sample: int) -> None:
     right = sample > trace.length / 2
     low, high = axes.get_ylim()
     axes.annotate(
-        f"{signal} = {value:.4g} at {format_time(time, 4)} s",
+        f"{signal} = {value:.4g} at {format_seconds(time, 4)}",
         (time, value),
         textcoords="offset points",
         xytext=(-12 if right else 12, -12 if value > (low + high) / 2 else 8),

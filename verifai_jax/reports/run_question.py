@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from verifai_jax.core.text import one_line
+from verifai_jax.core.text import format_seconds, one_line
 from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import parse
@@ -148,7 +148,8 @@ def system_rows(run: Run) -> list[tuple[str, Child]]:
         module = getattr(function, "__module__", "") or ""
         rows.append(("system", element("code", f"{module}.{name}".removeprefix("__main__."))))
         if not problem.black_box and (form := problem.form()) is not None and form.dt is not None:
-            rows.append(("duration", f"{problem.duration:g} s, a sample every {form.dt:g} s"))
+            lasts, period = format_seconds(problem.duration), format_seconds(form.dt)
+            rows.append(("duration", f"{lasts}, a sample every {period}"))
         rows.append(("kind", "black box" if problem.black_box else "traced by JAX"))
         if system.exact_step:
             rows.append(("integration step", "belongs to the system, as its authors published it"))
