@@ -53,7 +53,7 @@ from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.validation import check_options
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl.formula import Predicate
-from verifai_jax.problem.dependence import depends_on_key
+from verifai_jax.problem.dependence import depends_on_key, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.binomial import clopper_pearson
 
@@ -201,7 +201,8 @@ class _Numbers:
 
 
 def _has_slopes(problem: Problem) -> bool:
-    return not problem.black_box and 0 in problem.space.levels
+    slopes = not problem.black_box and 0 in problem.space.levels
+    return slopes and without_derivative(problem) is None
 
 
 def _constraint(space: FeatureSpace) -> Any:

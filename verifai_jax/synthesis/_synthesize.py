@@ -25,7 +25,7 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.precision import in_precision
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification.validation import check_options, check_search, usual_batch
-from verifai_jax.problem.dependence import depends_on_key
+from verifai_jax.problem.dependence import depends_on_key, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.max_min import max_min_step
@@ -402,7 +402,13 @@ def feature_parameters(
         wanted=backend,
     )  # fmt: skip
     choice.problem.check()
-    wanted = not several if gradient is None else gradient
+    lacking = without_derivative(choice.problem)
+    if gradient and lacking is not None:
+        raise ValueError(
+            f"the system of problem {problem.name!r} has no gradient: {lacking} has no derivative; "
+            "leave gradient out, and parameters are chosen by cross-entropy"
+        )
+    wanted = lacking is None and not several if gradient is None else gradient
     return FeatureParameters(
         choice.problem, parameters, batch=batch, gradient=wanted, precision=precision, seed=seed
     )

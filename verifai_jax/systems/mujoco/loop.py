@@ -17,7 +17,13 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from verifai_jax.systems.base import Seed
 from verifai_jax.systems.mujoco.bindings import Bindings, RecordingFeatures
 from verifai_jax.systems.mujoco.model import Place, names, reading
-from verifai_jax.systems.pytree_checks import check_like, check_signals, outline
+from verifai_jax.systems.pytree_checks import (
+    as_precise_as,
+    check_like,
+    check_signals,
+    in_working_precision,
+    outline,
+)
 
 Features = Mapping[str, Any]
 Signals = Mapping[str, str | Callable[..., Any]] | Callable[..., Mapping[str, Any]]
@@ -167,9 +173,7 @@ class Loop:
 
     def initial_progress(self) -> Progress:
         """Return the progress before the first sample."""
-        return Progress(
-            jax.tree.map(jnp.asarray, self.controller_memory), jnp.int32(0), jnp.array(True)
-        )
+        return Progress(in_working_precision(self.controller_memory), jnp.int32(0), jnp.array(True))
 
     def sample(
         self, k: Int[Array, ""], arrays: Mapping[str, Array], progress: Progress, features: Features
@@ -213,7 +217,8 @@ class Loop:
         if self.controller_memory is None:
             control = self.controller(state.time, state, features)
         else:
-            control, memory = self.controller(state.time, state, memory, features)
+            control, after = self.controller(state.time, state, memory, features)
+            memory = as_precise_as(after, memory)
         control = jnp.asarray(control, state.time.dtype)
         return control.reshape(nu), memory
 
@@ -281,7 +286,7 @@ class Loop:
             watched = RecordingFeatures(features, used)
             start = self.start(watched, key)
             state, sensors = self.state(jnp.zeros((), jnp.result_type(float)), start)
-            memory = jax.tree.map(jnp.asarray, self.controller_memory)
+            memory = in_working_precision(self.controller_memory)
             if self.controller is not None:
                 self._check_controller(state, memory, watched)
             control, _ = self.control(state, memory, watched)
@@ -314,7 +319,7 @@ class Loop:
             if not (isinstance(decided, tuple) and len(decided) == 2):
                 raise ValueError(f"controller must return {role}; got {outline(decided)}")
             control = decided[0]
-            check_like(decided[1], memory, "controller", role)
+            check_like(decided[1], memory, "controller", role, same_precision=False)
         shape = getattr(control, "shape", None) if not np.isscalar(control) else ()
         if shape != (nu,) and not (shape == () and nu == 1):
             known = ", ".join(names(self.compiled, "actuator"))
