@@ -54,6 +54,9 @@ PICTURES = click.option(
 )
 """Pictures can be left out."""
 
+KEEP_GOING = click.option(
+    "--keep-going", is_flag=True, help="Simulate on where all of the first simulations raise."
+)
 PROGRESS = click.option(
     "--progress/--no-progress",
     default=None,

@@ -9,6 +9,7 @@ from verifai_jax.cli.arguments import (
     BACKEND,
     BATCH,
     CLUSTER,
+    KEEP_GOING,
     MAX_SECONDS,
     ONLY,
     PICTURES,
@@ -76,6 +77,7 @@ if TYPE_CHECKING:
     help="Of kinds that differ in this  [default: inputs]",
 )
 @RUN_FOLDER
+@KEEP_GOING
 @PICTURES
 @PROGRESS
 @fail_on(
@@ -105,6 +107,7 @@ def falsify(
     diverse: bool,
     diverse_by: Literal["inputs", "behaviour"] | None,
     folder: Path | None,
+    keep_going: bool,
     pictures: bool,
     progress: bool | None,
     fail_on: Gate | None,
@@ -153,6 +156,7 @@ def falsify(
                 progress=progress,
                 executor=executor,
                 even_if_changed=even_if_changed,
+                keep_going=keep_going,
             )
     elif target is None:
         raise click.UsageError("Missing argument 'TARGET', such as specs/cartpole.py:balance.")
@@ -186,6 +190,7 @@ def falsify(
                 progress=progress,
                 target=target,
                 executor=executor,
+                keep_going=keep_going,
             )
     print_run(run, pictures)
     check_run(run, fail_on)

@@ -8,7 +8,7 @@
 All else has a default here: a system offers more by overriding it.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import jax
@@ -16,6 +16,9 @@ from jaxtyping import Array, Int, Key, PyTree
 
 from verifai_jax.core.compilation import Effort
 from verifai_jax.core.trace import Status, Trace
+
+KnownSignals: TypeAlias = tuple[str, ...] | Mapping[str, int] | None
+"""Names of signals, or names with their numbers of components, 1 for a scalar; None if unknown."""
 
 Features: TypeAlias = PyTree
 """The features of one simulation, as `FeatureSpace.unflatten` gives them; or of a batch."""
@@ -93,8 +96,11 @@ class System:
         return jax.eval_shape(self, features, jax.eval_shape(lambda: jax.random.key(0)))
 
     @property
-    def known_signals(self) -> tuple[str, ...] | None:
-        """Names of the signals of a trace, of a system without `abstract`; None where unknown."""
+    def known_signals(self) -> KnownSignals:
+        """Signals of a trace, of a system without `abstract`: names, with components where known.
+
+        None where nothing but a simulation can tell.
+        """
         return None
 
     @property
