@@ -108,6 +108,22 @@ def test_a_system_of_many_at_once_ends_after_its_first_round():
         )
 
 
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", ["always raises", "unknown signal"])
+def test_other_verbs_end_too(name):
+    function, formula, says = HOPELESS[name]
+    asked = problem(function, formula)
+    for verb in (
+        lambda: vj.estimate(asked, budget=3000, progress=False),
+        lambda: vj.compare(asked, {"other": asked}, budget=2000),
+        lambda: vj.analysis.sobol_indices(asked, samples=64),
+    ):
+        CALLS.clear()
+        with pytest.raises(RuntimeError, match=rf"each of the first 16 simulations .*{says}"):
+            verb()
+        assert len(CALLS) == 16
+
+
 def test_what_is_known_of_signals_is_checked_before():
     declared = problem(_trace, "always p > 0", signals={"x": 1, "p": 2})
     with pytest.raises(TypeError, match="signal 'p' is a vector of 2 components"):

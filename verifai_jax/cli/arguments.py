@@ -146,6 +146,13 @@ PARAMETER_CHOICE = all_of(
         "--held-out", type=int, default=2000, show_default=True, help="Simulations of the result."
     ),
     click.option(
+        "--mass",
+        type=float,
+        default=0.999,
+        show_default=True,
+        help="Probability of the part of the prior that is attacked; 1 for all of it.",
+    ),
+    click.option(
         "--gradient/--no-gradient",
         default=None,
         help="Improve by gradients  [default: where the system has them]",

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Integer
 
+from verifai_jax.core.text import one_line
 from verifai_jax.core.trace import Status
 
 ALIKE = 16
@@ -28,6 +29,10 @@ FEW = 3
 
 _VARIES = re.compile(r"[-+]?\d[\d.]*(?:e[-+]?\d+)?")
 """What tells messages of one kind apart: the numbers in them."""
+
+
+class AlwaysRaises(RuntimeError):
+    """All simulations of some work raise, so that it ends before its budget is spent."""
 
 
 class Raising:
@@ -49,6 +54,18 @@ class Raising:
         for message in messages or ("",):
             self._first = self._first or message
             self._kinds.add(_VARIES.sub("0", message))
+
+    def check(self, name: str) -> None:
+        """End the work on the problem of this name where all of its simulations raise.
+
+        **Raises:** `AlwaysRaises`.
+        """
+        if (said := self.reason) is not None:
+            raise AlwaysRaises(
+                f"each of the first {self._count} simulations of problem {name!r} raised"
+                f"{f' {one_line(said)}' if said else ' an error'}, so the others are not made; "
+                "falsify(problem, 'uniform', 20, keep_going=True).table.all shows them"
+            )
 
     @property
     def reason(self) -> str | None:

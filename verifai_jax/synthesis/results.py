@@ -30,7 +30,8 @@ class Synthesis:
     `attacks`: environments that were tried against the best parameters; `converged`: whether the
     last attack found no environment worse than those of the set; `simulations` (without
     those of the check), `without_verdict` and `seconds`; `stopped`: `"converged"`, `"budget"`,
-    `"max_seconds"`, `"no verdict"` or `"interrupted"`; `problem`: the one given; `seed`.
+    `"max_seconds"`, `"no verdict"` or `"interrupted"`; `problem`: the one given; `seed`;
+    `varied`: what was chosen, what the environment varied, and how far.
     """
 
     problem: Problem = field(repr=False)
@@ -47,6 +48,7 @@ class Synthesis:
     seconds: float
     stopped: str
     seed: int
+    varied: str = ""
 
     @property
     def holds(self) -> bool:
@@ -90,6 +92,8 @@ class Synthesis:
             )
         elif around:
             lines.append("  not checked in held-out environments")
+        if self.varied:
+            lines.append(f"  {self.varied}")
         found, of = len(self.robust), len(self.candidates)
         if around:
             over = f"over {len(self.environments)} environments"
