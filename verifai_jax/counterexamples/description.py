@@ -161,8 +161,8 @@ def format_spans(spans: list[Span]) -> str:
             joined[-1] = Span(joined[-1].begin, max(span.end, joined[-1].end))
         else:
             joined.append(span)
-    spans = [(format_seconds(s.begin, 3), format_seconds(s.end, 3)) for s in joined]
-    return _listed([f"from {begin} to {end}" for begin, end in spans])
+    ends = [(format_seconds(s.begin, 3), format_seconds(s.end, 3)) for s in joined]
+    return _listed([f"from {begin} to {end}" for begin, end in ends])
 
 
 def describe_gradient(influences: Sequence[Influence]) -> str:

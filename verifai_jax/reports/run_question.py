@@ -147,8 +147,9 @@ def system_rows(run: Run) -> list[tuple[str, Child]]:
         name = getattr(function, "__qualname__", type(system).__qualname__)
         module = getattr(function, "__module__", "") or ""
         rows.append(("system", element("code", f"{module}.{name}".removeprefix("__main__."))))
-        if not problem.black_box and (form := problem.form()) is not None and form.dt is not None:
-            lasts, period = format_seconds(problem.duration), format_seconds(form.dt)
+        form, duration = (None, None) if problem.black_box else (problem.form(), problem.duration)
+        if form is not None and form.dt is not None and duration is not None:
+            lasts, period = format_seconds(duration), format_seconds(form.dt)
             rows.append(("duration", f"{lasts}, a sample every {period}"))
         rows.append(("kind", "black box" if problem.black_box else "traced by JAX"))
         if system.exact_step:
