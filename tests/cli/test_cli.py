@@ -328,7 +328,9 @@ def test_exit_codes(call, tmp_path, monkeypatch):
     assert output.splitlines()[-1] == last
     broken = ("falsify", "specs/broken.py:raising", *few)
     output = call(*broken, "--fail-on", "counterexample", code=3)
-    ended = "ended after 16 of 32 simulations, since none succeeds: each raised RuntimeError: no road"
+    ended = (
+        "ended after 16 of 32 simulations, since none succeeds: each raised RuntimeError: no road"
+    )
     assert f"{ended} (specs/broken.py, line 6" in output
     assert output.rstrip().endswith("keep_going=True, or --keep-going, simulates all")
     output = call(*broken, "--keep-going", code=3)

@@ -281,7 +281,7 @@ class Repair:
             lines.append("  not checked in held-out environments")
         if self.found and self.held_out_after is not None and not self.held_out_after.passed:
             lines.append(
-                "  the check found what the attacks did not: try a larger budget or margin"
+                "  the check found what the attacks did not: try a larger budget, margin or mass"
             )
         checks = (self.held_out_before, self.held_out_after)
         if all(check is not None and check.simulations and not check.failures for check in checks):
