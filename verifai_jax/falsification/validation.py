@@ -190,8 +190,8 @@ def adapt_search(
     **Raises:** `ValueError` for a search that needs gradients, and a system with a step that has no
     derivative.
     """
-    lacking = None if problem.black_box else without_derivative(problem)
-    if lacking is not None and needs_gradient(search):
+    lacking = without_derivative(problem) if needs_gradient(search) else None
+    if lacking is not None:
         raise ValueError(
             f"search {search!r} follows gradients, and the system of problem {problem.name!r} has "
             f"none: {lacking} has no derivative. Use a search that needs none, such as 'portfolio' "
@@ -210,7 +210,7 @@ def adapt_search(
         why = "a priority has no gradient"
     elif not len(problem.space.cube.continuous):
         why = "all features are discrete"
-    elif lacking is not None:
+    elif (lacking := without_derivative(problem)) is not None:
         why = f"{lacking} has no derivative"
     elif problem.guide is None and not has_gradient(problem):
         why = "the robustness is constant almost everywhere"

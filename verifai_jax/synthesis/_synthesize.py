@@ -413,13 +413,14 @@ def feature_parameters(
         wanted=backend,
     )  # fmt: skip
     choice.problem.check()
-    lacking = without_derivative(choice.problem)
+    follows = gradient or (gradient is None and not several)
+    lacking = without_derivative(choice.problem) if follows else None
     if gradient and lacking is not None:
         raise ValueError(
             f"the system of problem {problem.name!r} has no gradient: {lacking} has no derivative; "
             "leave gradient out, and parameters are chosen by cross-entropy"
         )
-    wanted = lacking is None and not several if gradient is None else gradient
+    wanted = bool(follows) and lacking is None
     return FeatureParameters(
         choice.problem, parameters, batch=batch, gradient=wanted, precision=precision, seed=seed
     )
