@@ -90,6 +90,15 @@ def test_where_some_succeed_the_run_goes_on_with_the_same_rows(function):
 
 
 @pytest.mark.thorough
+def test_a_small_grid_is_simulated_whole():
+    grid = vj.search.Grid(points=5)
+    run = vj.falsify(problem(_trace), grid, 100, progress=False, confirm=False)
+    assert (run.simulations, run.stopped) == (5, "exhausted")
+    with pytest.raises(vj.RunError, match="ended after 16 of 100 simulations"):
+        vj.falsify(problem(_raises), vj.search.Grid(points=50), 100, progress=False)
+
+
+@pytest.mark.thorough
 def test_a_system_of_many_at_once_ends_after_its_first_round():
     def together(features):
         raise KeyError("mass")

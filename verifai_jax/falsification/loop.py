@@ -244,7 +244,8 @@ class Rounds:
     @property
     def exhausted(self) -> bool:
         """True where a finite search has come to its end."""
-        return self._proposals.exhausted and (self._ahead is None or self._ahead.empty)
+        waiting = self._pending is not None or (self._ahead is not None and not self._ahead.empty)
+        return self._proposals.exhausted and not waiting
 
     @property
     def acceptance(self) -> float | None:
