@@ -69,7 +69,7 @@ class Raising:
 
     @property
     def reason(self) -> str | None:
-        """What all say, empty where they say nothing; None where others may still succeed."""
+        """The message of all, empty where they have none; None where others may still succeed."""
         alike = ALIKE if time.monotonic() - self._since < LONG else FEW
         enough = self._count >= (alike if len(self._kinds) == 1 else ANY)
         return self._first if self.always and enough else None

@@ -191,7 +191,7 @@ class Rounds:
 
     @property
     def hopeless(self) -> str | None:
-        """What all simulations raise, so that more of them say nothing else; None otherwise."""
+        """The message of all simulations, where more of them would only say it again; else None."""
         measured = self._simulations.hopeless
         return self._raising.reason if measured is None else measured
 

@@ -35,7 +35,7 @@ from verifai_jax.problem.problem import Problem
 
 
 class Slopes(NamedTuple):
-    """What is known of the derivative of a robustness by the features.
+    """The derivative of a robustness by the features, as far as it is known without simulating.
 
     - `depends`: whether it can be anything but zero.
     - `lacking`: the steps on its way that have no derivative, for people; often none.
