@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
+from verifai_jax.core.text import format_seconds
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import (
     FALSE,
@@ -137,7 +138,7 @@ def test_writes(formula, text):
         ("a & & b", "but found '&'"),
         ("x = 1", "'=' is no comparison: write == for equal, >= or <="),
         ("0 < x < 1", "comparisons do not chain: write (0 < x) & (x < 1)"),
-        ("G[0,2 a", "expected a unit (s, ms, us, ns, min) or ']', but found 'a'"),
+        ("G[0,2 a", "expected a unit (s, ms, us, ns, min, h, d) or ']', but found 'a'"),
         ("G[0] a", "expected ',' or ':', but found ']'"),
         ("x ? 1", "but found '?'"),
         ("foo(x) > 1", "unknown function 'foo'"),
@@ -165,7 +166,7 @@ def test_writes(formula, text):
         ("alwys x < 1", "but found 'x'; did you mean 'always' instead of 'alwys'?"),
         ("evntually[0,2] x < 1", "; did you mean 'eventually' instead of 'evntually'?"),
         ("x > 1 untl y > 1", "but found 'untl'"),
-        ("abs > 1", "abs is a function: write abs(...), or quote it if it is a signal"),
+        ("abs > 1", "abs is a function: write abs(x), or quote it if it is a signal"),
         ("p[1.5] > 2", "a component is a signal and a whole number, as in p[0]"),
         ("(x + y)[0] > 2", "a component is a signal and a whole number"),
     ],
@@ -344,3 +345,67 @@ def test_a_text_beyond_the_limits_is_refused_at_once(text, said):
     assert said in message
     assert "^" in message.splitlines()[-1]
     assert len(message) < 2000
+
+
+@pytest.mark.parametrize(
+    ("text", "offers"),
+    [
+        (
+            "always[0,2](x)>0 and y>0",
+            ["always[0,2] ((x)>0 and y>0)", "(always[0,2](x)>0) and y>0"],
+        ),
+        (
+            "always x > 0 and always y > 0 and z > 0",
+            [
+                "always (x > 0 and always (y > 0 and z > 0))",
+                "(always x > 0) and (always y > 0) and z > 0",
+            ],
+        ),
+        (
+            "always eventually x > 0\n  -> y > 0",
+            ["always eventually (x > 0 -> y > 0)", "(always eventually x > 0) -> y > 0"],
+        ),
+        ("!once x|y", ["!once (x|y)", "(!once x)|y"]),
+        ("a U[0,1] b U c U d", ["a U[0,1] (b U (c U d))", "((a U[0,1] b) U c) U d"]),
+        ("0 < x < y < 1", ["(0 < x) & (x < y) & (y < 1)"]),
+        ("0 < 1 < x", []),
+        ("G[5,-1] x", []),
+        ("always " + "a" * 400 + " & b", []),
+    ],
+)
+def test_what_an_error_offers_can_be_read(text, offers):
+    with pytest.raises(FormulaSyntaxError) as caught:
+        parse(text)
+    said = str(caught.value).split("\n")[0]
+    assert said.endswith(f"write {' or '.join(offers)}") if offers else "write" not in said
+    for offer in offers:
+        parse(offer)
+
+
+def test_units_of_time():
+    assert parse("G[0, 2 h] x") == parse("G[0, 120 min] x")
+    assert parse("F[1d, 2 d] x") == parse("F[86400, 172800] x")
+    assert parse("G[0,2] d > h") == parse("G[0,2] (d > h)")  # Signals may still be called so.
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.25, "0.25 s"),
+        (599.5, "599.5 s"),
+        (600, "10 min"),
+        (5400.0, "1 h 30 min"),
+        (39780.5, "11 h 3 min 0.5 s"),
+        (86399.9999999, "1 d"),
+        (-7200, "-2 h"),
+        (1700000003.5, "1700000003.5 s"),
+        (float("inf"), "inf s"),
+    ],
+)
+def test_times_are_written_in_the_units_of_a_person(seconds, text):
+    assert format_seconds(seconds) == text
+
+
+def test_a_power_is_offered_with_its_parentheses():
+    with pytest.raises(TypeError, match=r"a power is \(x \+ 1\)\*\*2$"):
+        (X + 1) ^ 2

@@ -55,6 +55,9 @@ PICTURES = click.option(
 )
 """Pictures can be left out."""
 
+KEEP_GOING = click.option(
+    "--keep-going", is_flag=True, help="Simulate on where all of the first simulations raise."
+)
 PROGRESS = click.option(
     "--progress/--no-progress",
     default=None,
@@ -142,6 +145,13 @@ PARAMETER_CHOICE = all_of(
     ),
     click.option(
         "--held-out", type=int, default=2000, show_default=True, help="Simulations of the result."
+    ),
+    click.option(
+        "--mass",
+        type=float,
+        default=0.999,
+        show_default=True,
+        help="Probability of the part of the prior that is attacked; 1 for all of it.",
     ),
     click.option(
         "--gradient/--no-gradient",

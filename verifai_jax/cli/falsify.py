@@ -12,6 +12,7 @@ from verifai_jax.cli.arguments import (
     BACKEND,
     BATCH,
     CLUSTER,
+    KEEP_GOING,
     MAX_SECONDS,
     ONLY,
     PICTURES,
@@ -81,6 +82,7 @@ if TYPE_CHECKING:
     help="Of kinds that differ in this  [default: inputs]",
 )
 @RUN_FOLDER
+@KEEP_GOING
 @PICTURES
 @PROGRESS
 @fail_on(
@@ -110,6 +112,7 @@ def falsify(
     diverse: bool,
     diverse_by: Literal["inputs", "behaviour"] | None,
     folder: Path | None,
+    keep_going: bool,
     pictures: bool,
     progress: bool | None,
     fail_on: Gate | None,
@@ -158,6 +161,7 @@ def falsify(
                 progress=progress,
                 executor=executor,
                 even_if_changed=even_if_changed,
+                keep_going=keep_going,
             )
     elif target is None:
         raise click.UsageError("Missing argument 'TARGET', such as specs/cartpole.py:balance.")
@@ -191,6 +195,7 @@ def falsify(
                 progress=progress,
                 target=target,
                 executor=executor,
+                keep_going=keep_going,
             )
     ends = {"--max-seconds": max_seconds, "--stop-after": stop_after, "--within": within}
     print_run(run, pictures, {**ends, "--decide": decide, "--cluster": cluster})

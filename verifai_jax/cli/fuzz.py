@@ -8,6 +8,7 @@ import click
 from verifai_jax.cli.arguments import (
     BACKEND,
     BATCH,
+    KEEP_GOING,
     MAX_SECONDS,
     PICTURES,
     PRECISION,
@@ -40,6 +41,7 @@ from verifai_jax.cli.json_output import command, give_result
 @PRECISION
 @BACKEND
 @RUN_FOLDER
+@KEEP_GOING
 @PICTURES
 @PROGRESS
 @fail_on(counterexample="if a counterexample was found")
@@ -54,6 +56,7 @@ def fuzz(
     precision: Literal["float32", "float64"] | None,
     backend: str | None,
     folder: Path | None,
+    keep_going: bool,
     pictures: bool,
     progress: bool | None,
     fail_on: Gate | None,
@@ -77,6 +80,7 @@ def fuzz(
             backend=backend,
             progress=progress,
             target=target,
+            keep_going=keep_going,
         )
     print_run(run, pictures, {"--max-seconds": max_seconds, "--stop-after": stop_after})
     parts = [

@@ -29,7 +29,7 @@ from verifai_jax.core.revisions import load_at_revision, split_revision
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.features import FeatureSpace
+from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.problem.problem import Problem, ProblemError
 from verifai_jax.statistics.paired_rates import PairedRates, paired_rates
 
@@ -68,7 +68,8 @@ def compare(
 
     - `baseline`: the problem to compare with: itself, `FILE.py:NAME`, or `FILE.py:NAME@REVISION`
       for the problem as it was at a revision of git.
-    - `candidates`: another one with the same feature space, or several by name.
+    - `candidates`: another one that varies the same features, or several by name. What is held,
+      such as the parameters of a `repair`, may be held at other values, or be missing.
     - `margin`: difference of failure probabilities that does not matter, from 0 on.
     - `confidence`: probability with which all verdicts hold.
     - `budget`: simulations at most, of all problems together.
@@ -82,8 +83,8 @@ def compare(
     **Returns:** the comparison; after Ctrl-C that of the finished pairs.
 
     **Raises:** before anything is simulated, `TypeError` for something that is no `Problem`;
-    `ProblemError` for other feature spaces; `ValueError` for numbers out of range, and for targets
-    that cannot be loaded.
+    `ProblemError` for other features that vary; `ValueError` for numbers out of range, and for
+    targets that cannot be loaded.
     """
     with ExitStack() as loaded:
 
@@ -134,7 +135,7 @@ def _compare(
     for name, problem in problems.items():
         chosen = resolved(problem, batch=BATCH, budget=budget, precision=precision).problem
         evaluators[name] = Evaluator(
-            chosen, BATCH, precision=precision, seed=seed, executor=executor
+            chosen, BATCH, precision=precision, seed=seed, executor=executor, ends_raising=True
         )
     notes = _notes(baseline, named)
     sides = {"baseline": baseline, **named}
@@ -271,30 +272,54 @@ def _check(
     for name, problem in candidates.items():
         problem.check()
         ours, theirs = baseline.space, problem.space
-        if ours.root != theirs.root:
+        if _varying(ours) != _varying(theirs):
             raise ProblemError(
-                f"{name!r} has another feature space than the baseline, so that their samples are "
+                f"{name!r} varies other features than the baseline, so that their samples are "
                 f"not the same: {_difference(ours, theirs)}"
             )
         if (ours.where is None) != (theirs.where is None):
             raise ProblemError(f"only one of {name!r} and the baseline has a constraint")
 
 
+def _varying(space: FeatureSpace) -> list[tuple[str, Domain]]:
+    """Return the features that vary, in their order: samples of the prior are of these alone."""
+    return [(name, domain) for name, domain in space.root.fields if domain.size]
+
+
 def _difference(one: FeatureSpace, other: FeatureSpace) -> str:
-    for feature in dict.fromkeys((*one.domains, *other.domains)):
-        if feature not in other.domains:
-            return f"{feature} is missing there"
-        if feature not in one.domains:
-            return f"{feature} is there only"
-        if one.domains[feature] != other.domains[feature]:
-            return f"{feature} is {one.domains[feature]!r}, there {other.domains[feature]!r}"
+    ours, theirs = dict(_varying(one)), dict(_varying(other))
+    for feature in dict.fromkeys((*ours, *theirs)):
+        if feature not in theirs or feature not in ours:
+            space, where = (other, "there") if feature in ours else (one, "in the baseline")
+            if feature not in space.domains:
+                return f"{feature} is missing {where}"
+            return (
+                f"{feature} varies in one and is held in the other ({where}): compare what varies "
+                f"in both, such as problem.only({', '.join(map(repr, _common(ours, theirs)))})"
+            )
+        if ours[feature] != theirs[feature]:
+            return f"{feature} is {ours[feature]!r}, there {theirs[feature]!r}"
     return "their features are in another order"
+
+
+def _common(one: Mapping[str, Domain], other: Mapping[str, Domain]) -> list[str]:
+    return [name for name in one if name in other]
+
+
+def _held(space: FeatureSpace) -> dict[str, str]:
+    """Return the features that do not vary, as they are told."""
+    return {name: repr(domain) for name, domain in space.root.fields if not domain.size}
 
 
 def _notes(baseline: Problem, candidates: Mapping[str, Problem]) -> tuple[str, ...]:
     own = {name: str(formula) for name, formula in baseline.formulas.items()}
     notes = []
+    held = _held(baseline.space)
     for name, problem in candidates.items():
+        for feature, value in _held(problem.space).items():
+            if held.get(feature) != value:
+                was = f"; in the baseline {held[feature]}" if feature in held else ""
+                notes.append(f"{feature} is held in {name}: {value}{was}")
         theirs = {key: str(formula) for key, formula in problem.formulas.items()}
         if theirs != own:
             notes.append(

@@ -19,6 +19,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Real
 
 from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.text import format_seconds
 
 ABSENT = -1
 """The kind at places behind the last event."""
@@ -150,7 +151,9 @@ class Events:
         )
         if not known or np.ndim(self.kinds) != 1:
             return f"Events of {', '.join(self.names)}"
-        shown = ", ".join(f"{event['kind']} at {event['time']:z.4g} s" for event in self.listed())
+        shown = ", ".join(
+            f"{event['kind']} at {format_seconds(event['time'], 4)}" for event in self.listed()
+        )
         return f"Events({shown or 'none'})"
 
 

@@ -20,8 +20,13 @@ PROGRAM: Any = getattr(jax.extend.core, "ClosedJaxpr", jax.extend.core.Jaxpr)
 
 
 def as_traced(traced: jax.stages.Traced) -> Callable[..., Any]:
-    """Return what was traced as a function of pytrees: no code of a user's runs again."""
-    known = jax.extend.core.jaxpr_as_fun(traced.jaxpr)
+    """Return what was traced as a function of pytrees: no code of a user's runs again.
+
+    What none of its results is computed from is left out, so that it is not differentiated either.
+    """
+    closed = traced.jaxpr
+    used = without_unused(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
+    known = jax.extend.core.jaxpr_as_fun(PROGRAM(used, closed.consts))
     form = jax.tree.structure(traced.out_info)
     return lambda *arguments: jax.tree.unflatten(form, known(*jax.tree.leaves(arguments)))
 
@@ -30,6 +35,17 @@ def used_inputs(program: Any) -> list[bool]:
     """Return which inputs of a program any of its results depends on."""
     results = [True] * len(program.jaxpr.outvars)
     return partial_eval.dce_jaxpr(program.jaxpr, results)[1]
+
+
+def without_unused(program: Any, wanted: Sequence[bool]) -> Any:
+    """Return a program that computes some of the results of another, from the same inputs.
+
+    **Arguments:**
+
+    - `program`: a `Jaxpr`.
+    - `wanted`: which of its results.
+    """
+    return partial_eval.dce_jaxpr(program, list(wanted), instantiate=True)[0]
 
 
 def as_function(program: Any, step: Any) -> tuple[Callable[..., list[Any]], list[Any]]:

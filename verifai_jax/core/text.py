@@ -31,6 +31,38 @@ def format_time(seconds: float, digits: int = 6) -> str:
     return repr(round(float(seconds), 6)).removesuffix(".0")
 
 
+_UNITS_OF_TIME = (("d", 86_400), ("h", 3600), ("min", 60))
+"""Units of time above the second, as formulas take them, by their seconds."""
+LONG = 600.0
+"""Seconds from which on a time is written in minutes, hours and days; ..."""
+STAMPS = 1e8
+"""... up to this, three years: what is later is a stamp of a calendar's clock, not a duration."""
+
+
+def format_seconds(seconds: float, digits: int = 6) -> str:
+    """Write a time with its unit, from ten minutes on in those of a person: `11 h 3 min 0.5 s`.
+
+    Nothing is rounded away that `format_time` would write. Stamps, such as 1700000003.5 s since
+    1970, stay in seconds.
+
+    **Arguments:**
+
+    - `seconds`: instant or duration.
+    - `digits`: of one below ten minutes.
+    """
+    if not LONG <= abs(seconds) < STAMPS:
+        return f"{format_time(seconds, digits)} s"
+    rest, parts = round(abs(seconds), 6 if digits > 4 else 2), []
+    for unit, size in _UNITS_OF_TIME:
+        count, rest = divmod(rest, size)
+        if count:
+            parts.append(f"{int(count)} {unit}")
+    rest = round(rest, 6 if digits > 4 else 2)
+    if rest:
+        parts.append(f"{rest:.8g} s")
+    return f"{'-' * (seconds < 0)}{' '.join(parts)}"
+
+
 MOST_ENTRIES = 4
 """Numbers of one feature that are written one by one; of more, their range."""
 

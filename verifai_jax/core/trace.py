@@ -25,7 +25,7 @@ from verifai_jax.core.checks import check_name, is_number
 from verifai_jax.core.gaps import known_times, with_gaps
 from verifai_jax.core.lazy import late
 from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.text import format_time
+from verifai_jax.core.text import format_seconds
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -279,13 +279,13 @@ class Trace(InNotebook):
         """Return the number of samples, the clock, and how it ended."""
         count = f"{self.length} sample{'s' * (self.length != 1)}"
         if self.dt is not None:
-            text = f"{count} every {self.dt:zg} s"
+            text = f"{count} every {format_seconds(self.dt)}"
         else:
             known = not isinstance(self.times, Tracer | jax.ShapeDtypeStruct)
             text = count
             if known:
-                first, last = (format_time(float(self.clock()[i])) for i in (0, -1))
-                text += f" from {first} s to {last} s"
+                first, last = (format_seconds(float(self.clock()[i])) for i in (0, -1))
+                text += f" from {first} to {last}"
         for name in ("valid", "status"):
             code = getattr(self, name)
             if code is None or np.shape(code) or not _is_known(code):

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Real
 from verifai_jax.core.checks import is_number
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.interpolation import between, monotone_cubic
+from verifai_jax.core.text import format_seconds
 
 HOLDS = ("linear", "constant", "pchip", "pulse")
 """Courses between control points: lines, the value of the one before, a monotone cubic through
@@ -74,7 +75,7 @@ class Waveform:
         duration = check_duration(duration)
         if self.times is not None and self.times[-1] > duration * (1 + 1e-6):
             raise ValueError(
-                f"the times of a Signal must lie in its duration of {duration:zg} s; "
+                f"the times of a Signal must lie in its duration of {format_seconds(duration)}; "
                 f"got {self.times[-1]:zg}"
             )
         return replace(self, duration=duration)
@@ -146,7 +147,7 @@ class Waveform:
         return xp.where(on.reshape(on.shape + (1,) * (knots.ndim - 1)), knots[piece], 0)
 
     def __repr__(self) -> str:
-        over = "" if self.duration is None else f", over {self.duration:zg} s"
+        over = "" if self.duration is None else f", over {format_seconds(self.duration)}"
         at = "" if self.times is None else f" at {_listed(self.times)} s"
         return f"Waveform({self._outline()}{at}, {self.hold}{over})"
 

@@ -219,7 +219,7 @@ def _replay_batch(
     if problem.black_box:
         replays: Replays | HostReplays = HostReplays(problem, precision, key)
     else:
-        replays = Replays(problem, precision, key, features)
+        replays = Replays(problem, precision, key)
     numbers = np.array([entry.row for _, entry, _ in batch], np.int32)
     [verdicts] = replays(1, [features], numbers)
     again = None

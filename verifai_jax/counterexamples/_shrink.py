@@ -26,6 +26,7 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.text import format_seconds
 from verifai_jax.counterexamples.candidates import Candidates
 from verifai_jax.counterexamples.fixed_key import fix_key
 from verifai_jax.counterexamples.minimize_count import grow, minimize_count, revert_features
@@ -532,7 +533,7 @@ def _of(count: int, d: int) -> str:
 
 
 def _events(events: Events) -> str:
-    each = [f"{event['kind']} at {event['time']:z.4g} s" for event in events.listed()]
+    each = [f"{event['kind']} at {format_seconds(event['time'], 4)}" for event in events.listed()]
     return f"{len(each)} event{'s' * (len(each) != 1)}{': ' * bool(each)}{', '.join(each)}"
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from verifai_jax.core.text import format_time
+from verifai_jax.core.text import format_seconds
 from verifai_jax.counterexamples.influence import Influence, Span
 from verifai_jax.mtl import Explanation, robustness_signal
 from verifai_jax.mtl._explain import heading
@@ -71,7 +71,7 @@ def describe(
 
 def describe_verdict(name: str, row: int, why: Explanation) -> str:
     """Write which predicate decides, when, by how much, and through which sub-formulas."""
-    at = f"{format_time(why.time, 4)} s"
+    at = format_seconds(why.time, 4)
     formula = str(why.formula)
     first = f"Row {row} of {name} breaks  {formula}  with robustness {why.robustness:z.4g}"
     predicate = why.predicate
@@ -161,7 +161,8 @@ def format_spans(spans: list[Span]) -> str:
             joined[-1] = Span(joined[-1].begin, max(span.end, joined[-1].end))
         else:
             joined.append(span)
-    return _listed([f"from {s.begin:z.3g} s to {s.end:z.3g} s" for s in joined])
+    ends = [(format_seconds(s.begin, 3), format_seconds(s.end, 3)) for s in joined]
+    return _listed([f"from {begin} to {end}" for begin, end in ends])
 
 
 def describe_gradient(influences: Sequence[Influence]) -> str:

@@ -36,7 +36,7 @@ from verifai_jax.estimation.normal_space import LimitState
 from verifai_jax.estimation.result import METHODS, Estimate
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification.validation import check_options
-from verifai_jax.problem.dependence import depends_on_key
+from verifai_jax.problem.dependence import depends_on_key, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.binomial import clopper_pearson
 
@@ -214,7 +214,8 @@ def _result(
 
 def _differentiates(problem: Problem) -> bool:
     """Return whether the searches take gradients: in few dimensions chains do without."""
-    return not problem.black_box and problem.space.levels.count(0) >= GRADIENTS_FROM
+    many = not problem.black_box and problem.space.levels.count(0) >= GRADIENTS_FROM
+    return many and without_derivative(problem) is None
 
 
 def _constraint(problem: Problem) -> Callable[[np.ndarray], np.ndarray]:

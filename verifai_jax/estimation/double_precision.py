@@ -106,7 +106,7 @@ class DoublePrecisionEvaluator:
                 lambda: _with_space(original, FlattenedFeatures(space, precision)),
             )
         self._evaluator = Evaluator(
-            problem, batch, precision=precision, seed=seed, executor=executor
+            problem, batch, precision=precision, seed=seed, executor=executor, ends_raising=True
         )
         self._differentiated: Evaluator | None = None
         self._problem, self._precision, self._seed = problem, precision, seed

@@ -133,12 +133,8 @@ class Confirmer:
         """
         if self._plan is not None or self.problem.black_box or self.other is not None:
             return
-        space = self.problem.space
-        features = jax.tree.map(
-            lambda form: np.zeros((1, *form.shape), form.dtype), space.feature_form
-        )
         with suppress(Exception):
-            self._plan = _make_plan(self, space.rows(features))
+            self._plan = _make_plan(self)
 
     def __call__(
         self,
@@ -164,7 +160,7 @@ class Confirmer:
             return Checked(np.empty(0, object), {}, np.zeros(0), [], ())
         run = np.asarray(rows["rho"], np.float64) if "rho" in rows else None
         if self._plan is None:
-            self._plan = _make_plan(self, rows)
+            self._plan = _make_plan(self)
         if not self.checked:
             self.checked = describe_checks(self._plan.checks, self.problem.system.exact_step)
         most = max(MOST, COST // self._plan.cost) if self.most is None else self.most
@@ -214,7 +210,7 @@ class Confirmer:
         """
         if self.problem.black_box and not self.wavers:
             if self._plan is None:
-                self._plan = _make_plan(self, {})
+                self._plan = _make_plan(self)
             if self._plan.plain:
                 return max(REPEATED, simulations // SHARE_REPEATED)
         return max(LIMIT, simulations // SHARE)
@@ -359,10 +355,10 @@ class _Plan(NamedTuple):
         return max(1, sum(check.factor for check in self.checks.values()))
 
 
-def _make_plan(confirmer: Confirmer, rows: Mapping[str, np.ndarray]) -> _Plan:
+def _make_plan(confirmer: Confirmer) -> _Plan:
     problem, run = confirmer.problem, confirmer.precision
     checks: dict[str, _Check] = {}
-    own = _replays(problem, confirmer, rows)
+    own = _replays(problem, confirmer)
     base, precision, notes, raised = own.replays, own.precision, list(own.notes), own.raised
     refined = False
     if base is not None:
@@ -374,15 +370,14 @@ def _make_plan(confirmer: Confirmer, rows: Mapping[str, np.ndarray]) -> _Plan:
             for name, factor in FINER.items():
                 checks[name] = _Check(base, factor, precision)
             if precision != run:
-                first = {column: values[:1] for column, values in rows.items()}
-                single = Replays(problem, run, base.key, problem.space.features_of(first, run))
+                single = Replays(problem, run, base.key)
                 checks[SINGLE] = _Check(single, FINER["quarter_step"], run)
         else:
             notes.append(f"not checked at a finer step: {reason}")
         if not problem.black_box:
             checks["nudged"] = _Check(base, FINER["quarter_step"] if refined else 1, precision)
     if confirmer.other is not None:
-        other = _replays(confirmer.other, confirmer, rows)
+        other = _replays(confirmer.other, confirmer)
         notes += [f"the other simulator: {note}" for note in other.notes]
         raised = raised or (other.raised and f"the other simulator: {other.raised}")
         if other.replays is not None:
@@ -407,7 +402,7 @@ class _Base(NamedTuple):
     raised: str = ""
 
 
-def _replays(problem: Problem, confirmer: Confirmer, rows: Mapping[str, np.ndarray]) -> _Base:
+def _replays(problem: Problem, confirmer: Confirmer) -> _Base:
     """Return the replays of a problem's rows in the finest precision that it can be traced in."""
     run, key = confirmer.precision, run_keys(confirmer.seed)[1]
     if problem.black_box:
@@ -416,18 +411,16 @@ def _replays(problem: Problem, confirmer: Confirmer, rows: Mapping[str, np.ndarr
             return _Base(HostReplays(problem, run, key), run, notes)
         replays = ExecutorReplays(problem, run, key, confirmer.executor, confirmer.target)
         return _Base(replays, run, notes)
-    # All of one form: one row is enough to trace.
-    first = {name: column[:1] for name, column in rows.items()}
     note = "not checked in float64: in it the system would draw other random numbers"
     if run != "float64" and problem.system.can_refine:
         # It is traced in this precision in any case.
         with suppress(Exception):
-            single = Replays(problem, run, key, problem.space.features_of(first, run))
+            single = Replays(problem, run, key)
             if single.draws:
                 return _Base(single, run, (note,))
     raised = ""
     try:
-        replays = Replays(problem, "float64", key, problem.space.features_of(first, "float64"))
+        replays = Replays(problem, "float64", key)
         if not (replays.draws and run != "float64"):
             return _Base(replays, "float64", ())
     except Exception as error:
@@ -436,7 +429,7 @@ def _replays(problem: Problem, confirmer: Confirmer, rows: Mapping[str, np.ndarr
         if run == "float64":
             return _Base(None, run, (note,), raised)
     try:
-        replays = Replays(problem, run, key, problem.space.features_of(first, run))
+        replays = Replays(problem, run, key)
         return _Base(replays, run, (note,), raised)
     except Exception as error:
         again = f"not simulated again: {format_error(error)}"

@@ -197,6 +197,12 @@ class Engine:
         """
         try:
             return trace()
+        except TypeError as error:
+            if not self.gradient or self._derivative.reverse or "custom_vjp" not in str(error):
+                raise
+            # A function that brings a derivative for reverse mode alone.
+            self._derivative = self._derivative.by("reverse")
+            return trace()
         except ValueError as error:
             if not (self.gradient and self._derivative.reverse and reverse_refused(error)):
                 raise

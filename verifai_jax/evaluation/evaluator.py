@@ -20,6 +20,7 @@ from verifai_jax.evaluation.engine import Engine, engine_for
 from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.raising import ALIKE, Raising
 from verifai_jax.evaluation.steering import NOTHING, Steering
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
@@ -43,6 +44,7 @@ class Evaluator:
     - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
     - `keep_traces`: whether verdicts come with traces; in this process.
     - `given`: whether rows of features that somebody gave (`given_rows`) may be among the points.
+    - `ends_raising`: whether a call raises `AlwaysRaises` where all of the first simulations raise.
     """
 
     def __init__(
@@ -60,7 +62,9 @@ class Evaluator:
         steering: Steering = NOTHING,
         keep_traces: bool = False,
         given: bool = False,
+        ends_raising: bool = False,
     ) -> None:
+        self._raising = Raising() if ends_raising else None
         self.problem, self.batch = problem, batch
         self.given = given and problem.space.width > 0
         # Points are float32 whatever the precision; what a person gives is not.
@@ -121,6 +125,8 @@ class Evaluator:
         - `u`: points of the unit cube, or rows of given features.
         - `temperature`: of the smooth robustness that is differentiated, one for all or one each.
         - `first`: number of the first simulation; numbers go on from those before when left out.
+
+        **Raises:** `AlwaysRaises` where it was asked for.
         """
         start = self.simulations if first is None else first
         u = self._with_values(u)
@@ -129,15 +135,19 @@ class Evaluator:
             self.simulations = start + count
             verdicts = self.engine.evaluate(u, self.key, start, temperature)
             count_done(count)
+            self._check_raising(verdicts)
             return verdicts
-        for begin in range(0, count, self.batch):
-            block = slice(begin, begin + self.batch)
+        begin = 0
+        while begin < count:
+            block = slice(begin, begin + self._size(min(self.batch, count - begin)))
             some = temperature[block] if isinstance(temperature, np.ndarray) else temperature
-            points = u if count <= self.batch else u[block]
+            points = u if block.stop - block.start >= count else u[block]
             if points.dtype != self._dtype:
                 points = np.asarray(points, self._dtype)
             parts.append(self.engine.evaluate(points, self.key, start + begin, some))
             count_done(len(points))
+            self._check_raising(parts[-1])
+            begin = block.stop
         self.simulations = start + count
         if not parts:
             return Verdicts.nothing(len(self.problem.formulas), self.problem.space.dim)
@@ -151,6 +161,24 @@ class Evaluator:
         if not isinstance(self.engine, ExecutorEngine):
             raise TypeError("points are sent to workers only by an evaluator with an executor")
         return self.engine.submit(self._with_values(u), self.key, first)
+
+    def _size(self, most: int) -> int:
+        """Return how many points are simulated before one looks whether all raise."""
+        if self._raising is None or not self._raising.always:
+            return most
+        engine = self.engine
+        if not isinstance(engine, HostEngine) or engine.system.can_simulate_batch:
+            return most
+        # Their features are those of the whole batch, bit for bit.
+        engine.least = 1 << (most - 1).bit_length()
+        return min(most, ALIKE)
+
+    def _check_raising(self, verdicts: Verdicts) -> None:
+        if self._raising is not None:
+            self._raising.add(verdicts.status, verdicts.messages)
+            self._raising.check(self.problem.name)
+            if isinstance(self.engine, HostEngine):
+                self.engine.least = 1
 
     def _with_values(self, u: Float[Any, "n d"]) -> Float[Any, "n row"]:
         """Return points as rows without given numbers, where the engine takes such rows."""

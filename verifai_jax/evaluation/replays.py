@@ -1,7 +1,7 @@
 """Rows of a table simulated again, many at a time: in a chosen precision and at a finer step.
 
     features = problem.space.features_of(rows, "float64")   # [n, ...], the values of the table
-    again = Replays(problem, "float64", key, features)
+    again = Replays(problem, "float64", key)
     [verdicts] = again(1, [features], numbers)          # [n] rows, at the system's own step
     finer, moved = again(4, [features, others], numbers)    # twice, at a quarter of it
 
@@ -77,24 +77,20 @@ class Replays:
     - `problem`: on the backend that it ran on.
     - `precision`: of the replays.
     - `key`: of the run's simulations, from `run_keys`.
-    - `features`: of some rows, whose form all others have.
 
     `draws` is whether the system uses its random key, and `compile_seconds` what its programs took
     to compile. One program is traced at once, and what that raises is raised here.
     """
 
-    def __init__(
-        self, problem: Problem, precision: str, key: Key[Array, ""], features: PyTree
-    ) -> None:
+    def __init__(self, problem: Problem, precision: str, key: Key[Array, ""]) -> None:
         self.problem, self.precision, self.key = problem, precision, key
         self.refiner = Refiner(problem.system)
         self.compile_seconds = 0.0
         self._make_keys = jax.jit(jax.vmap(partial(simulation_key, key)))
         data = np.asarray(jax.random.key_data(key))
         self._any_keys = cache(lambda count: as_key(np.broadcast_to(data, (count, 2))))
-        self._form = jax.tree.map(
-            lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), features
-        )
+        # Forms alone are traced: no value has to be made up that a user's domain would accept.
+        self._form = problem.space.feature_form_in(precision)
         try:
             self.draws = self._engine(1, 1).draws()
         except Exception:
@@ -119,7 +115,9 @@ class Replays:
         **Returns:** the verdicts of the rows, once for each.
         """
         together = self._together(len(numbers))
-        features = jax.tree.map(lambda *leaves: np.concatenate(leaves), *each)
+        features = jax.tree.map(
+            lambda form, *leaves: np.concatenate(leaves).astype(form.dtype), self._form, *each
+        )
         numbers = np.tile(numbers, len(each))
         count = len(numbers)
         engine, parts = self._engine(factor, together), []

@@ -24,7 +24,7 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import SimulationProgress, shows_progress
-from verifai_jax.core.text import format_time
+from verifai_jax.core.text import format_seconds
 from verifai_jax.counterexamples import confirm
 from verifai_jax.counterexamples.description import describe_predicate
 from verifai_jax.counterexamples.fixed_key import hold_key
@@ -53,7 +53,7 @@ from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.validation import check_options
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl.formula import Predicate
-from verifai_jax.problem.dependence import depends_on_key
+from verifai_jax.problem.dependence import depends_on_key, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.binomial import clopper_pearson
 
@@ -202,7 +202,8 @@ class _Numbers:
 
 
 def _has_slopes(problem: Problem) -> bool:
-    return not problem.black_box and 0 in problem.space.levels
+    slopes = not problem.black_box and 0 in problem.space.levels
+    return slopes and without_derivative(problem) is None
 
 
 def _constraint(space: FeatureSpace) -> Any:
@@ -405,7 +406,7 @@ def _cause(numbers: _Numbers, features: dict[str, Any], key: Any, number: int) -
         why = replayed.explain()
     except ValueError:
         return rho, ""
-    at = f"{format_time(why.time, 4)} s"
+    at = format_seconds(why.time, 4)
     predicate = why.predicate
     if isinstance(predicate, Predicate):
         return rho, describe_predicate(predicate, why, at)

@@ -24,6 +24,7 @@ from verifai_jax.core.precision import in_precision, reproducible_settings
 from verifai_jax.core.progress import SimulationProgress, shows_progress, write_line
 from verifai_jax.core.sources import Sources
 from verifai_jax.core.stopwatch import Stopwatch
+from verifai_jax.core.text import one_line
 from verifai_jax.core.user_errors import explain_user_error, format_user_error
 from verifai_jax.evaluation.backends import Choice, resolved
 from verifai_jax.falsification.derived import as_simulated
@@ -49,6 +50,7 @@ from verifai_jax.falsification.silent_mistakes import (
     notes_before,
 )
 from verifai_jax.falsification.suggestions import Suggestions
+from verifai_jax.falsification.summary import first_message
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.falsification.validation import (
     AUTO,
@@ -85,8 +87,12 @@ if TYPE_CHECKING:
     from verifai_jax.features.given import Rows
 
 
+RAISES = "an error of every simulation"
+"""What has stopped a run whose first simulations all raise."""
+
+
 class RunError(RuntimeError):
-    """The loop broke down; `run` holds every batch finished before."""
+    """The loop broke down, or nothing can succeed; `run` holds what was finished before."""
 
     def __init__(self, message: str, run: Run) -> None:
         super().__init__(message)
@@ -117,6 +123,7 @@ def falsify(
     progress: bool | None = None,
     target: str | None = None,
     executor: Executor | None = None,
+    keep_going: bool = False,
 ) -> Run:
     """Search the feature space for inputs under which the system breaks its property.
 
@@ -162,6 +169,9 @@ def falsify(
     - `executor`: whose workers simulate: Dask's `client.get_executor()`, `clusters.RayExecutor()`,
       a process pool, or anything else with `concurrent.futures`' `submit`. The table is the one of
       this machine alone, bit for bit, on workers with its kind of processor.
+    - `keep_going`: whether to simulate on where all of the first simulations raise. When left out
+      the run ends there with an error, after 16 that raise the same, or a first round of a system
+      that simulates many at once: an error of the problem would cost the whole budget.
 
     Ctrl-C ends the run and returns what is finished. What is likely a mistake of the problem is in
     the run's `notes`, and above the progress bar.
@@ -171,7 +181,8 @@ def falsify(
     **Raises:** `ValueError` before anything compiles for options out of range, unknown names, a
     problem whose parts do not fit, a constraint that refuses every sample, a search that cannot
     work on the space, a folder that cannot be written or that another process writes; `RunError`
-    with the finished part of the run when the loop breaks down.
+    with the finished part of the run when the loop breaks down, and when all of the first
+    simulations raise.
     """
     started = time.perf_counter()
     check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
@@ -216,9 +227,15 @@ def falsify(
         def prepare() -> None:
             if earlier is not None:
                 rounds.warm(earlier)
-            if not default or diverse or not can_be_slow(problem, executor):
+            chooses = default and not diverse
+            if asking is not None or not can_be_slow(problem, executor):
                 return
-            slow = slow_search(problem, rounds.measure(min(batch, budget)))
+            if keep_going and not chooses:
+                return
+            seconds = rounds.measure(min(batch, budget))
+            if not chooses or (rounds.hopeless is not None and not keep_going):
+                return
+            slow = slow_search(problem, seconds)
             if slow is not None:
                 usual = usual_batch(slow[0], budget, stop_after)
                 rounds.switch(*slow, min(own_batch or usual, budget))
@@ -226,8 +243,9 @@ def falsify(
                     rounds.warm(earlier)
 
         return _run_rounds(
-            rounds, ends, seed, choice, progress, target, prepare, notes, callbacks, warm=warm
-        )
+            rounds, ends, seed, choice, progress, target, prepare, notes, callbacks, warm=warm,
+            keep_going=keep_going,
+        )  # fmt: skip
 
 
 @suggests_options
@@ -266,7 +284,7 @@ def simulate(
     return falsify(
         problem, searches.PointList(points), len(points), first=given,
         batch=batch, seed=seed, folder=folder, precision=precision, backend=backend,
-        confirm=False, progress=progress, target=target, executor=executor,
+        confirm=False, progress=progress, target=target, executor=executor, keep_going=True,
     )  # fmt: skip
 
 
@@ -286,6 +304,7 @@ def resume(
     progress: bool | None = None,
     executor: Executor | None = None,
     even_if_changed: bool = False,
+    keep_going: bool = False,
 ) -> Run:
     """Go on with a run where it stopped, or where it was cut off, as if it had never stopped.
 
@@ -295,6 +314,7 @@ def resume(
     - `problem`: needed for a folder, which names no code to run.
     - `search`: needed only if it is none of `verifai_jax.search`.
     - `budget`: simulations in all, those done included; the run's own when left out.
+    - `keep_going`: as in `falsify`.
     - `even_if_changed`: whether to go on where files of the model are others than those that the
       run recorded when it began; its rows are then of two models, it has no failure rate, and its
       notes and its record say so.
@@ -324,8 +344,11 @@ def resume(
             check_not_continued(run, run.folder)
         called = check_callbacks(callbacks)
         return as_made(
-            _resume(run, problem, search, budget, ends, progress, called, executor, even_if_changed)
-        )
+            _resume(
+                run, problem, search, budget, ends, progress, called, executor, even_if_changed,
+                keep_going,
+            )
+        )  # fmt: skip
 
 
 def _resume(
@@ -338,6 +361,7 @@ def _resume(
     callbacks: Sequence[Callback],
     executor: Executor | None,
     even_if_changed: bool,
+    keep_going: bool,
 ) -> Run:
     """Go on with a run whose folder is locked; `ends` is completed from the run."""
     made = {"derived": run.derived, "space_data": run.space_data}
@@ -416,6 +440,7 @@ def _resume(
         callbacks,
         resumed=True,
         sources=sources,
+        keep_going=keep_going,
     )
 
 
@@ -477,6 +502,7 @@ def _run_rounds(
     warm: bool = False,
     resumed: bool = False,
     sources: Sequence[Mapping[str, Any]] | None = None,
+    keep_going: bool = False,
 ) -> Run:
     """Compile, `prepare`, and play rounds until something ends them."""
     problem, search, place = rounds.problem, rounds.search, rounds.folder
@@ -553,12 +579,17 @@ def _run_rounds(
                 for note in rounds.notes:
                     bar.note(note)
             stopped = "exhausted" if rounds.exhausted else None
+            if rounds.hopeless is not None and not keep_going:
+                rounds.take_in_measured()
+                stopped = RAISES
             with watch.on(REST):
                 while stopped is None:
                     rounds.advance(min(rounds.batch, ends.budget - len(rounds.table)), ends.budget)
                     bar.update(len(rounds.table), rounds.found, rounds.best)
                     notify(callbacks, len(rounds.table), rounds.numbers)
                     stopped = ends.reached(rounds)
+                    if stopped is None and rounds.hopeless is not None and not keep_going:
+                        stopped = RAISES
                     if stopped is None:
                         rounds.save(seldom=True)
     except KeyboardInterrupt:
@@ -586,7 +617,21 @@ def _run_rounds(
         raise RunError(
             _failure_message(problem.name, len(rounds.table), place, cause), result
         ) from cause
+    if stopped == RAISES:
+        raise RunError(_hopeless_message(result, rounds.hopeless or "", ends.budget), result)
     return result
+
+
+def _hopeless_message(run: Run, said: str, budget: int) -> str:
+    """Say what all simulations of a run raised, and how to simulate on."""
+    first = first_message(run)
+    said = one_line(said or ("" if first is None else first[1]))
+    where = "" if run.folder is None else f" and in {run.folder}, which can be resumed"
+    return (
+        f"the run of {run.name!r} ended after {run.simulations:,} of {budget:,} simulations, since "
+        f"none succeeds: each raised{f' {said}' if said else ' an error'}. They are in the .run of "
+        f"this error{where}. keep_going=True, or --keep-going, simulates all"
+    )
 
 
 def _failure_message(name: str, simulations: int, place: Path | None, cause: Exception) -> str:

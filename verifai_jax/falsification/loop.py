@@ -19,6 +19,7 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.stopwatch import Stopwatch
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.steering import Steering
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.ahead import Ahead
@@ -116,6 +117,7 @@ class Rounds:
         self._sends_ahead = executor is not None and not search.learns
         self._ahead: Ahead | None = None
         self._saved = time.perf_counter()
+        self._raising = Raising()
 
     def compile(self, resumed: bool = False) -> None:
         """Compile the engine and the search, side by side.
@@ -164,7 +166,7 @@ class Rounds:
     def measure(self, most: int) -> float:
         """Simulate the first rows one by one, and return the least seconds that one took.
 
-        They are rows of the run. A first one that is quick is the only one.
+        They are rows of the run. A first one that is quick is the only one, unless it raises.
 
         - `most`: of the first round.
         """
@@ -174,6 +176,24 @@ class Rounds:
         points = np.asarray(self.first if len(self.first) else self._pending)
         with self.watch.on(SIMULATE):
             return self._simulations.measure(points[:most])
+
+    def take_in_measured(self) -> None:
+        """Store the rows that were simulated one by one, without the rest of their round.
+
+        The checkpoint stays before them: a run that goes on simulates their whole round.
+        """
+        rows = self.first if len(self.first) else self._pending
+        points = np.asarray(rows)[: self._simulations.measured]
+        with self.watch.on(SIMULATE):
+            verdicts = self._verdicts(points, 0, given=len(self.first) > 0)
+            points = np.asarray(points[:, : self.problem.space.dim], np.float32)
+            self._take_in(points, verdicts, 0, points[:0], learns=False)
+
+    @property
+    def hopeless(self) -> str | None:
+        """The message of all simulations, where more of them would only say it again; else None."""
+        measured = self._simulations.hopeless
+        return self._raising.reason if measured is None else measured
 
     def switch(self, search: Search, note: str, batch: int) -> None:
         """Go on with another search, for which the rows that are measured are given ones."""
@@ -224,7 +244,8 @@ class Rounds:
     @property
     def exhausted(self) -> bool:
         """True where a finite search has come to its end."""
-        return self._proposals.exhausted and (self._ahead is None or self._ahead.empty)
+        waiting = self._pending is not None or (self._ahead is not None and not self._ahead.empty)
+        return self._proposals.exhausted and not waiting
 
     @property
     def acceptance(self) -> float | None:
@@ -277,6 +298,26 @@ class Rounds:
         if len(given):
             # What follows knows points alone: the nearest ones.
             points = given = np.asarray(given[:, : self.problem.space.dim], np.float32)
+        self._take_in(points, verdicts, first, given, suggested)
+        if not (cut and self.search.learns):
+            # A larger budget goes on before a round that this one cut, with all of its points.
+            self._keep()
+
+    def _take_in(
+        self,
+        points: Float[Any, "n d"],
+        verdicts: Verdicts,
+        first: int,
+        given: Float[Any, "given d"],
+        suggested: bool = False,
+        *,
+        learns: bool = True,
+    ) -> None:
+        """Confirm, tell the search, store and count the simulations of these points.
+
+        - `learns`: whether the search is told; not of rows after which the run ends.
+        """
+        self._raising.add(verdicts.status, verdicts.messages)
         columns = rows_of(self.problem, verdicts, self._simulations.differentiates)
         if self.suggestions is not None:
             columns["suggested"] = np.full(len(points), suggested)
@@ -304,18 +345,16 @@ class Rounds:
         if self.steering.guide and verdicts.steering is not None:
             objective = self._guided(objective, verdicts.steering[:, 0])
         outcomes = self._outcomes(verdicts)
-        with self._searching():
-            self._learn(given, suggested, objective, verdicts, marks, outcomes)
-            if self._surrogate is not None:
-                self._surrogate.learn(points, verdicts)
+        if learns:
+            with self._searching():
+                self._learn(given, suggested, objective, verdicts, marks, outcomes)
+                if self._surrogate is not None:
+                    self._surrogate.learn(points, verdicts)
         self.table.append(columns)
         self.found += int(np.sum(claimed))
         self.violating += int(np.sum(verdicts.violated))
         self.without_verdict += int(np.sum(~verdicts.proper))
         self.best = float(np.fmin(self.best, np.fmin.reduce(verdicts.least)))
-        if not (cut and self.search.learns):
-            # A larger budget goes on before a round that this one cut, with all of its points.
-            self._keep()
 
     @contextmanager
     def _searching(self) -> Iterator[None]:
@@ -474,6 +513,7 @@ class Rounds:
         for part in self._parts:
             part.restore(checkpoint)
         counts = self.table.counts
+        self._raising.always = counts.without_verdict == len(self.table)
         self.without_verdict, self.violating = counts.without_verdict, counts.violating
         self.found = counts.claimed
         self.best = counts.least

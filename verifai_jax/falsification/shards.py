@@ -451,4 +451,5 @@ def merge(
         progress=progress,
         target=first["target"],
         executor=stored,
+        keep_going=True,
     )

@@ -21,6 +21,7 @@ from verifai_jax.core.executors import Executor
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.raising import ALIKE, Raising
 from verifai_jax.evaluation.steering import Steering
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.validation import SLOW
@@ -31,7 +32,8 @@ from verifai_jax.search import Search
 MOST_DIFFERENTIATED = 16
 """Rows whose clauses are differentiated in one call of the engine."""
 MEASURED = 2
-"""First rows of a black box that are timed; in the first one a simulator may prepare itself."""
+"""First rows of a black box that are timed; in the first one a simulator may prepare itself. More
+follow one by one, up to `ALIKE`, while all raise."""
 
 
 class Simulations:
@@ -45,6 +47,8 @@ class Simulations:
     - `seed`: of the run.
     - `precision`, `journal`, `executor`, `target`, `steering`, `keep_traces`, `given`: as for
       `Evaluator`.
+
+    `hopeless` is what all of the rows that were timed raised; None where one did not.
     """
 
     def __init__(
@@ -86,6 +90,7 @@ class Simulations:
             most = min(batch, MOST_DIFFERENTIATED)
             self._differentiate = evaluator(most, gradient=True, clauses=True)
         self._measured: Verdicts | None = None
+        self.hopeless: str | None = None
 
     @property
     def differentiates(self) -> bool:
@@ -147,19 +152,23 @@ class Simulations:
     def measure(self, points: Float[np.ndarray, "n d"]) -> float:
         """Simulate the first rows of the run one by one, and return the least seconds of one.
 
-        A first one that is quick is the only one. Their round does not simulate them again.
+        A first one that is quick is the only one, unless it raises. Their round does not simulate
+        them again. Where all of many raise, `hopeless` is what they say, and None otherwise.
         """
         engine = self.evaluate.engine
         assert isinstance(engine, HostEngine)
-        points = points[:MEASURED]
+        points, raising = points[:ALIKE], Raising()
         seconds, parts = float("inf") if len(points) else 0.0, []
         with self._as_in_a_batch(engine, keep_traces=True):
             for row in range(len(points)):
                 parts.append(self.evaluate(points[row : row + 1], first=row))
+                raising.add(parts[-1].status, parts[-1].messages)
                 # Without the compilation of the monitor.
                 seconds = min(seconds, engine.simulation_seconds)
-                if seconds < SLOW:
+                timed = seconds < SLOW or row + 1 >= MEASURED
+                if timed and (not raising.always or raising.reason is not None):
                     break
+        self.hopeless = raising.reason
         self._measured = Verdicts.concatenate(parts) if parts else None
         return seconds
 

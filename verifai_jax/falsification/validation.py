@@ -17,7 +17,7 @@ from verifai_jax.core.text import format_error, one_line
 from verifai_jax.falsification.run import RECORD, Run
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.features.given import Rows, check_columns, given_features, given_rows
-from verifai_jax.problem.dependence import has_gradient
+from verifai_jax.problem.dependence import has_gradient, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.search.contract import check_contract
@@ -186,7 +186,17 @@ def adapt_search(
     """Return the search as it can work on this problem, and notes on what it does without.
 
     A portfolio does without gradients where there are none, a model of traces without traces.
+
+    **Raises:** `ValueError` for a search that needs gradients, and a system with a step that has no
+    derivative.
     """
+    lacking = without_derivative(problem) if needs_gradient(search) else None
+    if lacking is not None:
+        raise ValueError(
+            f"search {search!r} follows gradients, and the system of problem {problem.name!r} has "
+            f"none: {lacking} has no derivative. Use a search that needs none, such as 'portfolio' "
+            "or 'cross_entropy', or give the operation a derivative by jax.custom_jvp"
+        )
     if isinstance(search, searches.TraceSurrogate):
         why = _why_no_traces(problem, executor)
         if why is None:
@@ -200,6 +210,8 @@ def adapt_search(
         why = "a priority has no gradient"
     elif not len(problem.space.cube.continuous):
         why = "all features are discrete"
+    elif (lacking := without_derivative(problem)) is not None:
+        why = f"{lacking} has no derivative"
     elif problem.guide is None and not has_gradient(problem):
         why = "the robustness is constant almost everywhere"
     else:

@@ -11,6 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
 from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.text import format_seconds
 from verifai_jax.core.waveform import (
     HELD,
     HOLDS,
@@ -99,7 +100,8 @@ class Signal(Domain):
             object.__setattr__(self, "duration", check_duration(self.duration))
             if times is not None and times[-1] > self.duration:
                 raise ValueError(
-                    f"the times of a Signal must lie in its duration of {self.duration:zg} s; got "
+                    "the times of a Signal must lie in its duration of "
+                    f"{format_seconds(self.duration)}; got "
                     f"{times[-1]:zg}"
                 )
 
@@ -166,7 +168,7 @@ class Signal(Domain):
             times = [_format_span(*span) for span in self.spans(length or math.inf)]
         else:
             instants = control_times(self.knots, self.hold, self.times, length or math.inf)
-            times = [f"at {time:z.4g} s" for time in instants]
+            times = [f"at {format_seconds(time, 4)}" for time in instants]
         return tuple(f"{part} {time}" for time in times for part in parts)
 
     def spans(self, duration: float) -> list[tuple[float, float]]:
@@ -245,5 +247,5 @@ def _format_course(course: Course) -> str:
 
 
 def _format_span(begin: float, end: float) -> str:
-    until = f" to {end:z.4g} s" if math.isfinite(end) else " on"
-    return f"from {begin:z.4g} s{until}"
+    until = f" to {format_seconds(end, 4)}" if math.isfinite(end) else " on"
+    return f"from {format_seconds(begin, 4)}{until}"

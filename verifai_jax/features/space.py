@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.core.notebook import ForUsers, rows_html
+from verifai_jax.core.precision import in_precision
 from verifai_jax.features.acceptance import acceptance_rate
 from verifai_jax.features.choice import Constant
 from verifai_jax.features.compound import Struct
@@ -140,6 +141,11 @@ class FeatureSpace(ForUsers):
     def feature_form(self) -> dict[str, Any]:
         """Shapes and types of the features of a point, for abstract evaluation."""
         return jax.eval_shape(self.unflatten, self.point_form)
+
+    def feature_form_in(self, precision: str) -> dict[str, Any]:
+        """Return the form of the features in `"float32"` or `"float64"`, whatever JAX is set to."""
+        with in_precision(precision):
+            return jax.eval_shape(self.unflatten, jax.ShapeDtypeStruct((self.dim,), precision))
 
     @cached_property
     def columns(self) -> tuple[str, ...]:

@@ -45,6 +45,7 @@ def fuzz(
     confirm: bool = True,
     progress: bool | None = None,
     target: str | None = None,
+    keep_going: bool = False,
 ) -> FuzzRun:
     """Look for failures by covering what can happen, with or without formulas.
 
@@ -76,5 +77,6 @@ def fuzz(
         checked, Coverage() if search is None else search, budget,
         batch=batch, seed=seed, max_seconds=max_seconds, stop_after=stop_after, folder=folder,
         precision=precision, backend=backend, confirm=confirm, progress=progress, target=target,
+        keep_going=keep_going,
     )  # fmt: skip
     return as_fuzz_run(run)

@@ -19,14 +19,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.text import format_time
+from verifai_jax.core.text import LONG, STAMPS, format_seconds, format_time
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._robustness import satisfied
 from verifai_jax.mtl.evaluate import End, Evaluator
 from verifai_jax.mtl.formula import Formula, surface
+from verifai_jax.mtl.node import missing_case
 from verifai_jax.mtl.semantics import hard
-from verifai_jax.mtl.setting import Setting, evaluator_of, prepare
+from verifai_jax.mtl.setting import Setting, check_trace, evaluator_of, prepare
 
 
 @dataclass(frozen=True)
@@ -109,25 +110,28 @@ class Explanation(InNotebook):
     def __str__(self) -> str:
         lines = [
             f"{'Holds' if self.holds else 'Fails'} with robustness {self.robustness:z.4g}, decided "
-            f"by  {self.predicate}  at {format_time(self.time)} s",
+            f"by  {self.predicate}  at {format_seconds(self.time)}",
             "",
         ]
         listed: set[int] = set()
         flat = self.tree.flat()
         instants = [node.time for _, node in flat] + [i.time for i in self.critical]
-        width = max(8, *(len(format_time(instant)) for instant in instants))
+        # Of a long trace with their units, which of a short one are seconds throughout.
+        long = any(LONG <= abs(instant) < STAMPS for instant in instants)
+        write = format_seconds if long else format_time
+        width = max(8, *(len(write(instant)) for instant in instants))
         for depth, node in flat:
             mark = "*" if node.decides else " "
             name = str(node.formula) if not node.children else heading(node.formula)
             if node.children and id(node) in listed:
                 name += "  (as above)"
             listed.add(id(node))
-            at = format_time(node.time)
+            at = write(node.time)
             lines.append(f"{mark} {node.robustness:>z10.4g} at {at:<{width}} {'  ' * depth}{name}")
         lines += ["", "Most critical instants:"]
         lines += [
             f"  {i.share:>6.1%} at {at:<{width}} {i.robustness:>z10.4g}  {i.predicate}"
-            for i, at in zip(self.critical, map(format_time, instants[len(flat) :]), strict=True)
+            for i, at in zip(self.critical, map(write, instants[len(flat) :]), strict=True)
         ]
         return "\n".join(lines)
 
@@ -159,6 +163,7 @@ def explain(
 
     **Raises:** as `robustness`, and `ValueError` for a NaN among the samples that matter.
     """
+    check_trace(trace)
     trace = trace.trim()
     holds = bool(satisfied(formula, trace, end))
     setting, signals, _, _ = prepare(formula, trace, hard, end, None)
@@ -280,7 +285,9 @@ class _Walk:
                 return self.witness(p, q, self.ahead(span, i, p, q), i, 1)
             case ast.Since(p, q, span):
                 return self.witness(p, q, self.behind(span, i), i, -1)
-        return []
+            case ast.Constant() | ast.Predicate() | ast.Atom():
+                return []
+        raise missing_case("the explanation", f)
 
     def deciding(self, f: Formula, i: int, operands: list[tuple[Formula, int]]) -> int | None:
         """Return the number of the operand that has the value of `f`."""

@@ -6,6 +6,7 @@ latex(eventually(signal("x") <= 2, 0, 4))    # \Diamond_{[0, 4]} \left(\mathit{x
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.expression import PRECEDENCE, Arithmetic, Component, Number, Signal
 from verifai_jax.mtl.formula import Formula, Term, surface
+from verifai_jax.mtl.node import missing_case
 from verifai_jax.mtl.words import number_text
 
 _LATEX = {
@@ -77,5 +78,5 @@ def _expression_latex(e: Term, outer: int = 0) -> str:
         case Arithmetic(name, arguments):
             return rf"\{name}\left({', '.join(map(_expression_latex, arguments))}\right)"
         case _:
-            raise TypeError(f"not an expression: {e!r}")
+            raise missing_case("the LaTeX", e)
     return rf"\left({text}\right)" if level < outer else text

@@ -30,6 +30,7 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import Evaluator, samples
 from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.node import missing_case
 from verifai_jax.mtl.rewriting import simplify
 from verifai_jax.mtl.semantics import Semantics, hard
 
@@ -214,7 +215,20 @@ class _Machine:
                 return below + int(b)
             case ast.Next():
                 return below + 1
-        return below
+            case (
+                ast.Constant()
+                | ast.Predicate()
+                | ast.Atom()
+                | ast.Not()
+                | ast.And()
+                | ast.Or()
+                | ast.Historically()
+                | ast.Once()
+                | ast.Prev()
+                | ast.Since()
+            ):
+                return below
+        raise missing_case("the online monitor", f)
 
     def settling(self, f: Formula) -> int:
         """Count the samples after which everything below has taken in a constant input."""
@@ -279,7 +293,9 @@ class _Machine:
                 return jnp.minimum(rights, jax.lax.cummin(before))[a:].max()
             case ast.Since(p, q, i):
                 return self.since(path, p, q, *self.span(i), sign)
-        return self.leaf(f, sign)
+            case ast.Constant() | ast.Predicate() | ast.Atom():
+                return self.leaf(f, sign)
+        raise missing_case("the online monitor", f)
 
     def align(self, path: str, parts: tuple[Formula, ...], sign: int) -> list[Array]:
         """Return streams of several formulas, the quicker ones delayed to match the slowest."""

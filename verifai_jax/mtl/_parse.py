@@ -27,12 +27,17 @@ _UNITS = {
     "us": Decimal("1e-6"),
     "ns": Decimal("1e-9"),
     "min": Decimal(60),
+    "h": Decimal(3600),
+    "d": Decimal(86400),
 }
 MOST_TOKENS = 10_000
 """Words and symbols that a formula's text may have."""
 
 MOST_DEEP = 100
 """Operators, or parentheses, that may stand within each other: far from where Python gives up."""
+
+MOST_OFFERED = 300
+"""Characters of a text that an error offers at most; a longer one would be cut when it is shown."""
 
 MOST_DEEP_TEMPORAL = 40
 """Temporal operators that may stand within each other: each is a loop of its own to compile."""
@@ -74,7 +79,13 @@ def parse(
     return _read(text, constants, known)
 
 
-def _read(text: str, constants: Mapping[str, float], known: Mapping[str, Formula]) -> Formula:
+def _read(
+    text: str,
+    constants: Mapping[str, float],
+    known: Mapping[str, Formula],
+    offers: bool = True,
+) -> Formula:
+    """Read a formula; `offers` is whether an error may offer texts, each of which is read, too."""
     if not isinstance(text, str):
         raise TypeError(f"a formula's text is a str; got {type(text).__name__}")
     import lark
@@ -84,7 +95,7 @@ def _read(text: str, constants: Mapping[str, float], known: Mapping[str, Formula
         tree = parser().parse(text)
     except lark.UnexpectedInput as error:
         raise explain_error(error, text) from None
-    return _Builder(text, constants, known).formula(tree)
+    return _Builder(text, constants, known, offers).formula(tree)
 
 
 def _check_size(text: str) -> None:
@@ -121,12 +132,16 @@ class _Builder:
     """Turns the tree of one text into a formula, refusing what is ambiguous or ill-typed."""
 
     def __init__(
-        self, text: str, constants: Mapping[str, float], known: Mapping[str, Formula]
+        self,
+        text: str,
+        constants: Mapping[str, float],
+        known: Mapping[str, Formula],
+        offers: bool = True,
     ) -> None:
         self.text = text
         self.constants = constants
         self.known = known
-
+        self.offers = offers
         self.parts: dict[int, _Part] = {}
 
     def formula(self, tree: Tree) -> Formula:
@@ -137,6 +152,28 @@ class _Builder:
 
     def _source(self, part: _Part) -> str:
         return self.text[part.start : part.end]
+
+    def _offered(self, before: str, *texts: str, within: str = "{}") -> str:
+        """Return the part of a message that offers texts: only those that can be read.
+
+        **Arguments:**
+
+        - `before`: what stands before the offers; nothing is said where none can be read.
+        - `within`: a formula that has the text in it, for one that is none on its own.
+        """
+        texts = tuple(" ".join(map(str.strip, text.splitlines())) for text in texts)
+        offers = [each for each in texts if self._reads(within.format(each))]
+        return f"{before}{' or '.join(offers)}" if offers else ""
+
+    def _reads(self, text: str) -> bool:
+        """Return whether a text that is to be offered is a formula; nothing is offered in turn."""
+        if not self.offers or len(text) > MOST_OFFERED:
+            return False
+        try:
+            _read(text, self.constants, self.known, offers=False)
+        except (FormulaSyntaxError, RecursionError):
+            return False
+        return True
 
     def _formula(self, part: _Part) -> Formula:
         if isinstance(part.value, Expression):
@@ -210,7 +247,7 @@ class _Builder:
 
     def _impl(self, tree: Tree) -> _Part:
         parts, words = self._operands(tree)
-        self._refuse_open(parts, words)
+        self._refuse_open(parts, words, tree.children[::2])
         if len(words) > 1:
             raise self._chained(parts, words)
         left, right = map(self._formula, parts)
@@ -224,13 +261,14 @@ class _Builder:
 
     def _joined(self, tree: Tree, kind: type[ast.And] | type[ast.Or]) -> _Part:
         parts, words = self._operands(tree)
-        self._refuse_open(parts, words)
+        self._refuse_open(parts, words, tree.children[::2])
         for part in parts:
             if part.rule == "bin":
                 word = next(c for c in words if c)
+                offer = self._offered(", as in ", f"({self._source(part)})")
                 raise self._fail(
                     f"until and its like beside {str(word)!r} is ambiguous: put it in "
-                    f"parentheses, as in ({self._source(part)})",
+                    f"parentheses{offer}",
                     part.start,
                     part.end,
                 )
@@ -250,9 +288,10 @@ class _Builder:
                 continue
             base = _text(self.text, _edge(tree.children[2 * k], -1))
             exponent = _text(self.text, _edge(tree.children[2 * k + 2], 0))
+            power = self._offered("", f"{base}**{exponent}", within='"s" < {}') or "x**2"
             raise self._fail(
                 f"'^' is exclusive or, and here it stands beside arithmetic: a power is written "
-                f"{base}**{exponent}, and exclusive or (one formula) xor (the other)",
+                f"{power}, and exclusive or (one formula) xor (the other)",
                 word.start_pos,
                 word.start_pos + 1,
             )
@@ -282,7 +321,7 @@ class _Builder:
     def _bin(self, tree: Tree) -> _Part:
         parts = [self._build(c) for c in tree.children[::3]]
         words, intervals = tree.children[1::3], tree.children[2::3]
-        self._refuse_open(parts, words)
+        self._refuse_open(parts, words, tree.children[::3])
         if len(words) > 1:
             raise self._chained(parts, words)
         left, right = map(self._formula, parts)
@@ -292,29 +331,58 @@ class _Builder:
         return _Part(value, *self._span(tree), rule="bin")
 
     def _chained(self, parts: list[_Part], words: list[Any]) -> FormulaSyntaxError:
-        a, b, c = map(self._source, parts[:3])
+        sources = [self._source(part) for part in parts]
         between = [self.text[p.end : q.start].strip() for p, q in itertools.pairwise(parts)]
-        first, second = between[0], between[1]
+        right, left = sources[-1], sources[0]
+        for k in range(len(between)):
+            left = f"{left if k == 0 else f'({left})'} {between[k]} {sources[k + 1]}"
+            at = len(between) - 1 - k
+            right = f"{sources[at]} {between[at]} {right if k == 0 else f'({right})'}"
         word = str(words[1])
+        # A power is no formula, so it is read within one.
+        within = '"s" < {}' if str(words[0]) == "**" else "{}"
+        offer = self._offered("write ", right, left, within=within)
         return self._fail(
-            f"a chain of {str(words[0])!r} is ambiguous: write {a} {first} ({b} {second} {c}) "
-            f"or ({a} {first} {b}) {second} {c}",
+            f"a chain of {str(words[0])!r} is ambiguous: {offer or 'say by parentheses how'}",
             words[1].start_pos,
             words[1].start_pos + len(word),
         )
 
-    def _refuse_open(self, parts: list[_Part], words: list[Any]) -> None:
+    def _refuse_open(self, parts: list[_Part], words: list[Any], trees: list[Tree]) -> None:
         """Refuse `always a & b`: tools disagree on how far the word reaches."""
-        for part, word in zip(parts, words, strict=False):
-            if part.rule == "word" and not part.closed:
-                operator, _, operand = self._source(part).partition(" ")
-                tail = self._source(parts[-1]) if len(parts) == 2 else "..."
-                raise self._fail(
-                    f"how far {operator!r} reaches is ambiguous: write {operator} "
-                    f"({operand.strip()} {word} {tail}) or ({self._source(part)}) {word} {tail}",
-                    part.start,
-                    part.end,
-                )
+        is_open = [part.rule == "word" and not part.closed for part in parts]
+        if not any(is_open[: len(words)]):
+            return
+        far = near = self._source(parts[-1])
+        for k in reversed(range(len(words))):
+            between = self.text[parts[k].end : parts[k + 1].start]
+            source = self._source(parts[k])
+            if is_open[k]:
+                operator, operand = self._operator(trees[k], parts[k])
+                far = f"{operator} ({operand}{between}{far})"
+                near = f"({source}){between}{near}"
+            else:
+                far, near = f"{source}{between}{far}", f"{source}{between}{near}"
+        first = is_open.index(True)
+        operator, _ = self._operator(trees[first], parts[first])
+        part = parts[first]
+        offer = self._offered("write ", far, near)
+        raise self._fail(
+            f"how far {operator!r} reaches is ambiguous: {offer or 'say so by parentheses'}",
+            part.start,
+            part.end,
+        )
+
+    def _operator(self, tree: Tree, part: _Part) -> tuple[str, str]:
+        """Return the operators in front of a part, with their intervals, and what they stand for.
+
+        The grammar's own tree says where one ends: a text has blanks anywhere, or none.
+        """
+        start = part.start
+        while tree.data in ("temporal", "negation"):
+            tree = tree.children[-1]
+            start = tree.meta.start_pos
+        return self.text[part.start : start].strip(), self.text[start : part.end]
 
     # Operators of one operand
 
@@ -350,12 +418,9 @@ class _Builder:
         if low < 0:
             raise self._fail("an interval starts at 0 or later", *span)
         if high < low:
-            raise self._fail(
-                f"an interval ends no earlier than it starts: write "
-                f"[{_text(self.text, tree.children[1])}, "
-                f"{_text(self.text, tree.children[0])}]",
-                *span,
-            )
+            ends = (_text(self.text, child) for child in reversed(tree.children))
+            offer = self._offered(": write ", f"[{', '.join(ends)}]", within='F{} "s"')
+            raise self._fail(f"an interval ends no earlier than it starts{offer}", *span)
         if low == float("inf"):
             raise self._fail("an interval starts at a finite time", *span)
         return Interval(low, high)
@@ -389,9 +454,10 @@ class _Builder:
     def _cmp(self, tree: Tree) -> _Part:
         parts, words = self._operands(tree)
         if len(words) > 1:
-            a, b, c = map(self._source, parts[:3])
+            sides = zip(itertools.pairwise(map(self._source, parts)), words, strict=True)
+            offer = self._offered(": write ", " & ".join(f"({a} {w} {b})" for (a, b), w in sides))
             raise self._fail(
-                f"comparisons do not chain: write ({a} {words[0]} {b}) & ({b} {words[1]} {c})",
+                f"comparisons do not chain{offer or ': join them by &'}",
                 words[1].start_pos,
                 words[1].start_pos + len(words[1]),
             )
@@ -440,7 +506,8 @@ class _Builder:
             return _Part(Number(NUMBERS[name]), *self._span(tree))
         if name in FUNCTIONS:
             raise self._fail(
-                f"{name} is a function: write {name}(...), or quote it if it is a signal",
+                f"{name} is a function: write {name}({', '.join('xy'[: FUNCTIONS[name]])}), or "
+                "quote it if it is a signal",
                 *self._span(tree),
             )
         return _Part(Signal(name), *self._span(tree))

@@ -18,7 +18,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PyTree
 
-from verifai_jax.core.text import format_time
+from verifai_jax.core.text import format_seconds
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import windows
 from verifai_jax.mtl._smoothing_error import error_of_setting
@@ -104,7 +104,7 @@ def _first_nan(formula: Formula, trace: Trace) -> str:
         signal = np.asarray(trace.signals[name])
         bad = np.isnan(signal.reshape(signal.shape[0], -1)).any(axis=1)
         if bad.any():
-            return f"signal {name!r} is NaN at {format_time(clock[int(np.argmax(bad))])} s"
+            return f"signal {name!r} is NaN at {format_seconds(clock[int(np.argmax(bad))])}"
     return f"the value of {formula} is NaN"
 
 

@@ -13,6 +13,7 @@ from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.evaluate import End, Evaluator
 from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.node import missing_case
 from verifai_jax.mtl.semantics import hard
 from verifai_jax.mtl.setting import Setting, evaluator_of, prepare
 
@@ -131,7 +132,9 @@ def _slack(e: Evaluator, f: Formula, first: int, last: int) -> _Slack:
             if a > 0:
                 terms.append(_past(e, left, "min", 0, a - 1, first, last))
             return _joined("min", terms) if len(terms) > 1 else terms[0]
-    return _Slack()
+        case ast.Constant() | ast.Predicate() | ast.Atom():
+            return _Slack()
+    raise missing_case("the smoothing error", f)
 
 
 def _until(e: Evaluator, f: Formula, g: Formula, n: int, first: int, last: int) -> _Slack:

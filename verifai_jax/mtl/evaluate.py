@@ -14,10 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from verifai_jax.core.text import format_seconds
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl import windows
 from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
 from verifai_jax.mtl.formula import Formula, Interval, Term
+from verifai_jax.mtl.node import missing_case
 
 End = Literal["hold", "truncate", "strict"]
 
@@ -33,13 +35,14 @@ def samples(time: float, dt: float, interval: Interval) -> float:
     n = time / dt
     if math.isinf(n):
         raise IntervalError(
-            f"the interval {interval} has more samples of {dt:zg} s than can be counted"
+            f"the interval {interval} has more samples of {format_seconds(dt)} than can be counted"
         )
     if abs(n - round(n)) > 1e-6 * max(1.0, abs(n)):
         low, high = math.floor(n), math.ceil(n)
         raise IntervalError(
-            f"the interval {interval} does not fit the sampling period of {dt:zg} s: {time:zg} s "
-            f"is not a multiple of it; the nearest are {low * dt:zg} s and {high * dt:zg} s"
+            f"the interval {interval} does not fit the sampling period of {format_seconds(dt)}: "
+            f"{format_seconds(time)} is not a multiple of it; the nearest are "
+            f"{format_seconds(low * dt)} and {format_seconds(high * dt)}"
         )
     return round(n)
 
@@ -109,7 +112,9 @@ class Evaluator:
             case ast.Historically(_, interval) | ast.Once(_, interval) | ast.Since(_, _, interval):
                 a, b = self.span(interval)
                 return max(below) + int(a if math.isinf(b) else b)
-        return max(below)
+            case ast.Not() | ast.And() | ast.Or() | ast.Until():
+                return max(below)
+        raise missing_case("the instant from which the value is constant", f)
 
     def value(self, f: Formula, first: int, last: int) -> Float[Array, "instants *lanes"]:
         """Compute the values of `f` at the instants `first` to `last`, both included."""
@@ -147,7 +152,7 @@ class Evaluator:
                 return self._until(left, right, *self.span(interval), first, last)
             case ast.Since(left, right, interval):
                 return self._since(left, right, *self.span(interval), first, last)
-        raise TypeError(f"not a formula: {f!r}")
+        raise missing_case("the robustness", f)
 
     # Leaves
 
@@ -211,7 +216,7 @@ class Evaluator:
                 return jnp.where(square == 0, square, jnp.sqrt(safe))
             case Arithmetic():
                 return self._arithmetic(e, start, stop)
-        raise TypeError(f"not an expression: {e!r}")
+        raise missing_case("the value", e)
 
     def _arithmetic(self, e: Arithmetic, start: int, stop: int) -> Array | float:
         # In a loop: a sum of many terms leans to the left as deep as it is long.

@@ -136,11 +136,11 @@ class Expression(Term):
 
     def __xor__(self, other: Formula | Term) -> Formula:
         if not isinstance(other, Formula | Term):
-            raise TypeError(f"'^' is exclusive or, between formulas; a power is {self}**{other}")
+            raise _not_a_power(self, other)
         return formula(self) ^ other
 
     def __rxor__(self, other: object) -> Formula:
-        raise TypeError(f"'^' is exclusive or, between formulas; a power is {other}**{self}")
+        raise _not_a_power(other, self)
 
     def __rshift__(self, other: Formula | Term) -> Formula:
         return formula(self) >> other
@@ -275,6 +275,14 @@ class Arithmetic(Expression):
                 node = node.arguments[0]
             text = "".join([node.text(level), *reversed(pieces)])
         return f"({text})" if level < outer else text
+
+
+def _not_a_power(base: object, exponent: object) -> TypeError:
+    try:
+        power = str(expression(base) ** expression(exponent))  # pyright: ignore[reportArgumentType]
+    except (TypeError, ValueError):
+        power = "x**2"
+    return TypeError(f"'^' is exclusive or, between formulas; a power is {power}")
 
 
 def constant_value(e: Expression) -> float | None:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar, TypeAlias, Union
 
 from verifai_jax.core.lazy import late
-from verifai_jax.mtl.node import Node, postorder
+from verifai_jax.mtl.node import Node, missing_case, postorder
 from verifai_jax.mtl.words import Text, number_text, operator_text
 
 
@@ -194,7 +194,9 @@ class Formula(Node):
 
     def _reach(self, dt: float) -> tuple[float, float]:
         """Return how many seconds the operator itself looks back and ahead."""
-        return 0.0, 0.0
+        if isinstance(self, Constant | Predicate | Atom | Not | And | Or):
+            return 0.0, 0.0
+        raise missing_case("the horizon, or the history,", self)
 
     def operands(self) -> tuple["Formula", ...]:
         """Return the formulas that it is made of, left to right."""
@@ -457,7 +459,7 @@ def surface(f: Formula) -> tuple[str, tuple[Formula, ...], Interval | None]:
             | Once(p, interval)
         ):
             return type(f).__name__.lower(), (p,), interval
-    raise TypeError(f"not an operator: {f!r}")
+    raise missing_case("the text", f)
 
 
 TRUE = Constant(True)

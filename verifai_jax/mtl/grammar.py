@@ -126,7 +126,7 @@ def parser() -> Any:
         POWER: "**"
         STAR: "*"
         SLASH: "/"
-        UNIT.5: /(?:min|ms|us|ns|s)(?!\w)/
+        UNIT.5: /(?:min|ms|us|ns|s|h|d)(?!\w)/
         ANGLE.5: /(?:{"|".join(ANGLES)})(?!\w)/
         NUMBER: /(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?/
         NAME: /{NAME.pattern}/
@@ -151,7 +151,7 @@ _GROUPS = (
     ({"UNTIL"}, "until"),
     ({"COMPARISON"}, "a comparison (<=, >, ...)"),
     ({"PLUS"}, "arithmetic"),
-    ({"UNIT"}, "a unit (s, ms, us, ns, min)"),
+    ({"UNIT"}, "a unit (s, ms, us, ns, min, h, d)"),
     ({"ANGLE"}, "a unit of angle (deg, rad)"),
     ({"COMMA"}, "','"),
     ({"COLON"}, "':'"),

@@ -14,6 +14,25 @@ from verifai_jax.core.notebook import ForUsers
 N = TypeVar("N", bound="Node")
 
 
+class MissingCaseError(TypeError):
+    """A walk over a formula has no case for a kind of node, such as one made outside of here."""
+
+
+def missing_case(walk: str, node: object) -> MissingCaseError:
+    """Return the error for a node that a walk over a formula has no case for.
+
+    **Arguments:**
+
+    - `walk`: what the walk gives, such as `"the horizon"`.
+    - `node`: the node; its own text is not asked for, since that is a walk, too.
+    """
+    kind = type(node)
+    return MissingCaseError(
+        f"{walk} of a formula has no case for a node {kind.__name__} (of {kind.__module__}): "
+        "build formulas of the operators of verifai_jax.mtl"
+    )
+
+
 class Node(ForUsers):
     """A node that is equal to another of the same kind with equal fields."""
 
@@ -64,7 +83,11 @@ class Node(ForUsers):
         return True
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({str(self)!r})"
+        try:
+            text = repr(str(self))
+        except MissingCaseError:
+            text = "..."  # Whoever shows it, such as a debugger or another error, goes on.
+        return f"{type(self).__name__}({text})"
 
     def __getstate__(self) -> dict[str, Any]:
         # What is remembered is of this process: texts have other hashes in the next.

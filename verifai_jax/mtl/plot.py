@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from verifai_jax.core.figure import Axes, Figure, new_figure
-from verifai_jax.core.text import format_time
+from verifai_jax.core.text import format_seconds
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._explain import Explanation, Node, heading
 from verifai_jax.mtl.evaluate import Evaluator
@@ -52,7 +52,7 @@ def draw(explanation: Explanation, path: str | Path | None = None) -> Figure:
     verdict = "holds" if explanation.holds else "fails"
     decided = (
         f"{verdict} with robustness {explanation.robustness:z.4g}: decided by  "
-        f"{explanation.predicate}  at {format_time(explanation.time)} s"
+        f"{explanation.predicate}  at {format_seconds(explanation.time)}"
     )
     above, below = 1 - 0.15 / size[1], 1 - (head - 0.5) / size[1]
     color = HOLDS if explanation.holds else FAILS
@@ -148,7 +148,7 @@ def _label(figure: Figure, axis: Axes, depth: int, node: Node, width: float) -> 
     figure.text(
         0.91,
         middle,
-        f"{value}\nat {format_time(node.time, 4)} s",
+        f"{value}\nat {format_seconds(node.time, 4)}",
         va="center",
         fontsize=9,
         weight=weight,

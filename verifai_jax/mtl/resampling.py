@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.core.text import format_time
+from verifai_jax.core.text import format_seconds, format_time
 from verifai_jax.core.trace import Trace, check_period
 from verifai_jax.mtl.setting import since_first
 
@@ -52,7 +52,8 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
         steps = np.floor((elapsed[-1] * (1 + 1e-9) + 1e-9 * dt + resolution) / dt)
     if not steps < MOST_SAMPLES:
         raise ValueError(
-            f"resampling {elapsed[-1]:zg} s every {dt:zg} s makes {steps + 1:z.3g} samples, "
+            f"resampling {format_seconds(elapsed[-1])} every {format_seconds(dt)} makes "
+            f"{steps + 1:z.3g} samples, "
             f"more than {MOST_SAMPLES}: take a longer period"
         )
     clock = dt * np.arange(int(steps) + 1)

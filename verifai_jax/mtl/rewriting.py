@@ -8,6 +8,7 @@ from decimal import Decimal
 
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.formula import FALSE, TRUE, Formula, Interval
+from verifai_jax.mtl.node import missing_case
 
 
 def nnf(f: Formula) -> Formula:
@@ -65,7 +66,7 @@ def _nnf_node(f: Formula, positive: bool, known: dict[tuple[Formula, bool], Form
         ):
             kind = type(f) if positive else _DUAL[type(f)]
             return kind(_nnf(operand, positive, known), interval)
-    raise TypeError(f"not a formula: {f!r}")
+    raise missing_case("the negation normal form", f)
 
 
 def simplify(f: Formula) -> Formula:
@@ -159,4 +160,6 @@ def rebuild(f: Formula, operands: tuple[Formula, ...]) -> Formula:
             return ast.Prev(operands[0], f.weak)
         case ast.Not():
             return ast.Not(operands[0])
-    return f
+        case ast.Constant() | ast.Predicate() | ast.Atom():
+            return f
+    raise missing_case("the rewriting", f)

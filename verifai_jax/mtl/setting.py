@@ -1,6 +1,7 @@
 """The setting of one evaluation: formula, trace and semantics, checked before anything compiles."""
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -10,7 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Real
 
 from verifai_jax.core.errors import missing_name
-from verifai_jax.core.text import format_time
+from verifai_jax.core.text import format_seconds, format_time
 from verifai_jax.core.trace import Samples, Trace, as_array, check_period
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import End, Evaluator
@@ -69,11 +70,33 @@ def as_formula(formula: Formula | str) -> Formula:
     return formula
 
 
+def check_trace(trace: object) -> None:
+    """Refuse what is no trace, and say how to make one of it.
+
+    **Raises:** `TypeError`.
+    """
+    if isinstance(trace, Trace):
+        return
+    if hasattr(trace, "columns"):
+        how = ": write vj.Trace.from_dataframe(...), which reads its column of times"
+    elif isinstance(trace, Mapping):
+        names = ", ".join(f"{str(name)!r}: ..." for name in list(trace)[:3]) or "'x': ..."
+        more = ", ..." if len(trace) > 3 else ""
+        how = (
+            f", which has no clock: write vj.Trace({{{names}{more}}}, dt=0.1), where dt is the "
+            "seconds from one sample to the next, or times=[...] for the seconds of each"
+        )
+    else:
+        how = ': write vj.Trace({"x": [...]}, dt=0.1), signals by name and the seconds of a sample'
+    raise TypeError(f"a Trace is needed here; got a {type(trace).__name__}{how}")
+
+
 def prepare(
     formula: Formula | str, trace: Trace, semantics: Semantics, end: End, compat: str | None
 ) -> tuple[Setting, dict[str, Array], Array | None, Array | None]:
     """Check an evaluation; return its setting, its signals, its temperature and valid length."""
     formula = as_formula(formula)
+    check_trace(trace)
     if end not in ("hold", "truncate", "strict"):
         raise ValueError(f"end is 'hold', 'truncate' or 'strict'; got {end!r}")
     if compat not in (None, "pymtl"):
@@ -149,12 +172,14 @@ def period(trace: Trace) -> float:
         )
     if resolution > 0.1 * dt:
         raise ValueError(
-            f"the sample times do not tell a period of {dt:zg} s{_too_coarse(trace, resolution)}"
+            f"the sample times do not tell a period of {format_seconds(dt)}"
+            f"{_too_coarse(trace, resolution)}"
         )
     if np.any(np.abs(steps - dt) > EVEN * dt + resolution):
         k = int(np.argmax(np.abs(steps - dt)))
         raise SamplingError(
-            f"the trace is not evenly sampled: steps of {steps.min():zg} s to {steps.max():zg} s, "
+            f"the trace is not evenly sampled: steps of {format_seconds(steps.min())} to "
+            f"{format_seconds(steps.max())}, "
             f"as at {_at(trace, k)}",
             float(np.median(steps)),
         )
@@ -207,6 +232,7 @@ def _too_coarse(trace: Trace, resolution: float) -> str:
 
 
 def _at(trace: Trace, k: int) -> str:
+    # In seconds, as whoever looks for it in a recording finds it.
     return f"{format_time(float(np.asarray(trace.clock())[k]))} s"
 
 
@@ -217,8 +243,9 @@ def _check_horizon(formula: Formula, trace: Trace, dt: float) -> None:
         length = int(np.min(np.asarray(trace.valid)))
     duration = (length - 1) * dt
     if horizon > duration * (1 + 1e-9) + 1e-9 * dt:
-        what = "has no end" if math.isinf(horizon) else f"looks {horizon:zg} s ahead"
-        raise HorizonError(f"the formula {what}, but the trace lasts {duration:zg} s: {formula}")
+        what = "has no end" if math.isinf(horizon) else f"looks {format_seconds(horizon)} ahead"
+        lasts = format_seconds(duration)
+        raise HorizonError(f"the formula {what}, but the trace lasts {lasts}: {formula}")
 
 
 def evaluator_of(

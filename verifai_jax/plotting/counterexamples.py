@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax.core.figure import Axes, Figure
-from verifai_jax.core.text import format_time
+from verifai_jax.core.text import format_seconds
 from verifai_jax.core.waveform import HELD, Waveform, acting_spans, control_times, is_waveform
 from verifai_jax.counterexamples._explain import Explained, Influence
 from verifai_jax.counterexamples._shrink import Shrunk
@@ -112,7 +112,7 @@ def draw_decision(axes: Axes, why: Explanation) -> None:
         if bounds:
             nearest = min(bounds, key=lambda b: abs(b - values[place]))
             shown = format_apart(float(values[place]), nearest)[0]
-        decided = f"\n{shown} at {format_time(clock[place], 4)} s"
+        decided = f"\n{shown} at {format_seconds(clock[place], 4)}"
     axes.set_ylabel(wrap_name(label, 28))
     # Above the axes, where no curve runs through it.
     title = f"decides: {_short(str(predicate), 100)}{decided}"

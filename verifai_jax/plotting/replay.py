@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.figure import Axes, Figure
-from verifai_jax.core.text import format_time, shorten
+from verifai_jax.core.text import format_seconds, shorten
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import is_waveform
 from verifai_jax.evaluation.replay import Replay
@@ -378,4 +378,4 @@ def _mark(axes: Axes, trace: Trace, signal: str, sample: int) -> str:
     if np.ndim(value):
         value = value[int(np.argmax(np.abs(value)))]
     axes.plot([time], [value], "o", color=FAILING, markersize=6, clip_on=False)
-    return f"decided by {signal} = {value:z.4g} at {format_time(time, 4)} s"
+    return f"decided by {signal} = {value:z.4g} at {format_seconds(time, 4)}"

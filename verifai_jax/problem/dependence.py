@@ -1,6 +1,7 @@
 """The dependence of a problem's robustness on its features and its key, without simulating.
 
     has_gradient(problem)                           # can slopes by features say anything?
+    without_derivative(problem)                     # None, or "pure_callback of road (sim.py, ..."
     depends_on_key(problem)                         # does a point fail with a probability?
 
 A signal that is a whole number (a gear, a count) or a truth value is constant between its jumps:
@@ -11,10 +12,14 @@ a derivative that does not depend on them either.
 To differentiate a simulation takes JAX many times as long as to trace it. So a sweep over the steps
 of the traced simulation finds what depends on the features through steps that have derivatives.
 Only steps that bring a derivative of their own are differentiated, each for itself.
+
+Some steps have none at all: a call of Python on the host, an operation of somebody's own. Where a
+feature reaches the robustness through one, JAX differentiates nothing of the simulation.
 """
 
 from collections.abc import Sequence, Set
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.extend.core
@@ -24,11 +29,24 @@ from jaxtyping import Array, Key, PyTree
 
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import Slot
-from verifai_jax.core.steps import PROGRAM, as_function, of_some, used_inputs
+from verifai_jax.core.steps import PROGRAM, as_function, of_some, used_inputs, without_unused
+from verifai_jax.core.user_errors import source_line
 from verifai_jax.problem.problem import Problem
 
-DEPENDENCE: Slot[None, bool] = Slot("dependence")
-"""Whether the robustness of a problem depends differentiably on a feature."""
+
+class Slopes(NamedTuple):
+    """The derivative of a robustness by the features, as far as it is known without simulating.
+
+    - `depends`: whether it can be anything but zero.
+    - `lacking`: the steps on its way that have no derivative, for people; often none.
+    """
+
+    depends: bool
+    lacking: tuple[str, ...]
+
+
+DEPENDENCE: Slot[None, Slopes] = Slot("dependence")
+"""How the robustness of a problem depends on the features."""
 
 KEY: Slot[None, bool] = Slot("dependence on the key")
 """Whether the verdict of a simulation depends on its random key."""
@@ -42,6 +60,19 @@ _CALLS |= {"remat2": "jaxpr", "checkpoint": "jaxpr", "remat": "jaxpr", "custom_v
 
 def has_gradient(problem: Problem) -> bool:
     """Return whether a monitored signal depends differentiably on a feature; traced once."""
+    return _slopes(problem).depends
+
+
+def without_derivative(problem: Problem) -> str | None:
+    """Return which steps from the features to the robustness have no derivative; traced once.
+
+    None where all have one, and for a black box, which JAX does not trace.
+    """
+    lacking = () if problem.black_box else _slopes(problem).lacking
+    return " and ".join(lacking) if lacking else None
+
+
+def _slopes(problem: Problem) -> Slopes:
     return problem.programs.get(DEPENDENCE, None, lambda: _depends(problem))
 
 
@@ -71,30 +102,104 @@ def _uses_key(problem: Problem) -> bool:
 
 
 @truncate_silently()
-def _depends(problem: Problem) -> bool:
+def _depends(problem: Problem) -> Slopes:
     key = jax.eval_shape(lambda: jax.random.key(0))
     mapped, features = jax.make_jaxpr(problem.space.unflatten, return_shape=True)(
         problem.space.point_form
     )
-    moved = _sweep(mapped.jaxpr, [True])
+    sweep = _Sweep()
+    moved = sweep(mapped.jaxpr, [True])
     # Traced already, when the problem was checked.
     program, trace = jax.make_jaxpr(problem.system, return_shape=True)(features, key)
     of_key = [False] * (len(program.jaxpr.invars) - len(moved))
-    reached = _sweep(program.jaxpr, [*moved, *of_key])
-    signals = jax.tree.unflatten(jax.tree.structure(trace), reached).signals
-    return any(any(jax.tree.leaves(signals[name])) for name in problem.monitored)
+    # What nothing monitored is computed from is not differentiated either.
+    count = len(program.jaxpr.outvars)
+    numbers = jax.tree.unflatten(jax.tree.structure(trace), range(count))
+    signals = {name: numbers.signals[name] for name in problem.monitored}
+    judged = set(jax.tree.leaves((signals, numbers.valid, numbers.status)))
+    read = without_unused(program.jaxpr, [number in judged for number in range(count)])
+    reached = sweep(read, [*moved, *of_key])
+    found = dict(zip(sorted(judged), reached, strict=True))
+    depends = any(found[number] for number in jax.tree.leaves(signals))
+    return Slopes(depends, tuple(sweep.lacking))
 
 
-def _sweep(program: jax.extend.core.Jaxpr, moved: Sequence[bool]) -> list[bool]:
-    """Return which results of a program depend differentiably on the inputs that are `moved`."""
-    depends = {each for each, moves in zip(program.invars, moved, strict=True) if moves}
-    for step in program.eqns:
-        inputs = _among(step.invars, depends)
-        if any(inputs):
-            results = _results(program, step, inputs)
-            pairs = zip(step.outvars, results, strict=True)
-            depends.update(each for each, moves in pairs if moves and _is_real(each))
-    return _among(program.outvars, depends)
+class _Sweep:
+    """Sweeps over the steps of programs; `lacking` are those found that have no derivative."""
+
+    def __init__(self) -> None:
+        self.lacking: dict[str, None] = {}
+
+    def __call__(self, program: jax.extend.core.Jaxpr, moved: Sequence[bool]) -> list[bool]:
+        """Return which results of a program depend differentiably on inputs that are `moved`."""
+        depends = {each for each, moves in zip(program.invars, moved, strict=True) if moves}
+        for step in program.eqns:
+            inputs = _among(step.invars, depends)
+            if any(inputs):
+                results = self.results(program, step, inputs)
+                pairs = zip(step.outvars, results, strict=True)
+                depends.update(each for each, moves in pairs if moves and _is_real(each))
+        return _among(program.outvars, depends)
+
+    def results(self, program: jax.extend.core.Jaxpr, step: Any, moved: list[bool]) -> list[bool]:
+        """Return which results of a step depend differentiably on the inputs that are `moved`."""
+        name, options = step.primitive.name, step.params
+        if name in _CALLS and _CALLS[name] in options:
+            return self(_program(options[_CALLS[name]]), moved)
+        if name == "scan":
+            constants, carried = _operands_of_scan(options)
+            fixed, carry = moved[:constants], moved[constants : constants + carried]
+            rows = moved[constants + carried :]
+            return self.repeated(_program(options["jaxpr"]), fixed, carry, rows)
+        if name == "while":
+            test, count = options["cond_nconsts"], options["body_nconsts"]
+            body = _program(options["body_jaxpr"])
+            return self.repeated(body, moved[test : test + count], moved[test + count :], [])
+        if name == "cond":
+            branches = [self(_program(each), moved[1:]) for each in options["branches"]]
+            return [any(each) for each in zip(*branches, strict=True)]
+        if name.startswith("scatter") or (_is_of_jax(step) and not _nested(step)):
+            return [name not in _FLAT] * len(step.outvars)
+        return self.differentiated(program, step, moved)
+
+    def differentiated(
+        self, program: jax.extend.core.Jaxpr, step: Any, moved: list[bool]
+    ) -> list[bool]:
+        """Return the same from the derivative of the step along a direction."""
+        call, inputs = as_function(program, step)
+        pairs = zip(step.invars, moved, strict=True)
+        moving = {each for each, moves in pairs if moves and _is_real(each)}
+        places = [i for i, each in enumerate(inputs) if each in moving]
+        forms = [jax.ShapeDtypeStruct(each.aval.shape, each.aval.dtype) for each in inputs]
+
+        def along(values: list[Array], direction: list[Array]) -> list[Any]:
+            function = of_some(call, values, places)
+            return jax.jvp(function, [values[i] for i in places], direction)[1]
+
+        try:
+            derivative = jax.make_jaxpr(along)(forms, [forms[i] for i in places]).jaxpr
+        except Exception:
+            # JAX says by errors of many kinds that there is none, each operation by its own.
+            self.lacking.setdefault(_described(step))
+            return [False] * len(step.outvars)
+        # All that it is computed from in any way: the derivative is linear in the direction.
+        reached = set(derivative.invars[len(inputs) :])
+        for each in derivative.eqns:
+            if any(_among(each.invars, reached)):
+                reached.update(each.outvars)
+        found = iter(_among(derivative.outvars, reached))
+        return [_is_real(each) and next(found) for each in step.outvars]
+
+    def repeated(
+        self, body: jax.extend.core.Jaxpr, fixed: list[bool], carry: list[bool], rows: list[bool]
+    ) -> list[bool]:
+        """Return the same of a loop: what is carried goes round until no more of it depends."""
+        while True:
+            results = self(body, [*fixed, *carry, *rows])
+            after = [old or new for old, new in zip(carry, results[: len(carry)], strict=True)]
+            if after == carry:
+                return [*carry, *results[len(carry) :]]
+            carry = after
 
 
 def _among(values: Sequence[Any], variables: Set[Any]) -> list[bool]:
@@ -109,26 +214,26 @@ def _is_real(value: Any) -> bool:
     return dtype is not None and jnp.issubdtype(dtype, jnp.inexact)
 
 
-def _results(program: jax.extend.core.Jaxpr, step: Any, moved: list[bool]) -> list[bool]:
-    """Return which results of a step depend differentiably on the inputs that are `moved`."""
-    name, options = step.primitive.name, step.params
-    if name in _CALLS and _CALLS[name] in options:
-        return _sweep(_program(options[_CALLS[name]]), moved)
-    if name == "scan":
-        constants, carried = _operands_of_scan(options)
-        fixed, carry = moved[:constants], moved[constants : constants + carried]
-        rows = moved[constants + carried :]
-        return _repeated(_program(options["jaxpr"]), fixed, carry, rows)
-    if name == "while":
-        test, count = options["cond_nconsts"], options["body_nconsts"]
-        body = _program(options["body_jaxpr"])
-        return _repeated(body, moved[test : test + count], moved[test + count :], [])
-    if name == "cond":
-        branches = [_sweep(_program(each), moved[1:]) for each in options["branches"]]
-        return [any(each) for each in zip(*branches, strict=True)]
-    if name.startswith("scatter") or (step.primitive in ad.primitive_jvps and not _nested(step)):
-        return [name not in _FLAT] * len(step.outvars)
-    return _differentiated(program, step, moved)
+def _is_of_jax(step: Any) -> bool:
+    """Return whether JAX has a derivative of its own for a step: one that does not refuse.
+
+    Those of calls of Python, and of operations from elsewhere, are asked for.
+    """
+    rule = ad.primitive_jvps.get(step.primitive)
+    while isinstance(rule, partial):
+        rule = rule.func
+    return str(getattr(rule, "__module__", "")).startswith(
+        ("jax._src.lax", "jax._src.interpreters")
+    )
+
+
+def _described(step: Any) -> str:
+    """Write a step for people: its operation, the function that it calls, and the user's line."""
+    called = step.params.get("callback")
+    name = getattr(getattr(called, "callback_func", called), "__name__", "")
+    named = f" of {name}" if name and not name.startswith("<") else ""
+    line = source_line(getattr(step.source_info, "traceback", None))
+    return f"{step.primitive.name}{named}{'' if line is None else f' ({line})'}"
 
 
 def _operands_of_scan(options: dict[str, Any]) -> tuple[int, int]:
@@ -146,40 +251,6 @@ def _nested(step: Any) -> bool:
         list(step.params.values()), is_leaf=lambda each: isinstance(each, kinds)
     )
     return any(isinstance(each, kinds) for each in leaves)
-
-
-def _differentiated(program: jax.extend.core.Jaxpr, step: Any, moved: list[bool]) -> list[bool]:
-    """Return the same from the derivative of the step along a direction."""
-    call, inputs = as_function(program, step)
-    pairs = zip(step.invars, moved, strict=True)
-    moving = {each for each, moves in pairs if moves and _is_real(each)}
-    places = [i for i, each in enumerate(inputs) if each in moving]
-    forms = [jax.ShapeDtypeStruct(each.aval.shape, each.aval.dtype) for each in inputs]
-
-    def along(values: list[Array], direction: list[Array]) -> list[Any]:
-        function = of_some(call, values, places)
-        return jax.jvp(function, [values[i] for i in places], direction)[1]
-
-    derivative = jax.make_jaxpr(along)(forms, [forms[i] for i in places]).jaxpr
-    # All that it is computed from in any way: the derivative is linear in the direction.
-    reached = set(derivative.invars[len(inputs) :])
-    for each in derivative.eqns:
-        if any(_among(each.invars, reached)):
-            reached.update(each.outvars)
-    found = iter(_among(derivative.outvars, reached))
-    return [_is_real(each) and next(found) for each in step.outvars]
-
-
-def _repeated(
-    body: jax.extend.core.Jaxpr, fixed: list[bool], carry: list[bool], rows: list[bool]
-) -> list[bool]:
-    """Return the same of a loop: what is carried goes round until no more of it depends."""
-    while True:
-        results = _sweep(body, [*fixed, *carry, *rows])
-        after = [old or new for old, new in zip(carry, results[: len(carry)], strict=True)]
-        if after == carry:
-            return [*carry, *results[len(carry) :]]
-        carry = after
 
 
 def _program(program: Any) -> jax.extend.core.Jaxpr:

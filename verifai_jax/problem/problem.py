@@ -13,6 +13,7 @@ from itertools import pairwise
 from typing import Any
 
 import jax
+import numpy as np
 from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.checks import check_name
@@ -31,6 +32,7 @@ from verifai_jax.core.user_errors import (
 )
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.mtl import Formula, hard, parse, robustness
+from verifai_jax.mtl.deciding import leaves_of
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.semantics import Semantics
 from verifai_jax.problem.behaviour import Behaviour
@@ -268,15 +270,25 @@ class Problem(InNotebook):
             raise self._wrong_system(error, features) from error
         trace = self.form()
         if trace is None:
-            known = self.system.known_signals
-            for signal in self.monitored:
-                if known is not None and signal not in known:
-                    raise missing_name("the trace", "signal", signal, known)
+            self._check_known()
             return
         for formula in self.formulas.values():
             jax.eval_shape(lambda t, f=formula: robustness(f, t, end=self.end), trace)
         if (guide := self.guide) is not None:
             jax.eval_shape(lambda t, f: guide.value(t.hold(), f, self.end), trace, features)
+
+    def _check_known(self) -> None:
+        """Check the formulas against what is known of the signals of a black box."""
+        known = self.system.known_signals
+        for signal in self.monitored:
+            if known is not None and signal not in known:
+                raise missing_name("the trace", "signal", signal, known)
+        if isinstance(known, Mapping):
+            shapes = {name: (2,) if width == 1 else (2, width) for name, width in known.items()}
+            forms: Any = {n: jax.ShapeDtypeStruct(s, np.float32) for n, s in shapes.items()}
+            # Predicates alone: how long a trace lasts, and how often it is sampled, is not known.
+            for leaf in leaves_of(list(self.formulas.values())):
+                jax.eval_shape(lambda t, f=leaf: robustness(f, t), Trace(forms, dt=1.0))
 
     def form(self) -> Trace | None:
         """Return the form of the system's traces, signals as `jax.ShapeDtypeStruct`; traced once.

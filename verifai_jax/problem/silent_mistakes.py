@@ -20,6 +20,7 @@ from jaxtyping import PyTree
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import Slot
 from verifai_jax.core.steps import PROGRAM, used_inputs
+from verifai_jax.core.text import format_seconds
 from verifai_jax.core.user_errors import source_line
 from verifai_jax.features import Categorical, Domain
 from verifai_jax.features.compound import Struct
@@ -77,7 +78,8 @@ def beyond_the_trace(problem: Problem) -> Iterator[str]:
         if math.isfinite(ahead) and ahead > duration + 1.01 * form.dt:
             which = "the formula" if len(problem.formulas) == 1 else f"formula {name!r}"
             yield (
-                f"{which} looks {ahead:zg} s ahead and a trace lasts {duration:zg} s: "
+                f"{which} looks {format_seconds(ahead)} ahead and a trace lasts "
+                f"{format_seconds(duration)}: "
                 f"{END_OF_TRACE[problem.end]}"
             )
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from verifai_jax.core.text import one_line
+from verifai_jax.core.text import format_seconds, one_line
 from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import parse
@@ -147,8 +147,10 @@ def system_rows(run: Run) -> list[tuple[str, Child]]:
         name = getattr(function, "__qualname__", type(system).__qualname__)
         module = getattr(function, "__module__", "") or ""
         rows.append(("system", element("code", f"{module}.{name}".removeprefix("__main__."))))
-        if not problem.black_box and (form := problem.form()) is not None and form.dt is not None:
-            rows.append(("duration", f"{problem.duration:zg} s, a sample every {form.dt:zg} s"))
+        form, duration = (None, None) if problem.black_box else (problem.form(), problem.duration)
+        if form is not None and form.dt is not None and duration is not None:
+            lasts, period = format_seconds(duration), format_seconds(form.dt)
+            rows.append(("duration", f"{lasts}, a sample every {period}"))
         rows.append(("kind", "black box" if problem.black_box else "traced by JAX"))
         if system.exact_step:
             rows.append(("integration step", "belongs to the system, as its authors published it"))

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from verifai_jax.core.text import format_percent, one_line
+from verifai_jax.core.text import format_percent, format_seconds, one_line
 from verifai_jax.features import Domain
 from verifai_jax.features.arrays import Array, VariableArray
 from verifai_jax.features.box import Box, DiscreteBox
@@ -94,16 +94,16 @@ def _span(interval: Interval | None) -> str:
     if interval is None or interval.everything:
         return ""
     if interval.end == math.inf:
-        return f" from {interval.start:zg} s on"
-    return f" from {interval.start:zg} s to {interval.end:zg} s"
+        return f" from {format_seconds(interval.start)} on"
+    return f" from {format_seconds(interval.start)} to {format_seconds(interval.end)}"
 
 
 def _back(interval: Interval | None) -> str:
     if interval is None or interval.everything:
         return ""
     if interval.end == math.inf:
-        return f", {interval.start:zg} s ago or earlier"
-    return f", {interval.start:zg} s to {interval.end:zg} s ago"
+        return f", {format_seconds(interval.start)} ago or earlier"
+    return f", {format_seconds(interval.start)} to {format_seconds(interval.end)} ago"
 
 
 def domain_words(domain: Domain) -> str:

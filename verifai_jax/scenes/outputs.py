@@ -138,9 +138,13 @@ class Outputs:
         if self._python:
             answer = jax.ShapeDtypeStruct((len(self._python),), real)
             asked = {name: features[name] for name in self.sampling.domains}
-            column = jax.pure_callback(
-                lambda f: self._computed(f, real), answer, asked, vmap_method="broadcast_all"
-            )
+
+            def computed(features: Mapping[str, Any]) -> np.ndarray:
+                return self._computed(features, real)
+
+            # What a person reads of it, where it has no derivative.
+            computed.__name__ = f"{', '.join(self.in_python)}, which Scenic computes in Python"
+            column = jax.pure_callback(computed, answer, asked, vmap_method="broadcast_all")
             for i, (owner, name, _) in enumerate(self._python):
                 found[owner, name] = column[..., i]
         return {

@@ -48,6 +48,7 @@ from verifai_jax.synthesis.optimize import (
     value_merit,
 )
 from verifai_jax.synthesis.parametric import ArrayParameters, Parametric
+from verifai_jax.synthesis.region import Region, region_of
 from verifai_jax.synthesis.results import Repair, Round
 
 ADDED = 8
@@ -70,6 +71,7 @@ def repair(
     margin: float = 0.0,
     rounds: int = 30,
     held_out: int = 2000,
+    mass: float = 0.999,
     gradient: bool | None = None,
     batch: int = 256,
     seed: int = 0,
@@ -91,6 +93,9 @@ def repair(
     - `margin`: robustness that is wanted.
     - `rounds`: turns of attack and repair at most.
     - `held_out`: fresh environments for the failure rates before and after; 0 for no check.
+    - `mass`: probability of the part of the prior in which the environment is attacked, nearest to
+      its medians: what lies farther out in the tails is no reason for other parameters. With 1 the
+      attack goes to the ends of all tails at once.
     - `gradient`: whether to follow gradients; by default where the system has them without
       changing the backend.
     - `max_seconds`: wall-clock seconds, of which a fifth is kept for the check.
@@ -123,7 +128,9 @@ def repair(
         )
     search = attack_search(whole, attack, loop)
     limits, checking = split_budget(lambda: loop.simulations, budget, started, max_seconds)
-    work = _Repair(loop, start, search, limits, margin, seed)
+    region = region_of(loop, mass)
+    assert region is not None
+    work = _Repair(loop, start, search, limits, margin, seed, region)
     try:
         if run is not None:
             work.add_run(run)
@@ -249,8 +256,10 @@ class _Repair:
         limits: Budget,
         margin: float,
         seed: int,
+        region: Region,
     ) -> None:
         assert loop.environment is not None
+        self.region = region
         self.loop, self.start, self.search, self.limits = loop, start, search, limits
         self.margin, self.seed = margin, seed
         self.rng = np.random.default_rng((seed, 2))
@@ -264,7 +273,7 @@ class _Repair:
         self.slack = 0.0
         self.archive = Archive()
         self.turns: list[Round] = []
-        self.notes: list[str] = []
+        self.notes: list[str] = [region.describe()]
         self.stopped = "rounds"
 
     def add_run(self, run: Run) -> None:
@@ -277,6 +286,13 @@ class _Repair:
             points = space.points(rows.iloc[order])
             pairs = self.loop.evaluate(self.start[None], points)
             failing = pairs.violates(self.margin)[0]
+            far = failing & ~self.region.contains(points)
+            if far.any():
+                self.notes.append(
+                    f"{int(far.sum())} counterexamples of the run of {run.name!r} lie farther out "
+                    "in the tails of the prior, and were left out"
+                )
+            failing &= ~far
             self.environments = points[failing][: 2 * ADDED].astype(np.float32)
             if failing.any():
                 self.set_aim(pairs.rho[0])
@@ -316,6 +332,7 @@ class _Repair:
             result = attack(
                 self.loop, self.now.theta, self.margin, self.limits.slice(self.share),
                 search=self.search, batch=self.batch, seed=self.seed + 7919 * number,
+                region=self.region,
                 scale=self.deficit or 1.0,
             )  # fmt: skip
             count = int(result.violating.sum())

@@ -26,7 +26,7 @@ from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification.validation import check_options, check_search, usual_batch
-from verifai_jax.problem.dependence import depends_on_key
+from verifai_jax.problem.dependence import depends_on_key, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.max_min import max_min_step
@@ -45,6 +45,7 @@ from verifai_jax.synthesis.optimize import (
     worst_case,
 )
 from verifai_jax.synthesis.parametric import FeatureParameters, Parametric, rows_of
+from verifai_jax.synthesis.region import Region, region_of
 from verifai_jax.synthesis.results import Synthesis
 
 if TYPE_CHECKING:
@@ -73,6 +74,7 @@ def synthesize(
     margin: float = 0.0,
     environments: int = 16,
     held_out: int = 2000,
+    mass: float = 0.999,
     gradient: bool | None = None,
     batch: int = 256,
     seed: int = 0,
@@ -93,6 +95,8 @@ def synthesize(
     - `margin`: robustness that is wanted.
     - `environments`: in the set at first.
     - `held_out`: fresh environments in which the result is checked; 0 for no check.
+    - `mass`: probability of the part of the prior in which the environment is attacked, nearest to
+      its medians; 1 for all of it, to the ends of all tails at once.
     - `gradient`: whether to follow gradients; by default where the system has them without
       changing the backend.
     - `batch`: simulations at once.
@@ -113,7 +117,8 @@ def synthesize(
     )
     search = attack_search(problem, attack, loop)
     limits, checking = split_budget(lambda: loop.simulations, budget, started, max_seconds)
-    work = _Synthesis(loop, search, limits, margin, environments, seed)
+    region = region_of(loop, mass)
+    work = _Synthesis(loop, search, limits, margin, environments, seed, region)
     try:
         work.run()
         stopped = work.stopped
@@ -150,6 +155,7 @@ def synthesize(
         seconds=time.perf_counter() - started,
         stopped=stopped,
         seed=seed,
+        varied="" if region is None else region.describe(),
     )
 
 
@@ -178,7 +184,9 @@ class _Synthesis:
         margin: float,
         environments: int,
         seed: int,
+        region: Region | None,
     ) -> None:
+        self.region = region
         self.loop, self.search, self.limits, self.seed = loop, search, limits, seed
         self.margin = margin
         # One shape for all attacks: a twentieth of what one may cost.
@@ -199,6 +207,8 @@ class _Synthesis:
                 # The constraint wants other parameters: it is asked with each of them.
                 rng = np.random.default_rng((seed, 3))
                 self.environments = rng.random((environments, loop.environment.dim), np.float32)
+            assert region is not None
+            self.environments = region.project(self.environments)
 
     def run(self) -> None:
         whole = self.limits
@@ -239,10 +249,11 @@ class _Synthesis:
             level = choice.value - 1e-3 * self.scale
             share = max(self.limits.left // 4, min(self.limits.left, 256))
             share = min(share, ATTACK)
+            assert self.region is not None
             result = attack(
                 self.loop, choice.theta, level, self.limits.slice(share), search=self.search,
                 batch=self.batch, seed=self.seed + 7919 * number,
-                scale=self.scale,
+                region=self.region, scale=self.scale,
             )  # fmt: skip
             worst = min(choice.value, result.worst)
             name = choice.theta.tobytes()
@@ -407,7 +418,14 @@ def feature_parameters(
         wanted=backend,
     )  # fmt: skip
     choice.problem.check()
-    wanted = not several if gradient is None else gradient
+    follows = gradient or (gradient is None and not several)
+    lacking = without_derivative(choice.problem) if follows else None
+    if gradient and lacking is not None:
+        raise ValueError(
+            f"the system of problem {problem.name!r} has no gradient: {lacking} has no derivative; "
+            "leave gradient out, and parameters are chosen by cross-entropy"
+        )
+    wanted = bool(follows) and lacking is None
     return FeatureParameters(
         choice.problem, parameters, batch=batch, gradient=wanted, precision=precision, seed=seed
     )

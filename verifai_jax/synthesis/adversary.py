@@ -2,7 +2,8 @@
 
 A search drives the environment's own cube with the parameters held. The worst environments are then
 followed downhill, by gradients or by differences of few coordinates, with steps as far as a corner
-of the cube, where the worst of a smooth system often lies.
+of the cube, where the worst of a smooth system often lies. All of it stays where the prior has its
+probability (`region.py`).
 """
 
 from typing import NamedTuple
@@ -15,6 +16,7 @@ from verifai_jax.core.budget import Budget
 from verifai_jax.search import Search
 from verifai_jax.search.proposals import Proposals
 from verifai_jax.synthesis.parametric import Pairs, Parametric
+from verifai_jax.synthesis.region import Region
 
 MOST_FOLLOWED = 4
 """Environments that are followed downhill."""
@@ -68,6 +70,7 @@ def attack(
     search: Search,
     batch: int,
     seed: int,
+    region: Region,
     enough: int = 64,
     scale: float = 1.0,
 ) -> Attack:
@@ -82,6 +85,7 @@ def attack(
     - `search`: over the environment.
     - `batch`: environments that the search proposes at once.
     - `seed`: of the search.
+    - `region`: where the environment is attacked.
     - `enough`: environments after which the search stops.
     - `scale`: size of ordinary robustnesses, to which temperatures are relative.
     """
@@ -104,6 +108,7 @@ def attack(
         points = np.asarray(proposals.next(min(batch, searching.left)))
         if not len(points):
             break
+        points = region.project(points)
         warm = float(proposals.temperature) if search.wants_gradient else None
         pairs = loop.evaluate(theta[None], points, warm)
         parts.append((points, pairs))
@@ -118,7 +123,7 @@ def attack(
             break
     result = _collect(parts, level, loop)
     if len(result.rho) and follows:
-        result = _descend(loop, theta, level, limits, result, scale)
+        result = _descend(loop, theta, level, limits, result, scale, region)
     return result
 
 
@@ -129,6 +134,7 @@ def _descend(
     limits: Budget,
     first: Attack,
     scale: float,
+    region: Region,
 ) -> Attack:
     assert loop.environment is not None
     free = np.array(loop.environment.levels) == 0
@@ -144,8 +150,10 @@ def _descend(
         tried.append(beside)
         down = -np.sign(gradients) * free
         moved = np.stack([np.clip(points + step * down, 0.0, 1.0) for step in STEPS], axis=1)
-        pairs = loop.evaluate(theta[None], moved.reshape(-1, points.shape[1]))
-        tried.append((moved.reshape(-1, points.shape[1]), pairs))
+        rows = region.project(moved.reshape(-1, points.shape[1]))
+        moved = rows.reshape(moved.shape)
+        pairs = loop.evaluate(theta[None], rows)
+        tried.append((rows, pairs))
         rho = np.where(pairs.proper[0], pairs.rho[0], np.inf).reshape(len(points), len(STEPS))
         least, which = rho.min(axis=1), rho.argmin(axis=1)
         better = least < best

@@ -31,7 +31,8 @@ class Synthesis(InNotebook):
     `attacks`: environments that were tried against the best parameters; `converged`: whether the
     last attack found no environment worse than those of the set; `simulations` (without
     those of the check), `without_verdict` and `seconds`; `stopped`: `"converged"`, `"budget"`,
-    `"max_seconds"`, `"no verdict"` or `"interrupted"`; `problem`: the one given; `seed`.
+    `"max_seconds"`, `"no verdict"` or `"interrupted"`; `problem`: the one given; `seed`;
+    `varied`: what was chosen, what the environment varied, and how far.
     """
 
     problem: Problem = field(repr=False)
@@ -48,6 +49,7 @@ class Synthesis(InNotebook):
     seconds: float
     stopped: str
     seed: int
+    varied: str = ""
 
     @property
     def holds(self) -> bool:
@@ -93,6 +95,8 @@ class Synthesis(InNotebook):
             )
         elif around:
             lines.append("  not checked in held-out environments")
+        if self.varied:
+            lines.append(f"  {self.varied}")
         found, of = len(self.robust), len(self.candidates)
         if around:
             over = f"over {len(self.environments)} environments"
@@ -280,7 +284,7 @@ class Repair(InNotebook):
             lines.append("  not checked in held-out environments")
         if self.found and self.held_out_after is not None and not self.held_out_after.passed:
             lines.append(
-                "  the check found what the attacks did not: try a larger budget or margin"
+                "  the check found what the attacks did not: try a larger budget, margin or mass"
             )
         checks = (self.held_out_before, self.held_out_after)
         if all(check is not None and check.simulations and not check.failures for check in checks):

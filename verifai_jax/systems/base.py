@@ -20,6 +20,9 @@ from verifai_jax.core.notebook import ForUsers
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.user_errors import format_user_error
 
+KnownSignals: TypeAlias = tuple[str, ...] | Mapping[str, int] | None
+"""Names of signals, or names with their numbers of components, 1 for a scalar; None if unknown."""
+
 Features: TypeAlias = PyTree
 """The features of one simulation, as `FeatureSpace.unflatten` gives them; or of a batch."""
 
@@ -128,8 +131,11 @@ class System(ForUsers):
         return jax.eval_shape(self, features, jax.eval_shape(lambda: jax.random.key(0)))
 
     @property
-    def known_signals(self) -> tuple[str, ...] | None:
-        """Names of the signals of a trace, of a system without `abstract`; None where unknown."""
+    def known_signals(self) -> KnownSignals:
+        """Signals of a trace, of a system without `abstract`: names, with components where known.
+
+        None where nothing but a simulation can tell.
+        """
         return None
 
     @property

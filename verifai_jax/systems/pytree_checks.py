@@ -27,10 +27,54 @@ def as_floating(tree: PyTree, origin: str) -> Any:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), tree)
 
 
-def check_like(got: PyTree, wanted: PyTree, origin: str, role: str, note: str = "") -> None:
+def in_working_precision(tree: PyTree) -> Any:
+    """Return a pytree as arrays, its real numbers in the precision that JAX computes in now.
+
+    What was made outside of a system has the precision that JAX had then.
+    """
+    real = jnp.result_type(float)
+
+    def leaf(value: Any) -> Any:
+        array = jnp.asarray(value)
+        other = jnp.issubdtype(array.dtype, jnp.floating) and array.dtype != real
+        return array.astype(real) if other else array
+
+    return jax.tree.map(leaf, tree)
+
+
+def as_precise_as(tree: PyTree, like: PyTree) -> Any:
+    """Return a pytree with its real numbers in the precision of those of another like it."""
+
+    def leaf(value: Any, other: Any) -> Any:
+        have, want = getattr(value, "dtype", None), getattr(other, "dtype", None)
+        return value if have == want or not _both_real(have, want) else jnp.asarray(value, want)
+
+    if jax.tree.structure(tree) != jax.tree.structure(like):
+        return tree  # `check_like` says it.
+    return jax.tree.map(leaf, tree, like)
+
+
+def _both_real(one: Any, other: Any) -> bool:
+    return all(kind is not None and jnp.issubdtype(kind, jnp.floating) for kind in (one, other))
+
+
+def check_like(
+    got: PyTree,
+    wanted: PyTree,
+    origin: str,
+    role: str,
+    note: str = "",
+    *,
+    same_precision: bool = True,
+) -> None:
     """Refuse a pytree of shapes that differs from the `wanted` one in structure, shape or dtype.
 
     A weakly typed number (a Python literal) may stand for any dtype that it can turn into.
+
+    **Arguments:**
+
+    - `same_precision`: whether real numbers must have the same number of bits; where not, whoever
+      asks converts them (`as_precise_as`).
 
     **Raises:** `ValueError`: `origin` must return `role`, and the first difference.
     """
@@ -47,6 +91,7 @@ def check_like(got: PyTree, wanted: PyTree, origin: str, role: str, note: str = 
         fits = have.dtype == want.dtype or (
             have.weak_type and jnp.promote_types(have.dtype, want.dtype) == want.dtype
         )
+        fits = fits or (not same_precision and _both_real(have.dtype, want.dtype))
         if not fits:
             real = jnp.issubdtype(have.dtype, jnp.floating)
             hint = ", so begin with a real number, such as 0.0" if real else ""

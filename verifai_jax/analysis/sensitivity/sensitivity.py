@@ -80,7 +80,7 @@ class Simulator:
         problem = resolved(problem, gradient=gradient, batch=batch).problem
         problem.check()
         self.batch = batch
-        self._evaluate = Evaluator(problem, batch, gradient=gradient, seed=seed)
+        self._evaluate = Evaluator(problem, batch, gradient=gradient, seed=seed, ends_raising=True)
         self.column = None if of is None else list(problem.formulas).index(of)
         self.done = self.dropped = 0
         self.gradients: list[Any] = []

@@ -24,7 +24,15 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.gaps import with_gaps
 from verifai_jax.core.locks import returning_once
 from verifai_jax.core.trace import Status, Trace, check_code
-from verifai_jax.systems.base import Features, FunctionSystem, Outcome, Seed, System, as_system
+from verifai_jax.systems.base import (
+    Features,
+    FunctionSystem,
+    KnownSignals,
+    Outcome,
+    Seed,
+    System,
+    as_system,
+)
 from verifai_jax.systems.blackbox.workers import Pool
 
 SignalNames = Sequence[str] | Mapping[str, int]
@@ -137,10 +145,10 @@ class Simulation:
         return self.declared.accept(trace)
 
     @property
-    def known_signals(self) -> tuple[str, ...] | None:
-        """Names of the signals of a trace; None where nothing but a simulation can tell."""
+    def known_signals(self) -> KnownSignals:
+        """Signals of a trace, see `System.known_signals`."""
         if self.declared.signals is not None:
-            return tuple(self.declared.widths)
+            return self.declared.widths
         return getattr(self.function, "known_signals", None)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -172,8 +180,8 @@ class BlackBox(System):
         return self.simulation.declared.abstract()
 
     @property
-    def known_signals(self) -> tuple[str, ...] | None:
-        """Names of the signals of a trace; None where nothing but a simulation can tell."""
+    def known_signals(self) -> KnownSignals:
+        """Signals of a trace, see `System.known_signals`."""
         return self.simulation.known_signals
 
     def may_draw(self, features: Features) -> bool:
@@ -232,8 +240,8 @@ class PooledBlackBox(System):
         return self.simulation.declared.abstract()
 
     @property
-    def known_signals(self) -> tuple[str, ...] | None:
-        """Names of the signals of a trace; None where nothing but a simulation can tell."""
+    def known_signals(self) -> KnownSignals:
+        """Signals of a trace, see `System.known_signals`."""
         return self.simulation.known_signals
 
     def may_draw(self, features: Features) -> bool:
@@ -272,6 +280,11 @@ class VectorisedBlackBox(System):
         batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], features)
         trace = self._simulate(batch, np.array([seed_of(key)], np.uint32), 1)
         return jax.tree.map(lambda leaf: leaf[0], trace)
+
+    @property
+    def known_signals(self) -> KnownSignals:
+        """Signals of a trace, see `System.known_signals`."""
+        return None if self.declared.signals is None else self.declared.widths
 
     @property
     def exact_step(self) -> bool:

@@ -25,6 +25,7 @@ from verifai_jax.core.gaps import with_gaps
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.user_errors import check_called_with
 from verifai_jax.core.waveform import is_waveform, set_durations
+from verifai_jax.systems.base import KnownSignals
 from verifai_jax.systems.blackbox._blackbox import BlackBox, PooledBlackBox, blackbox
 from verifai_jax.systems.delays import NO_DELAY, Delay, DelayOption, as_delay
 from verifai_jax.systems.environments.episode import (
@@ -199,8 +200,8 @@ class EpisodeFunction:
         _ = self.known_signals
 
     @property
-    def known_signals(self) -> tuple[str, ...] | None:
-        """Names of the signals of a trace; None where nothing but a simulation can tell.
+    def known_signals(self) -> KnownSignals:
+        """Signals of a trace with their numbers of components, where a simulation need not tell.
 
         **Raises:** `UnknownNameError`, `ValueError` for entries that the observation does not have.
         """
@@ -209,7 +210,8 @@ class EpisodeFunction:
         if callable(self.signals) or not all(hasattr(space, "sample") for space in draws):
             return None
         observation, action = (space.sample() for space in draws)
-        return tuple(self._sample(env, observation, action, 0.0, {}))
+        samples = self._sample(env, observation, action, 0.0, {})
+        return {name: max(1, value.size) for name, value in samples.items()}
 
     @property
     def environment(self) -> Any:
@@ -221,6 +223,11 @@ class EpisodeFunction:
                 self._env = package.make(self.make, **mode)
             else:
                 self._env = self.make()
+            if hasattr(self._env, "num_envs"):
+                raise TypeError(
+                    f"{self.name} must make one environment; it made a vector of "
+                    f"{self._env.num_envs}, whose simulations vj.blackbox(workers=...) would share"
+                )
             missing = [n for n in ("reset", "step", "unwrapped") if not hasattr(self._env, n)]
             if missing:
                 raise TypeError(

@@ -26,7 +26,13 @@ from verifai_jax.core.waveform import is_waveform
 from verifai_jax.systems.base import Carry, Features, Seed
 from verifai_jax.systems.checkpointing import checkpointed_scan
 from verifai_jax.systems.delays import NO_DELAYS, Delays, Line, through
-from verifai_jax.systems.pytree_checks import check_like, check_signals, outline
+from verifai_jax.systems.pytree_checks import (
+    as_precise_as,
+    check_like,
+    check_signals,
+    in_working_precision,
+    outline,
+)
 
 Time: TypeAlias = Float[Array, ""] | float
 """Seconds since the start of an episode."""
@@ -142,6 +148,7 @@ def _run(
         decide_key, step_key = (jax.random.fold_in(k, age) for k in (keys.decide, keys.step))
         observed, observations = through(observations, moment.observation, delays.observation)
         action, after = episode.decide(time, observed, memory, decide_key)
+        after = as_precise_as(after, memory)
         action, actions = through(actions, action, delays.action)
         collected, output = collect(collected, episode.signals(time, moment, action))
         # A state in which an episode has ended may have no finite derivative.
@@ -172,7 +179,7 @@ def _run_joined(
         step=lambda time, state, action, key: joined(False, time, state, action, (key, key), None),
     )
     form, _, lines = jax.eval_shape(lambda: _first_moment(plain, plain.start(keys.start), keys))
-    memory = jax.tree.map(jnp.asarray, episode.memory)
+    memory = in_working_precision(episode.memory)
     now = jnp.zeros(())
     action, _ = jax.eval_shape(episode.decide, now, form.observation, memory, keys.decide)
     nothing = lambda tree: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), tree)  # noqa: E731
@@ -195,6 +202,7 @@ def _run_joined(
         decide_key = jax.random.fold_in(keys.decide, age)
         observed, observations = through(now_lines[0], moment.observation, delays.observation)
         action, after = episode.decide(time, observed, memory, decide_key)
+        after = as_precise_as(after, memory)
         action, actions = through(now_lines[1], action, delays.action)
         collected, output = collect(collected, episode.signals(time, moment, action))
         following_lines = (now_lines, (observations, actions))
@@ -224,10 +232,11 @@ def _first_moment(
 ) -> tuple[Moment, Any, tuple[Line | None, Line | None]]:
     """Return the first moment, memory and delay lines in the types that they keep, checked."""
     first = jax.tree.map(jnp.asarray, first._replace(over=jnp.asarray(first.over, bool)))
-    memory = jax.tree.map(jnp.asarray, episode.memory)
+    memory = in_working_precision(episode.memory)
     now = jnp.zeros(())
     action, after = jax.eval_shape(episode.decide, now, first.observation, memory, keys.decide)
-    check_like(after, memory, "policy", "(action, memory), its memory in the form of policy_memory")
+    role = "(action, memory), its memory in the form of policy_memory"
+    check_like(after, memory, "policy", role, same_precision=False)
     following = jax.eval_shape(episode.next_moment, jnp.zeros(()), first.state, action, keys.step)
     if jax.tree.structure(first) != jax.tree.structure(following):
         raise ValueError(

@@ -21,7 +21,13 @@ from verifai_jax.systems.base import Seed
 from verifai_jax.systems.delays import NO_DELAY, Delay, Line, through
 from verifai_jax.systems.mujoco.bindings import Bindings, RecordingFeatures
 from verifai_jax.systems.mujoco.model import Place, names, reading
-from verifai_jax.systems.pytree_checks import check_like, check_signals, outline
+from verifai_jax.systems.pytree_checks import (
+    as_precise_as,
+    check_like,
+    check_signals,
+    in_working_precision,
+    outline,
+)
 
 Features = Mapping[str, Any]
 Signals = Mapping[str, str | Callable[..., Any]] | Callable[..., Mapping[str, Any]]
@@ -178,7 +184,7 @@ class Loop:
     def initial_progress(self) -> Progress:
         """Return the progress before the first sample."""
         return Progress(
-            jax.tree.map(jnp.asarray, self.controller_memory),
+            in_working_precision(self.controller_memory),
             jnp.int32(0),
             jnp.array(True),
             Line.of(self.rest(), self.delay.most),
@@ -230,7 +236,11 @@ class Loop:
         if self.controller is None:
             return self.rest().astype(state.time.dtype), memory
         decided = self._decide(state, memory, features)
-        control, memory = (decided, memory) if self.controller_memory is None else decided
+        if self.controller_memory is None:
+            control = decided
+        else:
+            control, after = decided
+            memory = as_precise_as(after, memory)
         control = jnp.asarray(control, state.time.dtype)
         return control.reshape(nu), memory
 
@@ -343,7 +353,7 @@ class Loop:
             watched = RecordingFeatures(features, used)
             start = self.start(watched, key)
             state, sensors = self.state(jnp.zeros((), jnp.result_type(float)), start)
-            memory = jax.tree.map(jnp.asarray, self.controller_memory)
+            memory = in_working_precision(self.controller_memory)
             if self.controller is not None:
                 self._check_controller(state, memory, watched)
             control, _ = self.control(state, memory, watched)
@@ -376,7 +386,7 @@ class Loop:
             if not (isinstance(decided, tuple) and len(decided) == 2):
                 raise ValueError(f"controller must return {role}; got {outline(decided)}")
             control = decided[0]
-            check_like(decided[1], memory, "controller", role)
+            check_like(decided[1], memory, "controller", role, same_precision=False)
         shape = getattr(control, "shape", None) if not np.isscalar(control) else ()
         if shape != (nu,) and not (shape == () and nu == 1):
             known = ", ".join(names(self.compiled, "actuator"))

@@ -30,9 +30,11 @@ from verifai_jax.systems.ode.integrators import Integrator, Step, Time, check_fa
 from verifai_jax.systems.ode.switching import Inputs, Switch, switched_step
 from verifai_jax.systems.pytree_checks import (
     as_floating,
+    as_precise_as,
     check_like,
     check_signals,
     default_signals,
+    in_working_precision,
     outline,
 )
 
@@ -119,7 +121,7 @@ class _Rollout:
 
     def trace(self, state: PyTree) -> Trace:
         loop = self.loop
-        memory = jax.tree.map(jnp.asarray, loop.controller_memory)
+        memory = in_working_precision(loop.controller_memory)
         finite = self.check(state, memory)
         last, age, _, samples = self.run(state, memory, None, lambda _, sample: (None, sample))
         ends = loop.terminate is not None
@@ -135,7 +137,7 @@ class _Rollout:
     def fold(
         self, state: PyTree, carry: Carry, update: Callable[[Carry, dict[str, Array]], Carry]
     ) -> Any:
-        memory = jax.tree.map(jnp.asarray, self.loop.controller_memory)
+        memory = in_working_precision(self.loop.controller_memory)
         self.check(state, memory)
         last, _, carry, _ = self.run(
             state, memory, carry, lambda c, sample: (update(c, sample), None)
@@ -230,7 +232,8 @@ class _Rollout:
             return None, memory
         if loop.controller_memory is None:
             return loop.controller(time, state, self.features), memory
-        return loop.controller(time, state, memory, self.features)
+        control, after = loop.controller(time, state, memory, self.features)
+        return control, as_precise_as(after, memory)
 
     def signals(self, time: Time, state: PyTree, control: PyTree) -> Any:
         if self.loop.signals is None:
@@ -273,12 +276,12 @@ class _Rollout:
                 if not _is_pair(decided):
                     raise ValueError(f"controller must return {role}; got {outline(decided)}{note}")
                 control = decided[0]
-                check_like(decided[1], memory, "controller", role, note)
+                check_like(decided[1], memory, "controller", role, note, same_precision=False)
         derivative = jax.eval_shape(
             lambda control: loop.dynamics(time, state, control, self.features), control
         )
         role, note = "the state's derivative, in the form of the state", defined_at(loop.dynamics)
-        check_like(derivative, state, "dynamics", role, note)
+        check_like(derivative, state, "dynamics", role, note, same_precision=False)
         role = "a state, in the form of the state"
         self._check_lines(
             state, loop.dt, "dt, at which update pushes it", fed=loop.update is not None
@@ -290,10 +293,11 @@ class _Rollout:
             )
         if loop.update is not None:
             after = jax.eval_shape(loop.update, time, state, self.features)
-            check_like(after, state, "update", role, defined_at(loop.update))
+            check_like(after, state, "update", role, defined_at(loop.update), same_precision=False)
         for switch in loop.switches:
             after = jax.eval_shape(switch.reset, time, state, self.features)
-            check_like(after, state, "reset of a Switch", role, defined_at(switch.reset))
+            where = defined_at(switch.reset)
+            check_like(after, state, "reset of a Switch", role, where, same_precision=False)
             guard = jax.eval_shape(switch.guard, time, state, self.features)
             if getattr(guard, "shape", None) != () or not jnp.issubdtype(guard.dtype, jnp.floating):
                 raise ValueError(
@@ -342,7 +346,8 @@ def substep(
 
     def dynamics(now: Time, state: PyTree, inputs: Inputs) -> Any:
         control, features = inputs
-        return loop.dynamics(now, state, control, within_step(features, begin, now))
+        rates = loop.dynamics(now, state, control, within_step(features, begin, now))
+        return as_precise_as(rates, state)
 
     advance = integrator(loop.method)
     inputs = (control, features)

@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from verifai_jax.core.checks import is_number
@@ -31,25 +32,27 @@ class DelayLine:
     # JAX rebuilds the class with placeholders and with batches, which have other shapes.
     __no_type_check__ = True
 
-    values: Float[Array, "n *shape"]
-    latest: Float[Array, ""]
+    values: Float[Array | np.ndarray, "n *shape"]
+    latest: Float[Array | np.ndarray, ""]
     period: float = field(metadata={"static": True})
 
     def push(self, time: Any, value: Any) -> "DelayLine":
         """Return the line with the value of this time, a period after the last one."""
-        newest = jnp.asarray(value, self.values.dtype)[None]
-        values = jnp.concatenate([newest, self.values[:-1]])
-        return DelayLine(values, jnp.asarray(time, self.latest.dtype), self.period)
+        values, latest = jnp.asarray(self.values), jnp.asarray(self.latest)
+        newest = jnp.asarray(value, values.dtype)[None]
+        values = jnp.concatenate([newest, values[:-1]])
+        return DelayLine(values, jnp.asarray(time, latest.dtype), self.period)
 
     def at(self, time: Any) -> Any:
         """Return the value at a time in seconds; beyond the ends that of the end."""
-        count = self.values.shape[0]
-        place = (self.latest - jnp.asarray(time, self.latest.dtype)) / self.period
+        values, latest = jnp.asarray(self.values), jnp.asarray(self.latest)
+        count = values.shape[0]
+        place = (latest - jnp.asarray(time, latest.dtype)) / self.period
         # Unlike jnp.clip, whose derivative at an end is halved.
         place = jnp.where(place < 0, 0, jnp.where(place > count - 1, count - 1, place))
         left = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, count - 2)
-        share = (place - left).astype(self.values.dtype)
-        return self.values[left] * (1 - share) + self.values[left + 1] * share
+        share = (place - left).astype(values.dtype)
+        return values[left] * (1 - share) + values[left + 1] * share
 
     @property
     def still(self) -> "DelayLine":
@@ -76,6 +79,13 @@ def delay_line(value: Any, *, longest: float, period: float) -> DelayLine:
     count = math.ceil(longest / period - 1e-6) + 2
     if isinstance(value, str | None) or (is_number(value) and not math.isfinite(value)):
         raise ValueError(f"value must be a finite number or an array; got {value!r}")
+    if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value)):
+        # In NumPy, whose arrays JAX takes in the precision that it computes in when it meets them:
+        # a line may be made before anything is simulated.
+        values = np.asarray(value, float)
+        return DelayLine(
+            np.broadcast_to(values, (count, *values.shape)), np.zeros(()), float(period)
+        )
     value = jnp.asarray(value)
     real = value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(float)
     values = jnp.broadcast_to(real, (count, *np.shape(real)))

@@ -1,0 +1,75 @@
+"""Simulations that all raise: an error of the problem, which is told once and ends the work.
+
+    raising = Raising()
+    raising.add(verdicts.status, verdicts.messages)     # of each batch, until one does not raise
+    raising.reason                                      # None, or what all of them say
+
+A formula on a signal that no trace has, a vector where a number is needed, a function with a
+misspelt name: each simulation says the same, and more of them would say nothing else.
+"""
+
+import re
+import time
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Integer
+
+from verifai_jax.core.text import one_line
+from verifai_jax.core.trace import Status
+
+ALIKE = 16
+"""Simulations that have to raise the same, with none that does not: where half of them raise by
+chance, that happens in one of 65 000 runs, and where nine of ten do, in every fifth."""
+ANY = 64
+"""Simulations that have to raise, whatever they say."""
+LONG = 30.0
+"""Seconds after which `FEW` simulations that raise the same are enough."""
+FEW = 3
+
+_VARIES = re.compile(r"[-+]?\d[\d.]*(?:e[-+]?\d+)?")
+"""What tells messages of one kind apart: the numbers in them."""
+
+
+class AlwaysRaises(RuntimeError):
+    """All simulations of some work raise, so that it ends before its budget is spent."""
+
+
+class Raising:
+    """The simulations of some work, as long as all of them raise."""
+
+    def __init__(self) -> None:
+        self._since = time.monotonic()
+        self._kinds: set[str] = set()
+        self._count = 0
+        self._first = ""
+        self.always = True
+
+    def add(self, status: Integer[np.ndarray, " n"], messages: Sequence[str] | None) -> None:
+        """Take in the statuses and the messages of simulations."""
+        if not self.always or not len(status):
+            return
+        self.always = bool(np.all(np.asarray(status) == Status.ERROR))
+        self._count += len(status)
+        for message in messages or ("",):
+            self._first = self._first or message
+            self._kinds.add(_VARIES.sub("0", message))
+
+    def check(self, name: str) -> None:
+        """End the work on the problem of this name where all of its simulations raise.
+
+        **Raises:** `AlwaysRaises`.
+        """
+        if (said := self.reason) is not None:
+            raise AlwaysRaises(
+                f"each of the first {self._count} simulations of problem {name!r} raised"
+                f"{f' {one_line(said)}' if said else ' an error'}, so the others are not made; "
+                "falsify(problem, 'uniform', 20, keep_going=True).table.all shows them"
+            )
+
+    @property
+    def reason(self) -> str | None:
+        """The message of all, empty where they have none; None where others may still succeed."""
+        alike = ALIKE if time.monotonic() - self._since < LONG else FEW
+        enough = self._count >= (alike if len(self._kinds) == 1 else ANY)
+        return self._first if self.always and enough else None

@@ -1,0 +1,134 @@
+"""The part of the prior in which an environment is attacked: where it has most of its probability.
+
+    region = region_of(loop, mass=0.999)
+    points = region.project(points)                 # [n, d] of the environment's cube
+    region.describe()                               # what is varied, and how far
+
+A search that only looks for the least robustness goes to the end of every tail at once, five
+deviations out in all features, which never happens and which no parameters may keep. Features with
+tails are held together in a ball of their normal scores that has the given probability; those
+without, such as a Box, are as probable in their corners as anywhere, and stay as they are.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from verifai_jax.core.text import format_percent
+from verifai_jax.features import Domain
+from verifai_jax.features.arrays import Array, VariableArray
+from verifai_jax.features.compound import Struct
+from verifai_jax.features.continuous import Continuous, scipy_special
+from verifai_jax.features.distributions import LogUniform
+from verifai_jax.features.signal import Signal
+from verifai_jax.synthesis.parametric import Parametric
+
+LEAST = 1e-12
+"""Distance that normal scores keep from the ends of the cube, where they are infinite."""
+MOST_NAMES = 6
+"""Features that are named one by one."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """A part of the cube of an environment; see the module's docstring.
+
+    - `parameters`, `features`: names of what is chosen, and of what the environment varies.
+    - `tailed`: of each coordinate, whether its feature has tails.
+    - `names`: of the features that have.
+    - `mass`: probability of the region, 1 for the whole cube.
+    """
+
+    parameters: tuple[str, ...]
+    features: tuple[str, ...]
+    tailed: Bool[np.ndarray, " d"]
+    names: tuple[str, ...]
+    mass: float
+
+    @property
+    def radius(self) -> float:
+        """Distance from the medians in normal scores, of all coordinates with tails together."""
+        count = int(self.tailed.sum())
+        if self.mass >= 1 or not count:
+            return math.inf
+        return math.sqrt(float(scipy_special().chdtri(count, 1 - self.mass)))
+
+    def contains(self, points: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
+        """Return the points that lie in the region."""
+        return self._distance(points) <= self.radius * (1 + 1e-6)
+
+    def project(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+        """Return points, those outside moved towards the medians to the edge of the region."""
+        outside = ~self.contains(points)
+        if not outside.any():
+            return points
+        scores = self._scores(points[outside])
+        share = self.radius / np.linalg.norm(scores, axis=1, keepdims=True)
+        moved = np.array(points, np.float32)
+        moved[np.ix_(outside, self.tailed)] = scipy_special().ndtr(scores * share)
+        return moved
+
+    def describe(self) -> str:
+        """Say what was chosen, what the environment varies, and how far it goes."""
+        text = f"varied {_listed(self.features)}"
+        if self.parameters:
+            text = f"chose {_listed(self.parameters)}, {text}"
+        if not self.names:
+            return f"{text}, everywhere"
+        if not math.isfinite(self.radius):
+            return f"{text}, everywhere, in the whole of the tails of {_listed(self.names)}"
+        together = " together" if self.tailed.sum() > 1 else ""
+        return (
+            f"{text}, where the prior has a probability of {format_percent(self.mass)}: "
+            f"{_listed(self.names)} within {self.radius:.3g} standard deviations{together} (mass=)"
+        )
+
+    def _scores(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n t"]:
+        u = np.asarray(points, np.float64)[:, self.tailed]
+        return scipy_special().ndtri(np.clip(u, LEAST, 1 - LEAST))
+
+    def _distance(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+        return np.linalg.norm(self._scores(points), axis=1)
+
+
+def region_of(loop: Parametric, mass: float) -> Region | None:
+    """Return the region in which the environment of a loop is attacked; None without one.
+
+    **Raises:** `ValueError` for a mass that is no probability above 0.
+    """
+    if isinstance(mass, bool) or not isinstance(mass, int | float) or not 0 < mass <= 1:
+        raise ValueError(
+            f"mass must be a probability above 0, and 1 for the whole prior; got {mass!r}"
+        )
+    if loop.environment is None:
+        return None
+    fields = loop.environment.root.fields
+    tailed = [(name, _tailed(domain)) for name, domain in fields]
+    each = [has for _, coordinates in tailed for has in coordinates]
+    names = tuple(name for name, coordinates in tailed if any(coordinates))
+    features = tuple(name for name, domain in fields if domain.size)
+    return Region(getattr(loop, "names", ()), features, np.array(each, bool), names, float(mass))
+
+
+def _tailed(domain: Domain) -> list[bool]:
+    """Return of each coordinate of a domain whether its values thin out towards an end."""
+    match domain:
+        case Continuous():
+            return [not isinstance(domain, LogUniform)] * domain.size
+        case Struct():
+            return [has for _, part in domain.fields for has in _tailed(part)]
+        case Array():
+            return _tailed(domain.domain) * domain.length
+        case VariableArray():
+            items = _tailed(domain.domain) * domain.most
+            return [False] * (domain.size - len(items)) + items
+        case Signal():
+            return _tailed(domain.domain) * domain.knots
+    return [False] * domain.size
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    shown = ", ".join(names[:MOST_NAMES])
+    return f"{shown} and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else shown
