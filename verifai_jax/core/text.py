@@ -59,7 +59,7 @@ def format_seconds(seconds: float, digits: int = 6) -> str:
             parts.append(f"{int(count)} {unit}")
     rest = round(rest, 6 if digits > 4 else 2)
     if rest:
-        parts.append(f"{rest:.8g} s")
+        parts.append(f"{rest:z.8g} s")
     return f"{'-' * (seconds < 0)}{' '.join(parts)}"
 
 

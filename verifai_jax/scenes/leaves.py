@@ -191,7 +191,7 @@ class Place(Leaf):
     def draw(self, parts: Parts, given: Given, xp: Any) -> Any:
         low, high = self._ends(given, xp)
         if xp is np and high < low:
-            raise NothingToDrawError(f"there is no integer from {low:g} to {high:g}")
+            raise NothingToDrawError(f"there is no integer from {low:zg} to {high:zg}")
         count = xp.maximum(high - low + 1, 1)
         place = low + xp.minimum(xp.floor(parts[self.feature] * count), count - 1)
         return int(place) if xp is np else place

@@ -155,7 +155,7 @@ class Constraint:
             self._shown = now
             write_line(
                 f"vj.scenic: Scenic decides requirements in Python: {decided} of {points} points "
-                f"so far, {1000 * (now - self._began) / decided:.0f} ms each"
+                f"so far, {1000 * (now - self._began) / decided:z.0f} ms each"
             )
 
     def _accepts(self, features: Mapping[str, Any]) -> bool:

@@ -70,7 +70,7 @@ class ScenicSimulation:
         _, sampling = self.recipe.compiled()
         scene = sampling.scene(sampling.values(features))
         if SEED in features:
-            seed = digest(str(seed), f"{float(features[SEED]):.9g}")
+            seed = digest(str(seed), f"{float(features[SEED]):z.9g}")
         with LOCK:
             random.seed(seed)
             np.random.seed(seed % 2**32)  # noqa: NPY002 - what Scenic draws from

@@ -82,7 +82,7 @@ class Region:
         together = " together" if self.tailed.sum() > 1 else ""
         return (
             f"{text}, where the prior has a probability of {format_percent(self.mass)}: "
-            f"{_listed(self.names)} within {self.radius:.3g} standard deviations{together} (mass=)"
+            f"{_listed(self.names)} within {self.radius:z.3g} standard deviations{together} (mass=)"
         )
 
     def _scores(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n t"]:
