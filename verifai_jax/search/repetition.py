@@ -89,4 +89,4 @@ class Repetition:
             points[:, self._cube.discrete] = self._cube.cells(points)
         words = points.view(np.uint32).astype(np.uint64)
         mixed = (words + np.uint64(1)) * self._factors
-        return np.sum(mixed ^ (mixed >> np.uint64(29)), axis=1, dtype=np.uint64)
+        return np.asarray(np.sum(mixed ^ (mixed >> np.uint64(29)), axis=1, dtype=np.uint64))
