@@ -625,7 +625,7 @@ def _run_rounds(
 def _hopeless_message(run: Run, said: str, budget: int) -> str:
     """Say what all simulations of a run raised, and how to simulate on."""
     first = first_message(run)
-    said = one_line(said or ("" if first is None else first[1]))
+    said = one_line(said or ("" if first is None else first[1])).rstrip(".")
     where = "" if run.folder is None else f" and in {run.folder}, which can be resumed"
     return (
         f"the run of {run.name!r} ended after {run.simulations:,} of {budget:,} simulations, since "
