@@ -2,13 +2,14 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: help falsify test test-slow test-all test-changed prove lint notebooks notebooks-update bench \
+.PHONY: help falsify test test-thorough test-slow test-all test-changed prove lint notebooks notebooks-update bench \
   policy wheel docs claims constraints clean
 
 help:
 	@echo "make falsify    set up, then break the trained cart-pole controller"
 	@echo "make test       set up, then run the quick tests of every room"
-	@echo "make test-slow  the slower ones, which compile more; .ci/run has them, too"
+	@echo "make test-thorough  those that take seconds, most of them to compile; .ci/run has them, too"
+	@echo "make test-slow  these, and the slow ones: kills, clusters, trainings; for each push and release"
 	@echo "make test-changed  all tests of what differs from main: BASE=REVISION for another one"
 	@echo "make prove      what proves a number over many seeds: rates, coverage, learning curves"
 	@echo "make test-all   all of these"
@@ -63,6 +64,9 @@ PYTEST = JAX_DISABLE_MOST_OPTIMIZATIONS=1 XLA_FLAGS="$$($(BIN)/python tests/xla_
 
 test: .venv/installed
 	$(PYTEST)
+
+test-thorough: .venv/extras
+	$(PYTEST) -m "thorough and not slow and not proves"
 
 test-slow: .venv/extras
 	$(PYTEST) -m "(thorough or slow) and not proves"

@@ -18,7 +18,7 @@ from verifai_jax.search import (
     split,
     to_json,
 )
-from verifai_jax.search.gradient import FIRST_BOX
+from verifai_jax.search.gradient import FIRST_BOX, WOBBLE
 from verifai_jax.testing import check_search
 
 CUBE = Cube(
@@ -70,8 +70,10 @@ def test_parts_learn_from_their_own_coordinates():
     # The largest box of each descent, which is the whole cube for every second, and another part
     # as ever.
     boxes = np.where(np.arange(len(starts)) % 2 == 0, 1.0, FIRST_BOX)
-    expected = np.maximum(np.asarray(starts) - boxes, 0.0)
-    np.testing.assert_allclose(u[: len(starts), 0], expected, atol=1e-6)
+    # Smaller boxes are up to a tenth less, by the seed.
+    least, most = (np.maximum(starts - part * boxes, 0.0) for part in (1.0, 1 - WOBBLE))
+    found = np.asarray(u[: len(starts), 0])
+    assert np.all((found >= least - 1e-6) & (found <= np.where(boxes < 1, most, least) + 1e-6))
     assert 0.2 < float(jnp.mean(u[:, 2])) < 0.8
 
 

@@ -39,6 +39,9 @@ def features_of_rows(
         if name not in rows:
             raise unknown_name("column", name, rows)
     columns = {name: np.asarray(rows[name]) for name in names}
+    if not names and len(rows):
+        # Where nothing varies, any other column says how many rows there are.
+        columns = {"": np.asarray(rows[next(iter(rows))])}
     with in_precision(precision):
         batch = {name: _batch(domain, columns, name, precision) for name, domain in domains.items()}
         return jax.tree.map(lambda leaf: _cast(leaf, precision), batch)
