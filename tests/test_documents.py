@@ -70,7 +70,7 @@ def test_links_lead_to_files(file):
     assert [link for link in LINK.findall(prose) if not (file.parent / link).exists()] == []
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
 def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -32,7 +32,7 @@ def test_examples_are_in_the_space_and_keep_the_constraint(features):
     SPACE.check(features)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_shrinks_to_nominal_and_to_few_events():
     nominal = {"x": 0.25, "n": 2, "kind": "b"}
 

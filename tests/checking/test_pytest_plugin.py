@@ -55,7 +55,7 @@ def run(project, *options):
     return project.runpytest_subprocess(*PLUGIN, *options, timeout=240)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_failure_is_kept_replayed_first_and_fixed(project):
     project.makeini(SETTINGS)
     write(project, 0.6)
@@ -92,7 +92,7 @@ def test_a_failure_is_kept_replayed_first_and_fixed(project):
     assert "settle: 0 of 64 simulations violate the property" in fixed.stdout.str()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_steers_a_terminal_is_written_out(project):
     project.makeini(SETTINGS)
     write(project, 0.6)
@@ -108,7 +108,7 @@ def test_what_steers_a_terminal_is_written_out(project):
     ElementTree.parse(project.path / "report.xml")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_decorated_function_with_fixtures_and_a_probability(project):
     write(project, 0.8)
     project.makepyfile(
@@ -147,7 +147,7 @@ def test_a_decorated_function_with_fixtures_and_a_probability(project):
     assert len(list((project.path / "elsewhere").iterdir())) == 1
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_with_xdist_each_problem_is_tested_once(project):
     pytest.importorskip("xdist")
     project.makeini(SETTINGS)

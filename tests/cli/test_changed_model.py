@@ -107,7 +107,7 @@ def test_studies_of_a_row_say_it_first(call, folder, command):
     assert call(f"{command} run {pictures} --even-if-changed").startswith(CHANGED)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_report_has_both_hashes_on_its_first_page(call, folder):
     call("report run --traces 4")
     text = Path("run/report.html").read_text()

@@ -32,7 +32,7 @@ def call(*arguments, code=0):
     return result.output
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_fuzz_then_shrink(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "spec.py").write_text(PROBLEM)

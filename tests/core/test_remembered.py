@@ -166,7 +166,7 @@ def same(one, other):
     jax.tree.map(np.testing.assert_array_equal, one.features, other.features)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("search", ["portfolio", "gradient", "cross_entropy", "bayes"])
 def test_a_search_is_the_same_recalled(folder, monkeypatch, search):
     from verifai_jax.search.proposals import compiled_search

@@ -206,7 +206,7 @@ def test_times_of_signals_are_those_of_the_whole_simulation_where_it_ends_early(
     assert "w at 4 s " in str(shrunk)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_batch_of_a_host_system_is_simulated_with_the_key_of_the_row():
     def simulate(features, seeds):
         x = features["x"] * 1.0 + (seeds % 7) * 0

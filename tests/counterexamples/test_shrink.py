@@ -336,7 +336,7 @@ def test_the_nearer_of_two_modes(d):
         checked(run, row, (1, 0.2), 0.2, seed=seed, others=seed % 2 == 0)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_curved_boundaries():
     def ball(u):
         return jnp.linalg.norm(u - jnp.array([0.8, 0.75, 0.5, 0.5, 0.5]) + 1e-9) - 0.14

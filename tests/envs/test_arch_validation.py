@@ -42,7 +42,7 @@ def test_no_inputs_leave_the_beginning():
     np.testing.assert_array_equal(arch_validation.input_matrix({}, (), 15.0), [[0.0]])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_input_of_a_line_breaks_the_requirement_again(tmp_path, monkeypatch):
     file = tmp_path / "results.csv"
     monkeypatch.setattr("sys.argv", ["", str(file), "at2", "--seeds", "2", "--budget", "50"])

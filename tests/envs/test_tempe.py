@@ -98,7 +98,7 @@ def test_the_assumption_leaves_room_to_halt():
     assert halting > 25 - CAR.front - model.STOP_LINE
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_notice_helps_those_too_who_start_too_near_to_halt():
     """They go on, and are through before the other car comes (docs/road.md)."""
     domains = {**specs.accident.space.domains, "ego_dist": vj.Box(25.0, 45.0)}

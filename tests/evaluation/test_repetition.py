@@ -181,7 +181,7 @@ def test_a_resumed_run_knows_that_its_system_wavers():
     assert longer.table.counts.claimed == 0
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_workers_repeat_in_another_process():
     system = vj.blackbox(host_systems.counting, workers=2, signals=("x", "pid"))
     try:

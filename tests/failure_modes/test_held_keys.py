@@ -56,7 +56,7 @@ def test_what_a_mode_hands_out_fails_again(found):
         assert small.replay().violated
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_black_box_with_a_seed_is_one_that_draws():
     box = vj.blackbox(noisy_on_the_host, seeded=True)
     found = vj.modes(vj.Problem("box", SPACE, box, FORMULAS), budget=6000, progress=False)

@@ -165,6 +165,7 @@ def check(folder, problem, whole):
     assert resumed.table.all.equals(whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turns", [12, pytest.param(250, marks=pytest.mark.thorough)])
 def test_anything_changed_in_a_folder_is_right_or_told(
     problem, whole, folders, tmp_path, monkeypatch, turns
@@ -260,7 +261,7 @@ def test_a_run_is_not_written_over_what_somebody_has_added(problem, whole, folde
     assert vj.resume(run, budget=160).table.all.equals(whole)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_run_that_dies_between_any_two_operations_on_files_is_resumed(
     problem, whole, tmp_path, monkeypatch
 ):

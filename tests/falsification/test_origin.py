@@ -65,7 +65,7 @@ def runs():
     }
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_every_text_gives_the_reason(runs, tmp_path):
     for origin, run in runs.items():
         assert (run.origin, run.prior) == (origin, origin == "prior")

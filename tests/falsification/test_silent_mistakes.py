@@ -133,7 +133,7 @@ def test_a_formula_that_looks_beyond_the_trace():
         assert notes_of(both, spec) == ()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_specifications_of_this_project_get_no_false_note():
     # In a model of an aircraft the heading has no part in the altitude; who knows the distance of
     # the cones needs no eyes for colours and weather.

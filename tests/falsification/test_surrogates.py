@@ -55,7 +55,7 @@ def test_needs_half_of_the_simulations_of_others():
     assert 2 * needed["trace_surrogate"] <= min(needed["cmaes"], needed["bayes"])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_resumed_it_proposes_the_same(tmp_path):
     options = {"batch": 8, "seed": 3, "progress": False}
     whole = vj.falsify(problem(), SMALL, 32, **options)
@@ -174,7 +174,7 @@ class TestDefault:
         assert default.table.all.equals(named.table.all)
         assert default.notes == named.notes
 
-    @pytest.mark.thorough
+    @pytest.mark.slow
     def test_slow_ones_a_model_and_resume_keeps_it(self, tmp_path, monkeypatch):
         # The clock is not asked: as if each simulation took as long as it takes to be slow.
         monkeypatch.setattr(simulations, "SLOW", 0.0)

@@ -101,7 +101,7 @@ def test_densities_and_tails(domain):
         assert domain.log_density(outside)[1] == -np.inf
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_an_unbounded_distribution_of_a_person_is_not_simulated_at_its_limits():
     own = Distribution(lambda u: jnp.exp(ndtri(u)), lambda x: ndtr(jnp.log(x)), name="own")
     logistic = Distribution(

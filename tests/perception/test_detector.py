@@ -45,7 +45,7 @@ def test_slices_and_convolutions_agree(network):
     assert together.values.shape == (3, 3)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_training_learns_where_the_square_is():
     images, labels = squares(600, 0)
     new = detector(jax.random.key(0), SHAPE, channels=(6, 8), hidden=(16,))

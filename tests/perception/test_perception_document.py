@@ -18,7 +18,7 @@ SMALLER = {
 }
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_landing_pad_trains_and_is_falsified(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     code = "\n".join(block for block in CODE if "Supervisor" not in block)

@@ -241,7 +241,7 @@ def test_shadows_lie_where_the_sun_does_not_come():
     assert error.mean() < 0.04
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_gradients_are_those_of_finite_differences():
     weights = np.random.default_rng(0).normal(size=(8, 16, 3))
 

@@ -94,7 +94,7 @@ def test_what_is_recorded_is_what_was_replayed(seen, motion):
     assert seen.problem.system.loop.compiled.geom("ball").size[0] == pytest.approx(0.1)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_mjx_simulated_is_recorded_in_mjx():
     row = {"size": 0.2, "wind": 3.0, "vx": 2.0}
     for precision in ("float32", "float64"):

@@ -194,7 +194,7 @@ def test_a_large_table_is_thinned():
     assert 100 < failing < 2 * n // 10
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_report_of_many_rows_is_small(tmp_path):
     path = large(100_000, 12).report(tmp_path / "large.html")
     assert path.stat().st_size < 5_000_000
@@ -282,7 +282,7 @@ def test_the_command_repeats_the_run():
     )
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_failure_is_explained_and_shrunk(tmp_path):
     problem = vj.Problem(
         "sum",
@@ -300,7 +300,7 @@ def test_a_failure_is_explained_and_shrunk(tmp_path):
     assert "as an animation" in text
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_features_of_every_kind_are_shown(tmp_path):
     car = vj.Struct({"x": vj.Box(0.0, 1.0), "kind": vj.Categorical("van", "bus")})
     problem = vj.Problem(
@@ -324,7 +324,7 @@ def test_features_of_every_kind_are_shown(tmp_path):
     assert "wind at 0.5 s" in text
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_ways_of_failing_stand_in_the_report_with_their_probabilities(tmp_path):
     def jump(features, key):
         distance = jnp.minimum(3.0 - features["a"], 3.3 + features["b"])

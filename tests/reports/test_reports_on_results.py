@@ -100,7 +100,7 @@ def test_files_that_are_no_result(tmp_path, text, message):
         read_result(stored, PROBLEM.space)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_sweep(tmp_path):
     sweep = Sweep(record_of(planted_rows()), space=SPACE)
     sweep.save(tmp_path / "toy-1")

@@ -192,6 +192,7 @@ class TestWithScenic:
         with pytest.raises(ValueError, match="steps must be"):
             program.simulator(steps=0)
 
+    @pytest.mark.slow
     def test_the_code_of_the_page_runs(self, monkeypatch, capsys):
         root = GALLERY.parents[2]
         monkeypatch.chdir(root)

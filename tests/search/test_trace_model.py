@@ -55,7 +55,7 @@ def test_short_lengths_and_near_rows_leave_a_finite_model_that_can_be_fitted():
     assert not np.array_equal(fitted.lengths, hyper.lengths)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_fit_follows_the_derivative_of_the_evidence(data):
     """Of the plain formula, by autodiff in double precision."""
     x, coefficients, mask = data

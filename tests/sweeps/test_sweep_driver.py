@@ -343,7 +343,7 @@ def test_the_objective_is_failures_first_then_robustness_then_return():
     assert objective(float("nan"), 0.0, 0.0, (0.0, 1.0)) is None
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_optuna_proposes_and_is_told(tmp_path):
     pytest.importorskip("optuna")
     space = {

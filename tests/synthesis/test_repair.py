@@ -182,7 +182,7 @@ def test_a_cart_pole_is_tuned(gradient):
     assert result.change < (0.3 if gradient else 1.0)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_weights_of_a_network():
     """The trained cart-pole network, which fails in three of a hundred environments."""
     layers = cartpole._preferring(load_policy(cartpole.POLICY_FILE))

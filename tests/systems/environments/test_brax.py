@@ -408,7 +408,7 @@ def test_friction_of_a_geom_and_gear_of_an_actuator():
         hop(rough="geom_friction[floor, 3]")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("backend", "path"), [("spring", "link.inertia.mass[pole]"), ("mjx", "body_mass[pole]")]
 )

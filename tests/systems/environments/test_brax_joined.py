@@ -87,7 +87,7 @@ def test_one_program_simulates_what_a_start_and_steps_do(pole, angle):
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:scatter inputs")  # Of Brax, in double precision.
 @pytest.mark.usefixtures("only_joined")
 def test_one_program_in_double_precision_at_any_step_and_its_gradient(pole):

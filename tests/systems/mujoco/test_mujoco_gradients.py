@@ -46,6 +46,7 @@ def derivatives(function, points, step):
     return np.stack(columns, axis=-1), forward(points)[0], backward(points)
 
 
+@pytest.mark.slow
 def test_smooth_dynamics_in_both_modes():
     """A cart-pole with all that changes its model: masses, length, damping, gravity."""
     places = ("theta0", "x_dot0", "masscart", "masspole", "length", "damping", "gravity")
@@ -67,6 +68,7 @@ def test_smooth_dynamics_in_both_modes():
     assert np.abs(wanted).min() > 1e-4
 
 
+@pytest.mark.slow
 def test_through_contacts_in_both_modes():
     """A ball that slides, one that lands, one that hits the rail: no event within the step."""
     places = ("speed", "lift", "height", "friction", "radius")
@@ -92,6 +94,7 @@ def test_through_contacts_in_both_modes():
     assert np.abs(wanted[0, 0, 3]) > 1e-2
 
 
+@pytest.mark.slow
 def test_what_cannot_be_reversed_says_what_would_help():
     system = mjx(WEIGHT, duration=0.02, control_period=0.02, bind={"v": "joint/rail/qvel[0]"})
     assert "has no reverse-mode derivative inside its Runge-Kutta" in system.reverse_hint

@@ -70,7 +70,7 @@ class TestPaths:
         with pytest.raises(ValueError, match="'geom/g/mass': the inertia of body 'stated' is stat"):
             cart(bind={"m": "geom/g/mass"})
 
-    @pytest.mark.thorough
+    @pytest.mark.slow
     def test_a_mocap_body_goes_where_a_feature_says_on_both_engines(self):
         system = cart(bind={"goal": "body/target/pos[0]", "tip": "geom/tip/mass"}, keyframe=0)
         features = {"goal": jnp.float32(3.0), "tip": jnp.float32(0.4)}
@@ -203,7 +203,7 @@ class TestWhatTakesLong:
         assert system.with_backend("native").why_slow_to_compile(True) == ""
         assert cart(source, backend="auto").why_slow_to_compile(True) == ""
 
-    @pytest.mark.thorough
+    @pytest.mark.slow
     def test_a_row_of_mjx_is_replayed_natively_where_that_gives_its_number(self):
         system = cart(backend="mjx", bind={"x0": "joint/s/qpos"}, keyframe=0)
         space = vj.FeatureSpace({"x0": vj.Box(0, 1)})

@@ -179,7 +179,7 @@ def test_the_dynamics_are_traced_as_often_for_many_switches_as_for_one(extra, co
     assert sines[0][:2] == (copies, copies)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_batch_in_which_little_happens_is_what_its_simulations_are_alone():
     """The branch of the events is taken by lanes in which nothing happens, too."""
     system, _ = gears(3, 30)
