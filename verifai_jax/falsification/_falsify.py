@@ -232,7 +232,7 @@ def falsify(
                 return
             if keep_going and not chooses:
                 return
-            seconds = rounds.measure(min(batch, budget))
+            seconds = rounds.measure(min(batch, budget), timed=chooses)
             if not chooses or (rounds.hopeless is not None and not keep_going):
                 return
             slow = slow_search(problem, seconds)

@@ -163,19 +163,21 @@ class Rounds:
             self._journal.settle(len(self.table) + MEASURED)
             self._journal = None
 
-    def measure(self, most: int) -> float:
-        """Simulate the first rows one by one, and return the least seconds that one took.
+    def measure(self, most: int, timed: bool) -> float:
+        """Simulate the first rows, and return the least seconds that one took.
 
-        They are rows of the run. A first one that is quick is the only one, unless it raises.
+        They are rows of the run. One by one, a first one that is quick is the only one, unless it
+        raises.
 
         - `most`: of the first round.
+        - `timed`: whether the seconds are wanted, for which they are simulated one by one.
         """
         if not len(self.first):
             with self._searching():
                 self._pending = self._proposals.next(most)
         points = np.asarray(self.first if len(self.first) else self._pending)
         with self.watch.on(SIMULATE):
-            return self._simulations.measure(points[:most])
+            return self._simulations.measure(points[:most], timed)
 
     def take_in_measured(self) -> None:
         """Store the rows that were simulated one by one, without the rest of their round.

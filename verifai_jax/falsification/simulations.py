@@ -149,24 +149,26 @@ class Simulations:
             return self._differentiate(points, temperature, first)
         return self.evaluate(points, first=first)
 
-    def measure(self, points: Float[np.ndarray, "n d"]) -> float:
-        """Simulate the first rows of the run one by one, and return the least seconds of one.
+    def measure(self, points: Float[np.ndarray, "n d"], timed: bool) -> float:
+        """Simulate the first rows of the run, and return the least seconds of one.
 
-        A first one that is quick is the only one, unless it raises. Their round does not simulate
-        them again. Where all of many raise, `hopeless` is what they say, and None otherwise.
+        One by one, a first one that is quick is the only one, unless it raises. Where nobody wants
+        the seconds, what simulates many side by side gets them together. Their round does not
+        simulate them again. Where all of many raise, `hopeless` is what they say, else None.
         """
         engine = self.evaluate.engine
         assert isinstance(engine, HostEngine)
         points, raising = points[:ALIKE], Raising()
+        together = len(points) if not timed and engine.system.can_simulate_each else 1
         seconds, parts = float("inf") if len(points) else 0.0, []
         with self._as_in_a_batch(engine, keep_traces=True):
-            for row in range(len(points)):
-                parts.append(self.evaluate(points[row : row + 1], first=row))
+            for row in range(0, len(points), together):
+                parts.append(self.evaluate(points[row : row + together], first=row))
                 raising.add(parts[-1].status, parts[-1].messages)
                 # Without the compilation of the monitor.
                 seconds = min(seconds, engine.simulation_seconds)
-                timed = seconds < SLOW or row + 1 >= MEASURED
-                if timed and (not raising.always or raising.reason is not None):
+                known = seconds < SLOW or row + 1 >= MEASURED
+                if known and (not raising.always or raising.reason is not None):
                     break
         self.hopeless = raising.reason
         self._measured = Verdicts.concatenate(parts) if parts else None
