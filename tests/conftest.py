@@ -3,6 +3,8 @@
 import ctypes
 import functools
 import gc
+import importlib
+import importlib.util
 import os
 import resource
 import sys
@@ -116,6 +118,25 @@ LONG_FILES = (
     "test_summary.py",
 )
 """Test files that take longest, the longest first: what begins last must be short."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Take Scenic as not installed where OpenCV, which it needs, lacks a library of the system.
+
+    What such an import leaves behind would stand in the way of others, in worker processes too.
+    """
+    if importlib.util.find_spec("scenic") is None or importlib.util.find_spec("cv2") is None:
+        return
+    path, modules = list(sys.path), set(sys.modules)
+    try:
+        importlib.import_module("cv2")
+    except ImportError as error:
+        sys.path[:] = path
+        for name in set(sys.modules) - modules:
+            if name.partition(".")[0] == "cv2":
+                del sys.modules[name]
+        sys.modules["scenic"] = None  # pyright: ignore[reportArgumentType]
+        print(f"tests with Scenic are left out: OpenCV cannot be imported here ({error})")
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:

@@ -12,6 +12,7 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
+from verifai_jax.core.errors import MissingExtra, require
 from verifai_jax.core.user_errors import format_user_error, user_line
 
 SPACE = vj.FeatureSpace(
@@ -261,3 +262,10 @@ def test_without_the_text_of_the_code():
     problem = vj.Problem("p", {"mass": vj.Box(0, 1)}, made["system"], "always x < 2")
     with pytest.raises(vj.ProblemError, match="there is no feature 'mas'; did you mean 'mass'"):
         problem.check()
+
+
+def test_a_package_that_is_there_and_cannot_be_imported_says_why(tmp_path, monkeypatch):
+    (tmp_path / "lacks_a_library.py").write_text("raise ImportError('libxcb.so.1: not found')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(MissingExtra, match=r"lacks_a_library is installed and .*: libxcb.so.1"):
+        require("lacks_a_library", "scenic")

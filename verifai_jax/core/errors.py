@@ -78,3 +78,5 @@ def require(module: str, extra: str) -> Any:
         raise MissingExtra(
             f"{module} {lacks} not installed: pip install 'verifai_jax[{extra}]'"
         ) from error
+    except ImportError as error:
+        raise MissingExtra(f"{module} is installed and cannot be imported: {error}") from error
