@@ -38,6 +38,7 @@ def notebook(*outputs, tags=()):
             "1.9 s to compile, 2 min to search, 3 min to simulate (9 simulations/s)",
         ),
         ("0.05 s to simulate, 0.2 s to confirm", "3 min to simulate, 2 min to confirm"),
+        ("1 s to confirm; stopped", "1 s to confirm, 0.01 s for callbacks and files; stopped"),
         ("48 simulations in 14.3 s, stopped: budget", "48 simulations in 2 min, stopped: budget"),
         ("10 of 10, 0 failing, 1.5 s", "10 of 10, 0 failing, 2 min"),
         ("32,768 steps in 0.2 s of a core", "32,768 steps in 1.5 s of a core"),
