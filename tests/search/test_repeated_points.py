@@ -46,7 +46,8 @@ def test_what_comes_back_was_never_there(data):
     for number, rows in enumerate(rounds):
         points = np.array(rows, np.float32)
         wanted = np.array([data.draw(st.booleans()) for _ in rows])
-        found = repetition.avoid(points, wanted, anywhere, number)
+        found, told = repetition.avoid(points, wanted, anywhere, number)
+        np.testing.assert_array_equal(told, found if anywhere else points)
         np.testing.assert_array_equal(found[~wanted], points[~wanted])
         assert ((found >= 0) & (found <= 1)).all()
         new = [(x, min(int(3 * c), 2), y) for x, c, y in found[wanted].tolist()]
@@ -62,10 +63,11 @@ def test_points_of_a_cell_are_one_point_and_the_last_of_a_space_are_taken_again(
     repetition = Repetition(Cube(levels=(4,)), KEY)
     repetition.add(np.array([[0.1], [0.3], [0.99]], np.float32))
     point, wanted = np.array([[0.01]], np.float32), np.array([True])
-    (left,) = repetition.avoid(point, wanted, False, 1)
+    (left,), (told,) = repetition.avoid(point, wanted, False, 1)
+    assert left == told  # Nothing is next to a choice.
     assert 0.5 <= left.item() < 0.75
     repetition.add(np.array([left]))
-    assert repetition.avoid(point, wanted, False, 2).shape == (1, 1)
+    assert repetition.avoid(point, wanted, False, 2)[0].shape == (1, 1)
 
 
 def test_memory_is_bounded():

@@ -9,6 +9,8 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+from verifai_jax.core.checks import is_number
+
 
 def with_gaps(name: str, signal: Any) -> Any:
     """Return a signal whose masked and missing samples are NaN; any other one as it is.
@@ -107,7 +109,7 @@ def known_times(times: Any) -> Any:
         )
     known = np.asarray(times.data if isinstance(times, np.ma.MaskedArray) else times)
     if known.dtype == object:
-        known = known.astype(float) if all(map(_is_plain_number, np.ravel(known))) else known
+        known = known.astype(float) if all(map(is_number, np.ravel(known))) else known
     if known.dtype.kind not in "iuf":
         hint = ""
         if known.dtype.kind == "M":
@@ -119,7 +121,3 @@ def known_times(times: Any) -> Any:
 def _is_missing(value: object) -> bool:
     # pandas.NA by its name: pandas need not be imported for it.
     return value is None or value is np.ma.masked or type(value).__name__ == "NAType"
-
-
-def _is_plain_number(value: object) -> bool:
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool)

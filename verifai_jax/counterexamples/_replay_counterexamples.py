@@ -4,10 +4,11 @@ result = replay_counterexamples(problem, "counterexamples", rename={"mass": "pay
 result.failing, result.fixed, result.invalid
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -158,10 +159,10 @@ def replay_counterexamples(
     if not isinstance(problem, Problem):
         raise TypeError(f"replay_counterexamples needs a Problem; got {type(problem).__name__}")
     entries, damaged = read_corpus(folder)
-    results: dict[Path, ReplayedCounterexample] = {}
+    results: _Replayed = {}
     for path, reason in damaged.items():
         results[path] = ReplayedCounterexample(path, INVALID, np.nan, np.nan, reason)
-    batches: dict[tuple[int, str, str | None], list[tuple[Path, SavedCounterexample, Any]]] = {}
+    batches: dict[tuple[int, str, str | None], _Batch] = {}
     for path, entry in entries.items():
         if entry.problem != problem.name:
             results[path] = ReplayedCounterexample(path, OTHER, np.nan, _least(entry))
@@ -174,30 +175,32 @@ def replay_counterexamples(
         together = (entry.seed, entry.precision, entry.backend)
         batches.setdefault(together, []).append((path, entry, columns))
     for (seed, precision, backend), batch in batches.items():
-        results |= _replay_each(problem, seed, precision, backend, batch)
+        replay = partial(_replay_batch, problem, seed, precision, backend)
+        results |= _replay_each(problem, replay, batch)
     ordered = tuple(results[path] for path in sorted(results))
     return CorpusReplay(problem.name, Path(folder), ordered)
 
 
+_Batch: TypeAlias = list[tuple[Path, SavedCounterexample, Any]]
+"""Files that are replayed together, with their entries and columns."""
+_Replayed: TypeAlias = dict[Path, ReplayedCounterexample]
+
+
 def _replay_each(
-    problem: Problem,
-    seed: int,
-    precision: str,
-    backend: str | None,
-    batch: list[tuple[Path, SavedCounterexample, Any]],
-) -> dict[Path, ReplayedCounterexample]:
+    problem: Problem, replay: Callable[[_Batch], _Replayed], batch: _Batch
+) -> _Replayed:
     """Replay counterexamples together; where that fails one by one, to name those that fail."""
     try:
-        return _replay_batch(problem, seed, precision, backend, batch)
+        return replay(batch)
     except (ValueError, TypeError, KeyError, OverflowError) as error:
         problem.check()  # What is wrong with the problem is no fault of a file.
         if len(batch) == 1:
             ((path, entry, _),) = batch
             reason = one_line(format_error(error))
             return {path: ReplayedCounterexample(path, INVALID, np.nan, _least(entry), reason)}
-    results: dict[Path, ReplayedCounterexample] = {}
+    results: _Replayed = {}
     for each in batch:
-        results |= _replay_each(problem, seed, precision, backend, [each])
+        results |= _replay_each(problem, replay, [each])
     return results
 
 
@@ -206,8 +209,8 @@ def _replay_batch(
     seed: int,
     precision: str,
     backend: str | None,
-    batch: list[tuple[Path, SavedCounterexample, Any]],
-) -> dict[Path, ReplayedCounterexample]:
+    batch: _Batch,
+) -> _Replayed:
     """Replay counterexamples of one seed, precision and backend."""
     problem = resolved(problem, wanted=backend).problem
     rows = {

@@ -21,7 +21,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from verifai_jax.core.checks import check_count
+from verifai_jax.core.checks import check_count, is_number
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.text import format_error, one_line
 from verifai_jax.counterexamples._shrink import shrink as shrink_row
@@ -119,12 +119,8 @@ def _is_text(value: object) -> bool:
     return isinstance(value, str)
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def _is_entry(value: object) -> bool:
-    return value is None or isinstance(value, bool | str) or (_is_number(value) and _is_real(value))
+    return value is None or isinstance(value, bool | str) or (is_number(value) and _is_real(value))
 
 
 def _is_real(value: Any) -> bool:
@@ -152,7 +148,7 @@ _FORMS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "formulas": (_maps_to(_is_text), "an object of texts"),
     "features": (_maps_to(_is_entry), "an object of finite numbers, texts, truth values and nulls"),
     "robustness": (
-        _maps_to(lambda value: value is None or (_is_number(value) and _is_real(value))),
+        _maps_to(lambda value: value is None or (is_number(value) and _is_real(value))),
         "an object of finite numbers and nulls",
     ),
     "seed": (_is_up_to(2**63 - 1), "a whole number from 0 to 2**63 - 1"),

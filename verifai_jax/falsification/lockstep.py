@@ -94,12 +94,12 @@ def lockstep(
         rows = np.minimum(rows, left)
         if not rows.any():
             break
-        asked, u = u, u.copy()
+        u, told = u.copy(), u.copy()
         proposed += planned
         for seed, repetition in enumerate(repetitions):
             chosen = np.arange(batch) < planned[seed]
             number = int(proposed[seed])
-            u[seed] = repetition.avoid(u[seed], chosen, not wanted[seed], number)
+            u[seed], told[seed] = repetition.avoid(told[seed], chosen, not wanted[seed], number)
             repetition.add(u[seed, : rows[seed]])
         values = np.full((n, batch), np.nan, np.float32)
         valid, broken = np.zeros((n, batch), bool), np.zeros((n, batch), bool)
@@ -146,8 +146,7 @@ def lockstep(
             if len(first) and not failed[seed]:
                 failed[seed], failures[seed] = True, u[seed, first[0]]
         observations = Observations(
-            # As `Proposals` tells them.
-            u=jnp.asarray(np.where(wanted[:, None, None], asked, u)),
+            u=jnp.asarray(told),
             rho=jnp.asarray(values),
             valid=jnp.asarray(valid),
             clauses=jnp.asarray(clauses),

@@ -42,7 +42,8 @@ EVENLY = 0.1
 """Share of exploration that samples the prior; it grows where nothing else helps."""
 
 FEW = 4
-"""Dimensions below which corners are few, so that more of exploration samples the prior."""
+"""Dimensions below which corners are few, and points that are spread find soon what descents find:
+more of exploration samples the prior, and the portfolio descends less before there is evidence."""
 
 SELDOM = 0.35
 """Share of exploration in which signals change seldom."""

@@ -37,7 +37,7 @@ from verifai_jax.search.interior import (
     wait,
     waits,
 )
-from verifai_jax.search.mutation import Mutation, MutationState
+from verifai_jax.search.mutation import FEW, Mutation, MutationState
 
 GRADIENT, MUTATION, CROSS_ENTROPY = range(3)
 """Numbers of the members."""
@@ -56,10 +56,6 @@ LEAST_SHARE = 0.05
 
 OPENING = 6
 """Descents before the budget is shared by evidence."""
-
-FEW = 4
-"""Dimensions below which points that are spread find sooner what descents find: the fewer there
-are, the fewer simulations the descents get before there is evidence."""
 
 MANY = 32
 """Simulations of a round beyond which descents wait until failures are rare."""

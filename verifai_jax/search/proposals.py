@@ -294,7 +294,7 @@ class Proposals:
         self.proposed, self.accepted = (int(count) for count in checkpoint["counts"])
         self._greatest = float(checkpoint.get("greatest", -math.inf))
         if self._repetition is not None and "simulated" in checkpoint:
-            self._repetition.codes = np.asarray(checkpoint["simulated"])
+            self._repetition.restore(np.asarray(checkpoint["simulated"]))
 
     def _ask(self) -> Float[Array, "m d"]:
         points, self._state = self._program.ask(self._state)
@@ -348,7 +348,8 @@ class Proposals:
             self._plan, planned = plan, int(plan.rows)
         self.proposed += planned
         wanted = np.arange(len(points)) < planned
-        asked, points = points, self._unrepeated(points, wanted)
+        asked = points
+        points, told = self._unrepeated(points, wanted)
         accepted = self._accepted_rows(points) & wanted
         for _ in range(TRIES - 1):
             if accepted.sum() == planned or self.total is not None:
@@ -358,13 +359,13 @@ class Proposals:
             if np.array_equal(np.asarray(others)[fresh], np.asarray(asked)[fresh]):
                 break  # This search proposes the same until it is told something.
             self.proposed += int(fresh.sum())
-            asked = jnp.where(fresh[:, None], others, asked)
-            points = jnp.where(fresh[:, None], self._unrepeated(others, fresh), points)
+            asked = others
+            parts = zip(self._unrepeated(others, fresh), (points, told), strict=True)
+            points, told = (jnp.where(fresh[:, None], new, old) for new, old in parts)
             accepted = accepted | (self._accepted_rows(points) & wanted)
         self._barren = 0 if accepted.any() else self._barren + 1
         if self._barren >= MOST_REFUSED:
             self._give_up()
-        told = points if self._anywhere or not len(self.cube.continuous) else asked
         missing = self.batch - len(told)
         self._points = np.pad(told, ((0, missing), (0, 0)), mode="edge") if missing else told
         self._rows = np.flatnonzero(accepted)[:most]
@@ -374,22 +375,16 @@ class Proposals:
             self._repetition.add(np.asarray(simulated))
         return simulated
 
-    @property
-    def _anywhere(self) -> bool:
-        """True where any point may take the turn of a repeated one, and the search is told which.
+    def _unrepeated(self, points: Any, wanted: Bool[np.ndarray, " n"]) -> tuple[Any, Any]:
+        """Return the points to simulate for those of a round, and those that the search learns of.
 
-        A search that plans its rounds has looked at the point without derivatives. Others go on
-        from the points that they proposed: they are told of these, which are next to it.
+        A search that plans its rounds learns of any point that takes the turn of a repeated one,
+        but for derivatives. Others go on from the points that they proposed.
         """
-        return self._plan is not None and not bool(self._plan.differentiate)
-
-    def _unrepeated(
-        self, points: Float[Array, "n d"] | Float[np.ndarray, "n d"], wanted: Bool[np.ndarray, " n"]
-    ) -> Float[Array, "n d"] | Float[np.ndarray, "n d"]:
-        """Return the points of a round, with others for those that were simulated before."""
         if self._repetition is None:
-            return points
-        return self._repetition.avoid(np.asarray(points), wanted, self._anywhere, self.proposed)
+            return points, points
+        anywhere = self._plan is not None and not bool(self._plan.differentiate)
+        return self._repetition.avoid(np.asarray(points), wanted, anywhere, self.proposed)
 
     def _spread(self, values: np.ndarray, filler: float) -> Any:
         """Put values of the simulated rows into an array of all rows of the batch."""

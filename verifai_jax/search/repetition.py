@@ -23,23 +23,37 @@ TRIES = 16
 
 
 class Repetition:
-    """The points that were simulated so far, each as a number that tells it apart.
-
-    - `codes`: the numbers, in the order of the simulations. The array is never written to: to go
-      on with those of an earlier process, set it.
-    """
+    """The points that were simulated so far, each as a number that tells it apart."""
 
     def __init__(self, cube: Cube, key: Key[Array, ""]) -> None:
         self._cube, self._levels = cube, np.array(cube.levels)
         self._seed = [int(word) for word in np.asarray(jax.random.key_data(key)).ravel()]
         rng = np.random.default_rng(cube.dim)
         self._factors = rng.integers(0, 2**63, cube.dim, np.uint64) * np.uint64(2) + np.uint64(1)
-        self.codes = np.zeros(0, np.uint64)
+        self.restore(np.zeros(0, np.uint64))
+
+    @property
+    def codes(self) -> UInt64[np.ndarray, " n"]:
+        """The numbers, in the order of the simulations; what is in this array never changes."""
+        return self._codes[: self._count]
+
+    def restore(self, codes: UInt64[np.ndarray, " n"]) -> None:
+        """Go on with the codes of an earlier process."""
+        # There is room at the end, so that a round does not copy those before it.
+        self._codes, self._count = np.resize(codes, 2 * len(codes) + 1024), len(codes)
+        self._known = set(codes.tolist())
 
     def add(self, points: Float[np.ndarray, "n d"]) -> None:
         """Remember points that are simulated."""
-        if len(self.codes) < MEMORY and len(points):
-            self.codes = np.concatenate([self.codes, self._code(points)])[:MEMORY]
+        if self._count >= MEMORY or not len(points):
+            return
+        new = self._code(points)[: MEMORY - self._count]
+        end = self._count + len(new)
+        if end > len(self._codes):
+            self._codes = np.resize(self._codes, 2 * end)
+        self._codes[self._count : end] = new
+        self._count = end
+        self._known.update(new.tolist())
 
     def avoid(
         self,
@@ -47,20 +61,24 @@ class Repetition:
         wanted: Bool[np.ndarray, " n"],
         anywhere: bool,
         number: int,
-    ) -> Float[np.ndarray, "n d"]:
-        """Return the points, with others for those that were simulated or stand there twice.
+    ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
+        """Replace points that were simulated before, or that stand there twice.
 
         **Arguments:**
 
         - `points`: proposals, in the unit cube.
         - `wanted`: which of them will be simulated.
-        - `anywhere`: whether any point of the cube may take a turn; otherwise one next to it.
-        - `number`: proposals before these, from which the random numbers follow.
+        - `anywhere`: whether any point of the cube may take a turn; otherwise one next to it, but
+          for a cube without continuous coordinates, in which nothing is next to a point.
+        - `number`: proposals up to these, from which the random numbers follow.
+
+        **Returns:** the points to simulate, and those that the search learns of: the same, but the
+        proposals themselves where what is simulated lies next to them.
         """
         repeated = wanted & self._repeated(points)
         if not repeated.any():
-            return points
-        points = points.copy()
+            return points, points
+        proposed, points = points, points.copy()
         rng = np.random.default_rng([*self._seed, number])
         anywhere = anywhere or not len(self._cube.continuous)
         for _ in range(TRIES):
@@ -73,14 +91,14 @@ class Repetition:
             repeated = wanted & self._repeated(points)
             if not repeated.any():
                 break
-        return points
+        return points, points if anywhere else proposed
 
     def _repeated(self, points: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
         """Return which points are remembered, or stand among these before."""
         codes = self._code(points)
         first = np.zeros(len(codes), bool)
         first[np.unique(codes, return_index=True)[1]] = True
-        return ~first | np.isin(codes, self.codes)
+        return ~first | np.array([code in self._known for code in codes.tolist()], bool)
 
     def _code(self, points: Float[np.ndarray, "n d"]) -> UInt64[np.ndarray, " n"]:
         """Return a number for each point, the same for all points of a cell."""
