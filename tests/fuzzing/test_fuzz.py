@@ -171,7 +171,7 @@ def test_refused(options, message):
     started = time.perf_counter()
     with unchecked(), pytest.raises(ValueError, match=message):
         vj.fuzz(**options)
-    assert time.perf_counter() - started < 5
+    assert time.perf_counter() - started < 60
 
 
 @pytest.mark.thorough

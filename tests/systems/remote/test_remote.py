@@ -578,21 +578,21 @@ def test_only_who_knows_the_token_is_let_in(caplog):
 
 
 def test_a_simulation_that_takes_too_long():
-    with remote(timeout=0.4) as system:
+    with remote(timeout=1.5) as system:
         stuck = Peer(system.address, capacity=4, parallel=2)
         asked = Asked(system, 6)
         points = stuck.points(2)
         with answering(system):
             outcomes = asked.all()
         assert [o.status.name for o in outcomes] == ["TIMEOUT"] * 2 + ["OK"] * 4
-        assert outcomes[0].message.startswith("the simulation took longer than 0.4 s at 127.0.0.1:")
+        assert outcomes[0].message.startswith("the simulation took longer than 1.5 s at 127.0.0.1:")
         first, second = (point["id"] for point in points)
-        assert stuck.refusal() == f"point {first}, {second} took longer than 0.4 s"
+        assert stuck.refusal() == f"point {first}, {second} took longer than 1.5 s"
 
 
 @pytest.mark.thorough
 def test_time_is_counted_from_when_a_client_can_begin():
-    with remote(timeout=0.6) as system:
+    with remote(timeout=2.0) as system:
         peer = Peer(system.address, capacity=8)
         asked = Asked(system, 9)
         peer.answer(peer.points(1)[0])
@@ -600,7 +600,7 @@ def test_time_is_counted_from_when_a_client_can_begin():
         peer.answer(held.pop(0))
         held += peer.points(2)
         for _ in range(4):
-            time.sleep(0.25)
+            time.sleep(0.75)
             peer.answer(held.pop(0))
             peer.socket.settimeout(0.1)
             with contextlib.suppress(TimeoutError):

@@ -102,7 +102,8 @@ class Pool:
         self.workers, self.timeout, self.retries = workers, timeout, retries
         self._setup = setup
         self._slots = threading.Semaphore(workers)
-        self._idle: list[_Worker] = []  # Its own operations are all the locking that it needs.
+        # Its own operations are all the locking that it needs.
+        self._idle: deque[_Worker] = deque()
         self._seen: dict[int, int] = {}  # Which worker has simulated what last.
         # When the pool is garbage, and at the interpreter's exit.
         weakref.finalize(self, _end, self._idle)
@@ -212,24 +213,36 @@ class Pool:
 
     def _another(self, batch: "_Batch", worker: "_Worker") -> "_Worker":
         """Return another worker than this one, where there may be several."""
-        if not self._idle and batch.busy >= self.workers:
-            return worker
-        other = self._worker(batch)
+        if not self._idle:
+            # A slot that no thread holds stands for a process that does not run yet.
+            if not self._slots.acquire(blocking=False):
+                return worker
+            try:
+                other = self._new(batch)
+                batch.leave(worker)
+                self._idle.append(worker)
+                return other
+            finally:
+                self._slots.release()
         batch.leave(worker)
+        # Exchanged without a moment when it would be missing, and another thread start a new one.
         self._idle.append(worker)
-        return other
+        return self._worker(batch, self._idle.popleft)
 
-    def _worker(self, batch: "_Batch") -> "_Worker":
+    def _worker(self, batch: "_Batch", idle: "Callable[[], _Worker] | None" = None) -> "_Worker":
         """Return an idle worker that is alive, or a new one that is ready."""
         while True:
             try:
-                worker = self._idle.pop()
+                worker = (idle or self._idle.pop)()
             except IndexError:
-                break
+                return self._new(batch)
             if worker.process.poll() is None:
                 batch.enter(worker)
                 return worker
             worker.end()
+
+    def _new(self, batch: "_Batch") -> "_Worker":
+        """Return a new worker that is ready."""
         end = ""
         for _ in range(self.retries + 1):
             worker = _Worker(self._setup)
@@ -254,7 +267,7 @@ def _pool(workers: int, timeout: float | None, retries: int, setup: bytes) -> Po
     return pool
 
 
-def _end(idle: "list[_Worker]") -> None:
+def _end(idle: "deque[_Worker]") -> None:
     """End these workers, all at a time."""
     ending = []
     while idle:
@@ -277,11 +290,6 @@ class _Batch:
         self._busy: set[_Worker] = set()
         self._leaving: set[_Worker] = set()  # Those of the busy ones that take no more.
         self._lock = threading.Lock()
-
-    @property
-    def busy(self) -> int:
-        """Number of workers that simulate, or are about to."""
-        return len(self._busy)
 
     def take(
         self, worker: "_Worker", seen: Mapping[int, int]
