@@ -74,6 +74,7 @@ TASK = vj.SupervisedTask(
 )
 
 
+@pytest.mark.slow
 def test_images_are_added_and_shown(tmp_path):
     options = {"initial": 128, "added": 32, "steps": 300, "further_steps": 50}
     result = vj.augment(

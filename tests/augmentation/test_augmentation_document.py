@@ -10,7 +10,7 @@ import verifai_jax as vj
 DOCUMENT = Path(__file__).parents[2] / "docs" / "augmentation.md"
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_worked_example_runs(capsys):
     blocks = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
     assert len(blocks) == 3

@@ -194,7 +194,7 @@ def test_a_test_is_called_as_a_function_too(tmp_path, monkeypatch):
     assert seen == []
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_tests_of_one_problem_share_what_they_compile(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     compiled = []

@@ -97,7 +97,7 @@ def test_a_system_with_memory_ends_with_the_same_code(call):
     assert CHANGED not in output
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["explain", "shrink", "confirm"])
 def test_studies_of_a_row_say_it_first(call, folder, command):
     pictures = "" if command == "confirm" else "--no-pictures"
@@ -130,7 +130,7 @@ def test_a_report_has_both_hashes_on_its_first_page(call, folder):
     assert sha(OTHER) not in inputs
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_run_of_before_is_reported_as_not_recorded(call, folder):
     from verifai_jax.core.seals import sealed
 

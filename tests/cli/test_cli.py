@@ -125,7 +125,7 @@ def test_ends_and_warm_start(call):
     assert "needs independent samples" in call(*ramp, "--within", 0.1, code=2)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_analyze(call, tmp_path):
     call("falsify", "specs/ramp.py:ramp", "--search", "uniform", "--budget", 400, "--no-pictures")
     output = call("analyze", "runs/ramp-1")

@@ -90,7 +90,7 @@ def test_the_region_is_that_of_brute_force():
     assert {"uncertain", "safe"} == set(region["kind"])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_is_confirmed_fails_because_the_network_errs():
     result = vj.perception.abstract(
         problem(), lambda s: braking(late(s)), frame, ERROR,

@@ -42,7 +42,7 @@ def test_a_backend_that_runs_already_is_left_alone():
     assert done.stdout.strip() == "1"
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_compiled_programs_outlive_the_process(tmp_path):
     code = (
         "import jax.numpy as jnp, verifai_jax as vj\n"

@@ -91,7 +91,7 @@ def test_other_versions_are_left_alone(monkeypatch):
     assert not registered
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_system_that_solves_equations_runs_in_batches():
     command = [sys.executable, "-c", HANGS]
     # It hung for ever, in another process so that this one can go on.

@@ -116,7 +116,7 @@ def falling(high=1.5, pull=1.0, bound=0.2):
     return vj.Problem("fall", space, system, f"always (h >= {bound} & v > -0.9)")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("clauses", [False, True])
 def test_gradients_are_recalled_and_right(folder, monkeypatch, clauses):
     swept = []

@@ -182,7 +182,7 @@ def test_sentences_tell_control_points_by_their_time(driven):
     assert "throttle[" not in text
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_times_of_signals_are_those_of_the_whole_simulation_where_it_ends_early():
     # Over at 2.1 s of 8 s, so that of the points at 0, 2, 4, 6 and 8 s the first three matter.
     system = vj.ode(

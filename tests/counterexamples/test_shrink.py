@@ -232,7 +232,7 @@ def test_choices_integers_and_a_constraint():
     assert found.replay().violated
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_black_box_without_gradients():
     problem = problem_of("box", 3, half([0.8, 0.6, 0.0], 0.3), black_box=True)
     run = vj.falsify(problem, "uniform", 64, batch=64, progress=False)

@@ -47,7 +47,7 @@ WRITTEN = [
 ]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_events_go_first_and_pairs_of_them_together():
     run = vj.simulate(PUSHED, {"events": WRITTEN, "bias": 0.7})
     assert run.table.all["violated"].all()

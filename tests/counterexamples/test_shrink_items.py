@@ -75,7 +75,7 @@ def test_items_that_go_count_once():
     assert lists_what_rebuilds_it(small)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_it_says_which_formula_breaks():
     spec = {"slow": "always fastest < 30", "dim": "always b < 0.6"}
     # The other one is nearer to nominal.

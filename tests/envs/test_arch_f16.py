@@ -54,7 +54,7 @@ def test_falls_are_those_of_aerobench(falls):
     np.testing.assert_allclose(altitude[0, [30, 60, 150, 450]], wanted, rtol=0, atol=0.01)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_heading_makes_no_difference_and_the_rest_is_differentiable(falls):
     system, centre = plane.f16(), np.array([math.pi / 4, -0.375 * math.pi, -math.pi / 4])
 

@@ -65,7 +65,7 @@ def test_problems_are_sound(problem):
     assert ("reaction_time" in problem.space.domains) == ("braking" not in problem.name)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_car_goes_around_the_cones_or_stops_before_them(tmp_path):
     around = jax.jit(specs.perfectly.system)(specs.perfectly.nominal, KEY)
     assert around["offset"][0] == 0

@@ -212,7 +212,7 @@ def test_controllers_refuse_what_they_cannot_use():
         lk.neural(Policy(layers, None, None, jnp.zeros(1), Continuous(-1.0, 1.0)))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     # Each compiles a problem of its own; two stand for all where time is short.

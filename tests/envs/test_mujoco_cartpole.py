@@ -28,7 +28,7 @@ def verdicts(problem, traces):
     return np.asarray(rho)[:, 0]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_qualitative_verdicts_agree_with_the_analytic_model():
     """At least 98 % of poles, long ones, which are hard for the controller."""
     hard = vj.FeatureSpace({**specs.poles.domains, "length": vj.Box(1.05, 1.2)})
@@ -48,7 +48,7 @@ def test_qualitative_verdicts_agree_with_the_analytic_model():
     assert np.median(np.abs(got - wanted)) < 1e-3
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("problem", [specs.gusts, specs.settle], ids=lambda p: p.name)
 def test_problems_fit_together_and_are_kept_on_an_ordinary_day(problem):
     problem = problem.on_backend("native")

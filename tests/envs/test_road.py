@@ -300,7 +300,7 @@ def test_platoon_agrees_with_an_independent_simulation(double):
     np.testing.assert_allclose(got, expected, atol=2e-3)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["platoon", "cut_in", "pedestrian"])
 def test_gradients_are_finite_differences(name, double):
     """Of the least gap, along random directions."""
@@ -319,7 +319,7 @@ def test_gradients_are_finite_differences(name, double):
     assert np.abs(slopes).max() > 0.1
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_nominal_is_safe_and_failures_are_there_but_rare(name):
     problem = PROBLEMS[name]

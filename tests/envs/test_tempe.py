@@ -151,7 +151,7 @@ def test_slopes_are_finite_differences():
     np.testing.assert_allclose(slopes, differences, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_fewer_collisions_with_more_notice_and_none_with_enough():
     curve = specs.collisions([0.0, 0.5, 1.0, 1.5, 2.0, 4.0], samples=4096, seed=11)
     assert curve["share"].is_monotonic_decreasing

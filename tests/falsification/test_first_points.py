@@ -47,7 +47,7 @@ def test_first_points_come_first_and_the_search_goes_on_as_ever():
         vj.falsify(PROBLEM, first=[{"a": 2.0, "b": 0.0}])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("search", ["cross_entropy", "coverage", "portfolio"])
 def test_a_search_learns_from_them_and_resuming_keeps_them(search, tmp_path):
     options = {"batch": 8, "first": FIRST, "seed": 3}

@@ -24,7 +24,7 @@ def problem(bound=1.0):
     )  # fmt: skip
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_first_run_compiles_only_what_it_needs(compiled):
     run = vj.falsify(problem(), budget=64, stop_after=1)
     assert len(run.table.counterexamples)

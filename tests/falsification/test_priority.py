@@ -41,7 +41,7 @@ def test_the_order_of_a_problem(ordered, plain):
         vj.Problem("trip", space=SPACE, system=trip, spec=SPEC, priority=["save", "smooth"])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_search_goes_for_the_gravest(ordered, plain):
     # Three in four samples break one of the lesser rules, one in thirty the important one.
     def grave(problem):

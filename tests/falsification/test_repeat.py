@@ -130,7 +130,7 @@ def test_a_failure_is_what_falsify_claims(artefact):
     assert "(as simulated, not confirmed)" in repr(simulated)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_search_that_plans_learns_what_is_not_claimed(artefact):
     trials = vj.repeat(artefact, "gradient", 60, batch=4, seeds=6)
     assert trials.not_claimed.any()
@@ -144,7 +144,7 @@ def test_a_search_that_plans_learns_what_is_not_claimed(artefact):
         assert trials.first_failure[seed] == (claimed.index[0] + 1 if len(claimed) else np.inf)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_double_precision(artefact):
     trials = vj.repeat(artefact, "gradient", 16, batch=4, seeds=2, precision="float64")
     for seed in range(2):

@@ -227,6 +227,7 @@ def files(folder):
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stride", [9, pytest.param(1, marks=pytest.mark.thorough)])
 def test_a_process_may_die_between_any_two_operations_on_files(
     tmp_path, short, monkeypatch, stride

@@ -88,7 +88,7 @@ def test_rewriting_keeps_the_value(formula, recording):
 
 @pytest.mark.thorough
 @given(formulas(3), recordings(sizes=(6,)), st.sampled_from([0.05, 0.5]))
-@settings(UNCOMPILED, max_examples=15)
+@settings(UNCOMPILED, max_examples=10)
 def test_gradient_equals_finite_differences(formula, recording, tau):
     base = trace_of(recording)
     # Off the grid, because |x| and == have corners on it.

@@ -134,7 +134,7 @@ def test_its_policy_allows_nothing_from_elsewhere(report):
     )
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_rebuilt_it_is_the_same(report, folder, tmp_path):
     again = vj.load(folder, PROBLEM).report(tmp_path / "another.html", **OPTIONS)
     assert again.read_bytes() == report.read_bytes()

@@ -35,6 +35,7 @@ def test_there_are_twenty_programs_and_a_map():
     assert (GALLERY[0].parent / "two_lanes.xodr").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", GALLERY, ids=lambda path: path.stem)
 def test_scenes_refusals_and_distribution_are_those_of_scenic(path):
     program = scenic(path)

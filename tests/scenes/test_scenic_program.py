@@ -173,6 +173,7 @@ class TestWithScenic:
         with pytest.raises(ValueError, match="Scenic refuses this scene"):
             program.scene(features)
 
+    @pytest.mark.slow
     def test_dynamic_scenarios_run_in_workers(self):
         program = vj.scenic(GALLERY / "chase.scenic")
         here = program.simulator(steps=30, records=("gap", "place"))

@@ -44,7 +44,7 @@ def test_expected_improvement_beats_uniform():
     assert gain("ball", value) > 5
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_goes_on_failing():
     u, value = play(SMALL, FLAT, 8, 11, 9, together=False)
     late = value[0, :, -40:] < 0

@@ -143,7 +143,7 @@ def test_it_finds_more_that_happens_where_inputs_say_little():
     assert kinds(some) >= 3
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_it_goes_on_as_it_was_also_with_gradients():
     options = {"diverse": "behaviour", "seed": 1, "confirm": False, "batch": 16}
     whole = vj.falsify(BANDED, "portfolio", 120, **options)

@@ -205,7 +205,7 @@ def test_the_gradient_is_that_of_the_raised_robustness():
     np.testing.assert_allclose(seen.gradient, wanted, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_clauses_and_their_gradients_are_raised_alike():
     cube, search = Cube((0, 0, 0)), Diverse(Uniform(), radius=0.3)
     state = search.init(jax.random.key(0), cube, 4)

@@ -33,7 +33,7 @@ def data(rows=40, padding=24, dtype=jnp.float32):
 PLAIN = GaussianProcess((False,) * 3)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(("wide", "tolerance"), [(False, 1e-3), (True, 1e-6)])
 def test_agrees_with_scikit_learn(wide, tolerance):
     from sklearn.gaussian_process import GaussianProcessRegressor

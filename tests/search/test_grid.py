@@ -70,7 +70,7 @@ def test_mixed_as_verifai():
     np.testing.assert_array_equal(cube.cells(u)[:, 0], [0, 1, 0, 1])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_every_combination_once_in_order():
     cube = Cube(
         (3, 0, 2, 0, 1),
@@ -134,7 +134,7 @@ def test_contract(cube):
     check_search(Grid(), cube)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_contract_of_many_dimensions():
     check_search(Grid(1), Cube((0,) * 200))
     check_batch_independence(Grid(), Cube((0, 0, 5)))

@@ -61,7 +61,7 @@ def test_needs_fewer_simulations_in_forty_dimensions():
     assert np.mean(corner(np.random.default_rng(0).random((100_000, 40))) < 0) < 1e-3
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_closes_in_on_the_best_point():
     def bowl(u):
         return 0.1 + jnp.sum((u - 0.3) ** 2, axis=1)

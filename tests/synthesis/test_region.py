@@ -60,7 +60,7 @@ def test_what_is_no_probability_is_refused():
     )
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_repair_is_found_where_the_prior_has_its_mass():
     repaired = vj.repair(PROBLEM, ["k"], budget=6000, seed=1)
     assert repaired.stopped == "repaired"

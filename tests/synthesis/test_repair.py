@@ -172,7 +172,7 @@ def test_a_black_box():
 NAMES = ["k_x", "k_x_dot", "k_theta", "k_theta_dot"]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("gradient", [False, pytest.param(True, marks=pytest.mark.thorough)])
 def test_a_cart_pole_is_tuned(gradient):
     result = repair(gains, NAMES, gradient=gradient)

@@ -109,7 +109,7 @@ def test_a_message_that_utf8_cannot_hold_is_stored(tmp_path, workers):
     assert len(vj.resume(tmp_path / "run", problem, budget=4).table.all) >= 3
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::RuntimeWarning", "ignore::DeprecationWarning")
 @pytest.mark.parametrize("simulate", [forking, returning_twice])
 @pytest.mark.parametrize("workers", [None, 1])

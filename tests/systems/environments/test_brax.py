@@ -326,7 +326,7 @@ def test_the_step_belongs_to_the_environment_unless_it_is_said_not_to():
     assert brax(Slide(), lambda observation: 0.0, steps=3, exact_step=False).can_refine
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"features": {"g": "gravity[2]"}}])
 def test_one_program_replays_at_every_step(options):
     pole = brax(
@@ -389,7 +389,7 @@ def test_names_in_the_environments_of_brax():
     assert {name: str(place) for name, place in start.items()} == {"a": "q[1]"}
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_friction_of_a_geom_and_gear_of_an_actuator():
     def hop(**features):
         return brax("hopper", lambda o: jnp.zeros(3), steps=3, backend="mjx", features=features)

@@ -74,7 +74,7 @@ def plain(system):
     return replace(system, joined=None)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [0.02, 0.16])
 @pytest.mark.usefixtures("only_joined")
 def test_one_program_simulates_what_a_start_and_steps_do(pole, angle):

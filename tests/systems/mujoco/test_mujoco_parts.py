@@ -85,6 +85,7 @@ SEEN = {"signals": {"u": lambda time, state, control, features: control[0]}}
 
 
 class TestDelays:
+    @pytest.mark.slow
     @pytest.mark.parametrize("backend", ["native", pytest.param("mjx", marks=pytest.mark.thorough)])
     def test_a_decision_takes_effect_later(self, backend):
         system = cart(
