@@ -32,7 +32,8 @@ from verifai_jax.systems.environments._gymnax import Gymnax, gymnax
 from verifai_jax.systems.pytree_checks import outline
 
 if TYPE_CHECKING:
-    from gymnax.environments.environment import Environment
+    # gymnax does not install alongside JAX 0.12.
+    from gymnax.environments.environment import Environment  # pyright: ignore[reportMissingImports]
 
 
 @jax.tree_util.register_dataclass
