@@ -97,7 +97,7 @@ class Brax(System):
 
     @property
     def effort(self) -> Effort:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Effort of XLA: the generalized backend compiles sooner with `little`, and runs as fast."""
+        """Effort of XLA: with `little` the generalized backend compiles sooner and runs as fast."""
         backend = getattr(self.env.unwrapped, "_backend", None)
         return "little" if backend == "generalized" else "most"
 
