@@ -101,7 +101,6 @@ LONG_FILES = (
     "test_workers.py",
     "test_cluster_executors.py",
     "test_silent_mistakes.py",
-    "test_brax_joined.py",
     "test_scenic_gallery.py",
     "test_surrogates.py",
     "test_diverse_search.py",

@@ -1,10 +1,10 @@
 """verifai_jax: find inputs that make a closed-loop system break a temporal-logic property."""
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from verifai_jax._version import __version__ as __version__
 from verifai_jax.core.cores import claim_cores as _claim_cores
+from verifai_jax.core.lazy import attach as _attach
 from verifai_jax.core.reads import watch as _watch
 
 if TYPE_CHECKING:
@@ -124,183 +124,8 @@ if TYPE_CHECKING:
     from verifai_jax.systems.ode import sin_cos as sin_cos
     from verifai_jax.systems.remote import remote as remote
 
-_ROOMS = (
-    *("analysis", "augmentation", "blocks", "clusters", "events", "mtl", "perception", "rl"),
-    "search",
-)
-
 # Imported when first used (PEP 562), so that importing this package takes milliseconds.
-_NAMES = {
-    "augmentation": (
-        "Augmentation",
-        "SupervisedTask",
-        "augment",
-    ),
-    "certification": (
-        "Certificates",
-        "certify",
-    ),
-    "checking": ("test",),
-    "comparison": (
-        "Comparison",
-        "compare",
-    ),
-    "core.loggers": (
-        "CSVLogger",
-        "TensorBoardLogger",
-    ),
-    "core.trace": (
-        "Status",
-        "Trace",
-    ),
-    "core.waveform": ("Waveform",),
-    "counterexamples": (
-        "Confirmation",
-        "Confirmations",
-        "confirm",
-        "explain",
-        "replay_counterexamples",
-        "shrink",
-    ),
-    "estimation": (
-        "Estimate",
-        "estimate",
-    ),
-    "falsification": (
-        "ErrorTable",
-        "Replay",
-        "Run",
-        "RunError",
-        "Trials",
-        "falsify",
-        "load",
-        "repeat",
-        "resume",
-        "simulate",
-    ),
-    "features": (
-        "Array",
-        "Beta",
-        "Box",
-        "Categorical",
-        "Constant",
-        "DiscreteBox",
-        "Distribution",
-        "Empirical",
-        "Exponential",
-        "FeatureSpace",
-        "Gamma",
-        "LogNormal",
-        "LogUniform",
-        "Normal",
-        "Reactive",
-        "Signal",
-        "Struct",
-        "Triangular",
-        "TruncatedNormal",
-        "Weibull",
-    ),
-    "fuzzing": (
-        "FuzzCoverage",
-        "FuzzRun",
-        "fuzz",
-    ),
-    "failure_modes": (
-        "Mode",
-        "Modes",
-        "modes",
-    ),
-    "mtl": (
-        "Formula",
-        "FormulaSyntaxError",
-        "always",
-        "eventually",
-        "parse",
-        "robustness",
-        "signal",
-        "until",
-    ),
-    "problem": (
-        "Behaviour",
-        "Guide",
-        "Problem",
-        "ProblemError",
-        "Rulebook",
-    ),
-    "scenes": (
-        "ProgramError",
-        "ScenicProgram",
-        "scenic",
-    ),
-    "statistics.binomial": (
-        "Rate",
-        "clopper_pearson",
-        "simulations_without_failure",
-    ),
-    "statistics.confidence_sequences": ("anytime_interval",),
-    "statistics.stopping": (
-        "Decided",
-        "Within",
-    ),
-    "sweeps": (
-        "Halving",
-        "OptunaSampler",
-        "Study",
-        "StudyError",
-        "Sweep",
-        "Trainer",
-        "load_sweep",
-        "sweep",
-    ),
-    "synthesis": (
-        "Repair",
-        "Synthesis",
-        "repair",
-        "synthesize",
-    ),
-    "systems.base": ("System",),
-    "systems.blackbox": (
-        "blackbox",
-        "stack_traces",
-    ),
-    "systems.environments": (
-        "brax",
-        "gymnasium",
-        "gymnax",
-    ),
-    "systems.mujoco": (
-        "mjx",
-        "mujoco",
-        "native",
-        "Scaled",
-    ),
-    "systems.ode": (
-        "ode",
-        "sin_cos",
-    ),
-    "systems.remote": ("remote",),
-}
-_MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
-
-__all__ = ["__version__", *_ROOMS, *_MODULE_OF]  # pyright: ignore[reportUnsupportedDunderAll]
-
-
-def __getattr__(name: str) -> Any:
-    if name in _ROOMS:
-        value: Any = importlib.import_module(f"verifai_jax.{name}")
-    elif name in _MODULE_OF:
-        value = getattr(importlib.import_module(f"verifai_jax.{_MODULE_OF[name]}"), name)
-    else:
-        from verifai_jax.core.errors import nearest_names
-
-        raise AttributeError(f"verifai_jax has no {name!r}{nearest_names(name, __all__)}")
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
-
+__getattr__, __dir__, __all__ = _attach(__name__, "__version__")
 
 _claim_cores()
 _watch()

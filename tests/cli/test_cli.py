@@ -652,6 +652,14 @@ def test_parts_of_a_job_array_are_merged_to_the_run_of_one_machine(call, tmp_pat
     assert merged.table.all.equals(whole.table.all)
 
 
+@pytest.mark.parametrize(
+    "option", [["--seed", 0], ["--no-confirm"], ["--diverse"], ["--set", "a=1"]]
+)
+def test_an_option_that_the_run_has_fixed_is_refused_and_not_ignored(call, option):
+    output = call("falsify", "--resume", "run", *option, "--no-pictures", code=2)
+    assert f"{option[0].replace('--no-', '--')} is fixed in the run" in output
+
+
 def test_a_part_alone_neither_stops_nor_learns_nor_uses_a_cluster(call):
     for option in (["--stop-after", 3], ["--cluster", "dask://a:1"], ["--diverse"]):
         output = call("falsify", "specs/ramp.py:ramp", "--shard", "1/2", *option, code=2)

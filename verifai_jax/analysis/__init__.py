@@ -1,62 +1,27 @@
 """Analyses of error tables: components, neighbours, patterns, clusters, rules, coverage."""
 
-from verifai_jax.analysis._coverage import Coverage as Coverage
-from verifai_jax.analysis._coverage import coverage as coverage
-from verifai_jax.analysis._diverse import Diverse as Diverse
-from verifai_jax.analysis._diverse import diverse as diverse
-from verifai_jax.analysis._frequent_patterns import FrequentPatterns as FrequentPatterns
-from verifai_jax.analysis._frequent_patterns import frequent_patterns as frequent_patterns
-from verifai_jax.analysis._importance import Importance as Importance
-from verifai_jax.analysis._importance import importance as importance
-from verifai_jax.analysis._pca import Components as Components
-from verifai_jax.analysis._pca import pca as pca
-from verifai_jax.analysis._rules import Rule as Rule
-from verifai_jax.analysis._rules import Rules as Rules
-from verifai_jax.analysis._rules import rules as rules
-from verifai_jax.analysis.clustering.clusters import Clusters as Clusters
-from verifai_jax.analysis.clustering.clusters import clusters as clusters
-from verifai_jax.analysis.data.columns import Column as Column
-from verifai_jax.analysis.data.samples import Samples as Samples
-from verifai_jax.analysis.neighbours import Neighbours as Neighbours
-from verifai_jax.analysis.neighbours import k_closest as k_closest
-from verifai_jax.analysis.neighbours import nearest as nearest
-from verifai_jax.analysis.neighbours import random_rows as random_rows
-from verifai_jax.analysis.overview import Analysis as Analysis
-from verifai_jax.analysis.overview import analyze as analyze
-from verifai_jax.analysis.sensitivity.gradients import gradient_sensitivity as gradient_sensitivity
-from verifai_jax.analysis.sensitivity.morris import morris as morris
-from verifai_jax.analysis.sensitivity.sensitivity import Sensitivity as Sensitivity
-from verifai_jax.analysis.sensitivity.sobol import sobol_indices as sobol_indices
+from verifai_jax.analysis._coverage import Coverage, coverage
+from verifai_jax.analysis._diverse import Diverse, diverse
+from verifai_jax.analysis._frequent_patterns import FrequentPatterns, frequent_patterns
+from verifai_jax.analysis._importance import Importance, importance
+from verifai_jax.analysis._pca import Components, pca
+from verifai_jax.analysis._rules import Rule, Rules, rules
+from verifai_jax.analysis.clustering.clusters import Clusters, clusters
+from verifai_jax.analysis.data.columns import Column
+from verifai_jax.analysis.data.samples import Samples
+from verifai_jax.analysis.neighbours import Neighbours, k_closest, nearest, random_rows
+from verifai_jax.analysis.overview import Analysis, analyze
+from verifai_jax.analysis.sensitivity.gradients import gradient_sensitivity
+from verifai_jax.analysis.sensitivity.morris import morris
+from verifai_jax.analysis.sensitivity.sensitivity import Sensitivity
+from verifai_jax.analysis.sensitivity.sobol import sobol_indices
 
 __all__ = [
-    "Analysis",
-    "Clusters",
-    "Column",
-    "Components",
-    "Coverage",
-    "Diverse",
-    "FrequentPatterns",
-    "Importance",
-    "Neighbours",
-    "Rule",
-    "Rules",
-    "Samples",
-    "Sensitivity",
-    "analyze",
-    "clusters",
-    "coverage",
-    "diverse",
-    "frequent_patterns",
-    "gradient_sensitivity",
-    "importance",
-    "k_closest",
-    "morris",
-    "nearest",
-    "pca",
-    "random_rows",
-    "rules",
-    "sobol_indices",
-]
+    "Analysis", "Clusters", "Column", "Components", "Coverage", "Diverse", "FrequentPatterns",
+    "Importance", "Neighbours", "Rule", "Rules", "Samples", "Sensitivity", "analyze", "clusters",
+    "coverage", "diverse", "frequent_patterns", "gradient_sensitivity", "importance", "k_closest",
+    "morris", "nearest", "pca", "random_rows", "rules", "sobol_indices",
+]  # fmt: skip
 
 
 def __dir__() -> list[str]:

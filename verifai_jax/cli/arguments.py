@@ -3,11 +3,12 @@
 import contextlib
 import json
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
     from verifai_jax.problem import Problem
 
 Command = TypeVar("Command", bound=Callable[..., object])
+
+COMMON = ("as_json", "pictures", "progress", "keep_going")
+"""Options about what a command prints and draws, and whether it goes on, not about its result."""
 
 RUN = click.argument("folder", metavar="RUN", type=click.Path(path_type=Path))
 """The run folder that a command reads."""
@@ -66,7 +70,7 @@ PROGRESS = click.option(
 """The progress bar can be forced or left out."""
 
 SEED = click.option("--seed", type=int, default=0, show_default=True, help="Seed of all chance.")
-"""Seed of a command that cannot be resumed."""
+"""The seed of everything random in a command."""
 
 
 ONLY = click.option(
@@ -84,8 +88,11 @@ MAX_SECONDS = click.option(
 )
 """A limit of time."""
 
+STOP_AFTER = click.option("--stop-after", type=int, help="Stop at that many counterexamples.")
+"""A number of failures that ends a run."""
+
 PRECISION = click.option(
-    "--precision", type=click.Choice(["float32", "float64"]), help="[default: float32]"
+    "--precision", type=click.Choice(["float32", "float64"]), default="float32", show_default=True
 )
 """Floating-point numbers of the simulations."""
 
@@ -117,9 +124,9 @@ REPORT = click.option(
 EVEN_IF_CHANGED = click.option(
     "--even-if-changed",
     is_flag=True,
-    help="The model has changed on purpose: a row that gives another number is no error.",
+    help="The model was changed on purpose: go on with it, and note what differs.",
 )
-"""For commands that simulate a row again: whether it may be that of another model."""
+"""For commands that go on with what another model may have simulated."""
 
 SET = click.option(
     "--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search."
@@ -288,11 +295,21 @@ def plain_values(option: str, texts: tuple[str, ...]) -> dict[str, Any]:
     return values
 
 
-def refuse_with_resume(options: Mapping[str, object], noun: str) -> None:
-    """Raise a usage error for an option that was given although `--resume` already fixes it."""
-    for option, value in options.items():
-        if value is not None and value != ():
-            raise click.UsageError(f"{option} is fixed in the {noun} that --resume goes on with")
+def refuse_others(allowed: Container[str], why: str) -> None:
+    """Raise a usage error for an option of this command that was given and is not allowed now.
+
+    **Arguments:**
+
+    - `allowed`: names of parameters, beside those that every command has.
+    - `why`: the end of the message, after the option.
+    """
+    context = click.get_current_context()
+    for option in context.command.params:
+        name = option.name or ""
+        if name in allowed or name in COMMON or not isinstance(option, click.Option):
+            continue
+        if context.get_parameter_source(name) is not ParameterSource.DEFAULT:
+            raise click.UsageError(f"{option.opts[0]} {why}")
 
 
 def target_apart(folder: Path, target: str | None) -> str | None:

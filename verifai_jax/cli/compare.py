@@ -1,17 +1,11 @@
 """`verifai-jax compare specs/old.py:balance specs/new.py:balance --margin 0.002`."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
-from verifai_jax.cli.arguments import (
-    CLUSTER,
-    MAX_SECONDS,
-    REPORT,
-    SEED,
-    TARGET,
-    on_cluster,
-)
+from verifai_jax.cli.arguments import CLUSTER, MAX_SECONDS, REPORT, SEED, TARGET, on_cluster
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import as_plain, command, give_result
 
@@ -38,14 +32,10 @@ from verifai_jax.cli.json_output import as_plain, command, give_result
 def compare(
     target: str,
     candidates: tuple[str, ...],
-    margin: float,
-    confidence: float,
-    budget: int,
-    seed: int,
-    max_seconds: float | None,
     cluster: str | None,
     report: Path | None,
     fail_on: Gate | None,
+    **options: Any,
 ) -> None:
     """Compare failure rates of CANDIDATES (specs/FILE.py:NAME) with that of TARGET, in pairs.
 
@@ -58,16 +48,8 @@ def compare(
     from verifai_jax.problem import Problem
 
     with on_cluster(cluster) as executor:
-        result = run_compare(
-            target,
-            {name: name for name in candidates},
-            margin=margin,
-            confidence=confidence,
-            budget=budget,
-            seed=seed,
-            max_seconds=max_seconds,
-            executor=executor,
-        )
+        named = {name: name for name in candidates}
+        result = run_compare(target, named, executor=executor, **options)
     click.echo(printable(str(result)))
     if report is not None:
         with load_at_revision(target, Problem) as baseline:

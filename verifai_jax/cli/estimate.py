@@ -1,7 +1,7 @@
 """`verifai-jax estimate FILE.py:NAME`: how probable a failure is."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -49,20 +49,13 @@ if TYPE_CHECKING:
 )
 def estimate(
     target: str,
-    method: str | None,
-    budget: int,
-    p0: float | None,
-    confidence: float,
-    seed: int,
     only: str | None,
-    batch: int | None,
-    max_seconds: float | None,
-    precision: Literal["float32", "float64"] | None,
-    backend: str | None,
+    p0: float | None,
     cluster: str | None,
     plot: Path | None,
     report: Path | None,
     fail_on: Gate | None,
+    **options: Any,
 ) -> None:
     """Estimate the probability that TARGET (FILE.py:NAME) fails, with an interval and a bound."""
     from verifai_jax.estimation import estimate as run
@@ -73,19 +66,7 @@ def estimate(
         p0 = fail_on.bound
     problem = load_problem(target, only)
     with on_cluster(cluster) as executor:
-        found = run(
-            problem,
-            method,
-            budget,
-            batch=batch,
-            seed=seed,
-            confidence=confidence,
-            p0=p0,
-            precision=precision or "float32",
-            backend=backend,
-            max_seconds=max_seconds,
-            executor=executor,
-        )
+        found = run(problem, p0=p0, executor=executor, **options)
     show_result(found, plot)
     if report is not None:
         path = found.report(report, problem=problem)

@@ -14,7 +14,7 @@ from verifai_jax.cli.arguments import (
     load_judged_run,
 )
 from verifai_jax.cli.exit_codes import check_again
-from verifai_jax.cli.json_output import command, give_result
+from verifai_jax.cli.json_output import command, draw, give_result
 
 
 @command()
@@ -54,8 +54,5 @@ def explain(
         finding=why.replay.finding,
     )
     if pictures:
-        path = (into or folder) / f"why-{why.row}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        why.plot(path)
-        click.echo(f"  picture      {path}")
+        draw(why, (into or folder) / f"why-{why.row}.png")
     check_again(why.replay.finding, even_if_changed)

@@ -12,6 +12,7 @@ from verifai_jax.cli.arguments import (
     BACKEND,
     BATCH,
     CLUSTER,
+    EVEN_IF_CHANGED,
     KEEP_GOING,
     MAX_SECONDS,
     ONLY,
@@ -19,14 +20,16 @@ from verifai_jax.cli.arguments import (
     PRECISION,
     PROGRESS,
     RUN_FOLDER,
+    SEED,
     SET,
+    STOP_AFTER,
     given_or_next,
     load_problem,
     on_cluster,
     plain_values,
     read_run,
     recorded_target,
-    refuse_with_resume,
+    refuse_others,
     resuming,
     target_apart,
 )
@@ -41,16 +44,28 @@ if TYPE_CHECKING:
     from verifai_jax.statistics.stopping import Decided, Within
 
 
+_RESUMES = (
+    *("resume", "target", "only", "budget", "max_seconds", "stop_after", "within", "decide"),
+    *("even_if_changed", "cluster", "fail_on"),
+)
+"""Options that go with `--resume`; the run has fixed the others."""
+_PARTS = (
+    *("shard", "target", "search", "options", "budget", "batch", "seed", "only", "precision"),
+    *("backend", "confirm", "folder", "even_if_changed"),
+)
+"""Options that go with `--shard`; the others need all rows."""
+
+
 @command()
 @click.argument("target", required=False)
 @click.option("--search", help="Name of the search  [default: auto]")
 @SET
 @click.option("--budget", type=int, help="Simulations at most  [default: 10000]")
 @BATCH
-@click.option("--seed", type=int, help="Seed of all chance  [default: 0]")
+@SEED
 @ONLY
 @MAX_SECONDS
-@click.option("--stop-after", type=int, help="Stop at that many counterexamples.")
+@STOP_AFTER
 @click.option("--within", type=float, help="Stop when the failure rate is known as closely.")
 @click.option("--decide", type=float, help="Stop when the rate is clearly above or below this.")
 @click.option("--warm-start", type=click.Path(path_type=Path), help="Run to learn from first.")
@@ -59,9 +74,7 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path),
     help="Run folder to go on with; with a larger --budget the run of that budget and this batch.",
 )
-@click.option(
-    "--even-if-changed", is_flag=True, help="Resume although the model has changed, and note it."
-)
+@EVEN_IF_CHANGED
 @PRECISION
 @BACKEND
 @CLUSTER
@@ -94,28 +107,20 @@ def falsify(
     search: str | None,
     options: tuple[str, ...],
     budget: int | None,
-    batch: int | None,
-    seed: int | None,
     only: str | None,
-    max_seconds: float | None,
-    stop_after: int | None,
     within: float | None,
     decide: float | None,
     warm_start: Path | None,
     resume: Path | None,
     even_if_changed: bool,
-    precision: Literal["float32", "float64"] | None,
-    backend: str | None,
     cluster: str | None,
     shard: str | None,
-    confirm: bool,
     diverse: bool,
     diverse_by: Literal["inputs", "behaviour"] | None,
     folder: Path | None,
-    keep_going: bool,
     pictures: bool,
-    progress: bool | None,
     fail_on: Gate | None,
+    **given: Any,
 ) -> None:
     """Search for inputs under which TARGET (specs/FILE.py:NAME) breaks its property."""
     from verifai_jax import falsification
@@ -128,43 +133,36 @@ def falsify(
 
     stop_when = _stopping_rule(within, decide)
     if shard is not None:
-        alone = {"--resume": resume, "--cluster": cluster, "--warm-start": warm_start}
-        alone |= {"--max-seconds": max_seconds, "--stop-after": stop_after, "--within": within}
-        alone |= {"--decide": decide, "--diverse": diverse or None, "--diverse-by": diverse_by}
-        alone |= {"--fail-on": fail_on}
-        for option, value in alone.items():
-            if value is not None:
-                raise click.UsageError(f"{option} needs all rows of a run; --shard has a part")
-        if target is None:
-            raise click.UsageError("Missing argument 'TARGET', such as specs/cartpole.py:balance.")
+        refuse_others(_PARTS, "needs all rows of a run; --shard has a part")
+    elif resume is not None:
+        refuse_others(_RESUMES, "is fixed in the run that --resume goes on with")
+        target = target or _resumed_target(resume)
+    if target is None:
+        raise click.UsageError("Missing argument 'TARGET', such as specs/cartpole.py:balance.")
+    if shard is not None:
         chosen = named(search or "uniform", **plain_values("--set", options))
-        _simulate_shard(
-            load_problem(target, only), shard, chosen, budget or 10_000, folder,
-            batch=batch, seed=seed or 0, precision=precision or "float32", backend=backend,
-            confirm=confirm, progress=progress, target=target,
-        )  # fmt: skip
+        asked = {
+            name: given[name]
+            for name in ("batch", "seed", "precision", "backend", "confirm", "progress")
+        }
+        problem = load_problem(target, only)
+        _simulate_shard(problem, shard, chosen, budget or 10_000, folder, target=target, **asked)
         return
     if resume is not None:
-        fixed = {"--search": search, "--batch": batch, "--seed": seed, "--folder": folder}
-        fixed |= {"--set": options, "--warm-start": warm_start}
-        fixed |= {"--precision": precision, "--backend": backend}
-        refuse_with_resume(fixed, "run")
-        problem = load_problem(target or _resumed_target(resume), only)
+        problem = load_problem(target, only)
+        asked = {
+            name: given[name] for name in ("max_seconds", "stop_after", "progress", "keep_going")
+        }
         with on_cluster(cluster) as executor:
             run = falsification.resume(
                 resume,
                 problem,
                 budget=budget,
-                max_seconds=max_seconds,
-                stop_after=stop_after,
                 stop_when=stop_when,
-                progress=progress,
                 executor=executor,
                 even_if_changed=even_if_changed,
-                keep_going=keep_going,
+                **asked,
             )
-    elif target is None:
-        raise click.UsageError("Missing argument 'TARGET', such as specs/cartpole.py:balance.")
     else:
         chosen = named(search or "portfolio", **plain_values("--set", options))
         if fail_on is not None and fail_on.name == RATE and not chosen.samples_prior:
@@ -181,24 +179,17 @@ def falsify(
                 problem,
                 chosen if search or options else "auto",
                 10_000 if budget is None else budget,
-                batch=batch,
-                seed=0 if seed is None else seed,
-                max_seconds=max_seconds,
-                stop_after=stop_after,
                 stop_when=stop_when,
                 warm_start=earlier,
                 folder=place,
-                precision=precision or "float32",
-                backend=backend,
-                confirm=confirm,
                 diverse=diverse_by or diverse,
-                progress=progress,
                 target=target,
                 executor=executor,
-                keep_going=keep_going,
+                **given,
             )
-    ends = {"--max-seconds": max_seconds, "--stop-after": stop_after, "--within": within}
-    print_run(run, pictures, {**ends, "--decide": decide, "--cluster": cluster})
+    ends = {"--max-seconds": given["max_seconds"], "--stop-after": given["stop_after"]}
+    ends |= {"--within": within, "--decide": decide, "--cluster": cluster}
+    print_run(run, pictures, ends)
     check_run(run, fail_on)
 
 

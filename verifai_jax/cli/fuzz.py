@@ -1,7 +1,7 @@
 """`verifai-jax fuzz specs/handover.py:handover --stop-after 1`: follow what was covered."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import click
 
@@ -15,6 +15,7 @@ from verifai_jax.cli.arguments import (
     PROGRESS,
     RUN_FOLDER,
     SEED,
+    STOP_AFTER,
     TARGET,
     given_or_next,
     load_problem,
@@ -37,7 +38,7 @@ from verifai_jax.cli.json_output import command, give_result
 @BATCH
 @SEED
 @MAX_SECONDS
-@click.option("--stop-after", type=int, help="Stop at that many counterexamples.")
+@STOP_AFTER
 @PRECISION
 @BACKEND
 @RUN_FOLDER
@@ -47,19 +48,11 @@ from verifai_jax.cli.json_output import command, give_result
 @fail_on(counterexample="if a counterexample was found")
 def fuzz(
     target: str,
-    budget: int,
     cells: tuple[str, ...],
-    batch: int | None,
-    seed: int,
-    max_seconds: float | None,
-    stop_after: int | None,
-    precision: Literal["float32", "float64"] | None,
-    backend: str | None,
     folder: Path | None,
-    keep_going: bool,
     pictures: bool,
-    progress: bool | None,
     fail_on: Gate | None,
+    **options: Any,
 ) -> None:
     """Look for failures of TARGET (specs/FILE.py:NAME) by covering what can happen in it."""
     from verifai_jax.fuzzing import fuzz as run_fuzz
@@ -67,22 +60,9 @@ def fuzz(
     chosen = {name: _cells(name, text) for name, text in split_pairs("--cells", cells)}
     problem = load_problem(target)
     with given_or_next(folder, "runs", problem.name) as place:
-        run = run_fuzz(
-            problem,
-            budget,
-            cells=chosen or None,
-            batch=batch,
-            seed=seed,
-            max_seconds=max_seconds,
-            stop_after=stop_after,
-            folder=place,
-            precision=precision or "float32",
-            backend=backend,
-            progress=progress,
-            target=target,
-            keep_going=keep_going,
-        )
-    print_run(run, pictures, {"--max-seconds": max_seconds, "--stop-after": stop_after})
+        run = run_fuzz(problem, cells=chosen or None, folder=place, target=target, **options)
+    ends = {"--max-seconds": options["max_seconds"], "--stop-after": options["stop_after"]}
+    print_run(run, pictures, ends)
     parts = [
         {"of": part.where, "kind": part.what, "covered": part.covered, "total": part.total}
         for part in run.coverage.parts

@@ -69,15 +69,28 @@ def give_result(**values: object) -> None:
         context.meta.setdefault(_RESULT, {}).update({n: as_plain(v) for n, v in values.items()})
 
 
-def show_result(found: Any, plot: Path | None) -> None:
-    """Print a result, give it as plain data, and draw it into a file where one is named."""
+def show_result(found: Any, plot: Path | None, *names: str) -> None:
+    """Print a result, give it as plain data, and draw it into a file where one is named.
+
+    **Arguments:**
+
+    - `found`: what the Python API returned.
+    - `plot`: the file of its picture, whose folder is made; None for no picture.
+    - `names`: attributes to give; all fields that its `repr` shows when left out.
+    """
     from verifai_jax.core.text import printable
 
     click.echo(printable(str(found)))
-    give_result(**as_plain(found))
+    give_result(**({name: getattr(found, name) for name in names} or as_plain(found)))
     if plot is not None:
-        found.plot(plot)
-        click.echo(f"  picture      {plot}")
+        draw(found, plot)
+
+
+def draw(found: Any, path: Path) -> None:
+    """Draw a result into a file, whose folder is made, and say where it is."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    found.plot(path)
+    click.echo(f"  picture      {path}")
 
 
 def as_plain(value: object) -> Any:

@@ -4,7 +4,15 @@ from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import PICTURES, PROGRESS, RUN_FOLDER, given_or_next, load_problem
+from verifai_jax.cli.arguments import (
+    ONLY,
+    PICTURES,
+    PROBLEM,
+    PROGRESS,
+    RUN_FOLDER,
+    given_or_next,
+    load_problem,
+)
 from verifai_jax.cli.falsify import check_run, print_run
 from verifai_jax.cli.gates import Gate, fail_on
 from verifai_jax.cli.json_output import command
@@ -14,13 +22,8 @@ from verifai_jax.cli.json_output import command
 @click.argument(
     "folders", metavar="PARTS...", nargs=-1, required=True, type=click.Path(path_type=Path)
 )
-@click.option(
-    "--problem",
-    "target",
-    metavar="FILE.py:NAME",
-    help="Problem of the parts  [default: the one they record]",
-)
-@click.option("--only", metavar="NAMES", help="Features that vary, as in the parts.")
+@PROBLEM
+@ONLY
 @RUN_FOLDER
 @PICTURES
 @PROGRESS

@@ -1,7 +1,7 @@
 """`verifai-jax modes FILE.py:NAME`: every mode of failure, and how probable it is."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import click
 
@@ -37,31 +37,8 @@ from verifai_jax.cli.json_output import command, show_result
 @PRECISION
 @BACKEND
 @PLOT
-def modes(
-    target: str,
-    budget: int,
-    confidence: float,
-    least_share: float,
-    seed: int,
-    only: str | None,
-    batch: int | None,
-    max_seconds: float | None,
-    precision: Literal["float32", "float64"] | None,
-    backend: str | None,
-    plot: Path | None,
-) -> None:
+def modes(target: str, only: str | None, plot: Path | None, **options: Any) -> None:
     """List the modes of failure of TARGET (FILE.py:NAME), each with its probability."""
     from verifai_jax.failure_modes import modes as run
 
-    found = run(
-        load_problem(target, only),
-        budget,
-        batch=batch,
-        seed=seed,
-        confidence=confidence,
-        least_share=least_share,
-        precision=precision or "float32",
-        backend=backend,
-        max_seconds=max_seconds,
-    )
-    show_result(found, plot)
+    show_result(run(load_problem(target, only), **options), plot)

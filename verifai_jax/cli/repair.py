@@ -14,7 +14,7 @@ from verifai_jax.cli.arguments import (
     read_run,
 )
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
-from verifai_jax.cli.json_output import command, give_result
+from verifai_jax.cli.json_output import command, draw, give_result, show_result
 
 
 @command()
@@ -62,24 +62,14 @@ def repair(
         nominal=plain_values("--nominal", nominal) or None,
         **keywords,
     )
-    click.echo(printable(str(result)))
-    give_result(
-        before=result.before,
-        parameters=result.parameters,
-        robustness=result.robustness,
-        repaired=result.repaired,
-        change=result.change,
-        held_out_before=result.held_out_before,
-        held_out_after=result.held_out_after,
-        simulations=result.simulations,
-        stopped=result.stopped,
-        seed=result.seed,
-    )
+    show_result(
+        result, None, "before", "parameters", "robustness", "repaired", "change",
+        "held_out_before", "held_out_after", "simulations", "stopped", "seed",
+    )  # fmt: skip
     if estimate is not None:
         estimates = result.estimate(budget=estimate, seed=result.seed)
         click.echo(printable(str(estimates)))
         give_result(estimate_before=estimates.before, estimate_after=estimates.after)
     if plot is not None:
-        result.plot(plot)
-        click.echo(f"  picture      {plot}")
+        draw(result, plot)
     check_gate(fail_on, {"unsafe": not result.repaired})

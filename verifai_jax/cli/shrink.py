@@ -1,7 +1,7 @@
 """`verifai-jax shrink runs/balance-1`: the least departure from nominal that still fails."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import click
 
@@ -16,7 +16,7 @@ from verifai_jax.cli.arguments import (
     load_judged_run,
 )
 from verifai_jax.cli.exit_codes import check_again
-from verifai_jax.cli.json_output import command, give_result
+from verifai_jax.cli.json_output import command, give_result, show_result
 
 
 @command()
@@ -45,35 +45,19 @@ def shrink(
     folder: Path,
     row: int | None,
     target: str | None,
-    by: Literal["count", "distance"],
-    budget: int,
-    seed: int,
-    others: bool,
     even_if_changed: bool,
     into: Path | None,
     pictures: bool,
+    **options: Any,
 ) -> None:
     """Make a ROW (by default the worst) of the run in RUN small: few features, near nominal."""
     from verifai_jax import counterexamples
-    from verifai_jax.core.text import printable
 
     run = load_judged_run(folder, target)
-    small = counterexamples.shrink(run, row, by=by, budget=budget, seed=seed, others=others)
-    click.echo(printable(str(small)))
-    give_result(
-        row=small.row,
-        features=small.features,
-        robustness=small.rho,
-        changed=small.changed,
-        count=small.count,
-        distance=small.distance,
-        simulations=small.simulations,
-        model_changed=small.model_changed,
-        finding=small.finding,
-    )
-    if pictures:
-        path = (into or folder) / f"shrunk-{small.row}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        small.plot(path)
-        click.echo(f"  picture      {path}")
+    small = counterexamples.shrink(run, row, **options)
+    give_result(robustness=small.rho)
+    show_result(
+        small, (into or folder) / f"shrunk-{small.row}.png" if pictures else None, "row",
+        "features", "changed", "count", "distance", "simulations", "model_changed", "finding",
+    )  # fmt: skip
     check_again(small.finding, even_if_changed)

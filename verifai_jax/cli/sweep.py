@@ -9,6 +9,7 @@ import click
 
 from verifai_jax.cli.arguments import (
     CLUSTER,
+    EVEN_IF_CHANGED,
     MAX_SECONDS,
     PICTURES,
     SET,
@@ -16,30 +17,22 @@ from verifai_jax.cli.arguments import (
     is_sweep,
     on_cluster,
     plain_values,
-    refuse_with_resume,
+    refuse_others,
     resuming,
     split_names,
 )
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
-from verifai_jax.cli.json_output import command, give_result
+from verifai_jax.cli.json_output import command, draw, give_result
 
 if TYPE_CHECKING:
     from verifai_jax.sweeps.result import Sweep
 
-_FIXED = (
-    "search",
-    "seed",
-    "samples",
-    "confidence",
-    "budget",
-    "attack",
-    "attack_simulations",
-    "reduction",
-    "by",
-    "only",
+_RESUMES = (
+    *("resume", "target", "configurations", "max_seconds", "cache", "even_if_changed", "cluster"),
+    "fail_on",
 )
-"""Options that a resumed sweep takes from its cache."""
+"""Options that go with `--resume`; the cache of the sweep has fixed the others."""
 _NOTED = ("target", "configurations", "given", "options", "nominal")
 """Entries of the command in the cache."""
 _MOST_ROWS = 12
@@ -75,9 +68,7 @@ _MOST_ROWS = 12
     help="Folder or .sqlite file of finished work  [default: the sweep's folder]",
 )
 @click.option("--resume", type=click.Path(path_type=Path), help="Folder of a sweep to resume.")
-@click.option(
-    "--even-if-changed", is_flag=True, help="Resume although the study has changed, and note it."
-)
+@EVEN_IF_CHANGED
 @click.option(
     "--folder",
     type=click.Path(path_type=Path),
@@ -108,11 +99,7 @@ def sweep(
     from verifai_jax.sweeps.study import Study
 
     if resume is not None:
-        renamed = {"reduction": "halving", "by": "halving-by"}
-        fixed = {f"--{renamed.get(name, name)}": given[name] for name in _FIXED}
-        refuse_with_resume(
-            {**fixed, "--set": options, "--nominal": nominal, "--folder": folder}, "sweep"
-        )
+        refuse_others(_RESUMES, "is fixed in the sweep that --resume goes on with")
         folder, cache = resume, resume if cache is None else cache
         before = _read_command(cache)
         target = target or target_of_project(
@@ -170,9 +157,7 @@ def sweep(
         folder=folder,
     )
     if pictures and record.certified:
-        picture = folder / "sweep.png"
-        result.plot(picture)
-        click.echo(f"  picture      {picture}")
+        draw(result, folder / "sweep.png")
     if not record.complete:
         apart = None if cache == folder else cache
         more = {"--cache": apart, "--max-seconds": max_seconds, "--cluster": cluster}

@@ -7,7 +7,7 @@ import click
 
 from verifai_jax.cli.arguments import PARAMETER_CHOICE, TARGET, load_problem
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
-from verifai_jax.cli.json_output import command, give_result
+from verifai_jax.cli.json_output import command, show_result
 
 
 @command()
@@ -33,28 +33,13 @@ def synthesize(
     **keywords: Any,
 ) -> None:
     """Find parameters for which TARGET (specs/FILE.py:NAME) holds, whatever its other features."""
-    from verifai_jax.core.text import printable
     from verifai_jax.synthesis import synthesize as run_synthesize
 
-    result = run_synthesize(
-        load_problem(target),
-        parameters,
-        budget,
-        **keywords,
-    )
-    click.echo(printable(str(result)))
-    give_result(
-        parameters=result.parameters,
-        robustness=result.robustness,
-        holds=result.holds,
-        margin=result.margin,
-        converged=result.converged,
-        simulations=result.simulations,
-        without_verdict=result.without_verdict,
-        held_out=result.held_out,
-        stopped=result.stopped,
-        seed=result.seed,
-    )
+    result = run_synthesize(load_problem(target), parameters, budget, **keywords)
+    show_result(
+        result, None, "parameters", "robustness", "holds", "margin", "converged", "simulations",
+        "without_verdict", "held_out", "stopped", "seed",
+    )  # fmt: skip
     if table is not None:
         result.candidates.to_csv(table, index=False)
         click.echo(f"  candidates   {table}")

@@ -9,70 +9,39 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
-from verifai_jax.core.cube import Cube as Cube
+from verifai_jax.core.cube import Cube
 from verifai_jax.core.errors import check_names, unknown_name
-from verifai_jax.search._split import Split as Split
-from verifai_jax.search.annealing import Annealing as Annealing
-from verifai_jax.search.bandit import Bandit as Bandit
-from verifai_jax.search.base import Observations as Observations
-from verifai_jax.search.base import Plan as Plan
-from verifai_jax.search.base import Search as Search
-from verifai_jax.search.bayes import Bayes as Bayes
-from verifai_jax.search.ce_compat import CECompat as CECompat
-from verifai_jax.search.cmaes import CMAES as CMAES
-from verifai_jax.search.coverage import Coverage as Coverage
-from verifai_jax.search.cross_entropy import CrossEntropy as CrossEntropy
-from verifai_jax.search.descent import Descent as Descent
-from verifai_jax.search.diverse import Diverse as Diverse
-from verifai_jax.search.diverse import distinct as distinct
-from verifai_jax.search.epsilon_greedy import EpsilonGreedy as EpsilonGreedy
-from verifai_jax.search.gradient import Gradient as Gradient
-from verifai_jax.search.grid import Grid as Grid
-from verifai_jax.search.halton import Halton as Halton
-from verifai_jax.search.mutation import Mutation as Mutation
-from verifai_jax.search.point_list import PointList as PointList
-from verifai_jax.search.portfolio import Portfolio as Portfolio
-from verifai_jax.search.sobol import Sobol as Sobol
-from verifai_jax.search.suggested import Absent
-from verifai_jax.search.suggested import Suggested as Suggested
-from verifai_jax.search.trace_surrogate import TraceSurrogate as TraceSurrogate
-from verifai_jax.search.turbo import TuRBO as TuRBO
-from verifai_jax.search.uniform import Uniform as Uniform
+from verifai_jax.search._split import Split
+from verifai_jax.search.annealing import Annealing
+from verifai_jax.search.bandit import Bandit
+from verifai_jax.search.base import Observations, Plan, Search
+from verifai_jax.search.bayes import Bayes
+from verifai_jax.search.ce_compat import CECompat
+from verifai_jax.search.cmaes import CMAES
+from verifai_jax.search.coverage import Coverage
+from verifai_jax.search.cross_entropy import CrossEntropy
+from verifai_jax.search.descent import Descent
+from verifai_jax.search.diverse import Diverse, distinct
+from verifai_jax.search.epsilon_greedy import EpsilonGreedy
+from verifai_jax.search.gradient import Gradient
+from verifai_jax.search.grid import Grid
+from verifai_jax.search.halton import Halton
+from verifai_jax.search.mutation import Mutation
+from verifai_jax.search.point_list import PointList
+from verifai_jax.search.portfolio import Portfolio
+from verifai_jax.search.sobol import Sobol
+from verifai_jax.search.suggested import Absent, Suggested
+from verifai_jax.search.trace_surrogate import TraceSurrogate
+from verifai_jax.search.turbo import TuRBO
+from verifai_jax.search.uniform import Uniform
 
 __all__ = [
-    "CMAES",
-    "Annealing",
-    "Bandit",
-    "Bayes",
-    "CECompat",
-    "Coverage",
-    "CrossEntropy",
-    "Cube",
-    "Descent",
-    "Diverse",
-    "EpsilonGreedy",
-    "Gradient",
-    "Grid",
-    "Halton",
-    "Mutation",
-    "Observations",
-    "Plan",
-    "PointList",
-    "Portfolio",
-    "Search",
-    "Sobol",
-    "Split",
-    "Suggested",
-    "TraceSurrogate",
-    "TuRBO",
-    "Uniform",
-    "distinct",
-    "from_json",
-    "named",
-    "names",
-    "split",
+    "CMAES", "Annealing", "Bandit", "Bayes", "CECompat", "Coverage", "CrossEntropy", "Cube",
+    "Descent", "Diverse", "EpsilonGreedy", "Gradient", "Grid", "Halton", "Mutation",
+    "Observations", "Plan", "PointList", "Portfolio", "Search", "Sobol", "Split", "Suggested",
+    "TraceSurrogate", "TuRBO", "Uniform", "distinct", "from_json", "named", "names", "split",
     "to_json",
-]
+]  # fmt: skip
 
 
 def __dir__() -> list[str]:

@@ -463,6 +463,11 @@ def test_pendulum_is_that_of_brax_stepped_by_hand(backend, path):
             state = step(machine, state, balance(state.obs))
 
 
+@pytest.mark.parametrize(("backend", "effort"), [("generalized", "little"), ("spring", "most")])
+def test_the_generalized_backend_is_compiled_with_less_effort(backend, effort):
+    assert brax("inverted_pendulum", push, steps=3, backend=backend).effort == effort
+
+
 def test_a_missing_or_old_package_is_one_line(monkeypatch):
     real = importlib.import_module
 

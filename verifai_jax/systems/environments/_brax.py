@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
-from jaxtyping import Array, Bool, Int, Key, PyTree
+from jaxtyping import Array, Int, Key, PyTree
 
 from verifai_jax.core.compilation import Effort
 from verifai_jax.core.errors import (
@@ -37,7 +37,6 @@ from verifai_jax.systems.delays import (
     as_delay,
     first_refusal,
 )
-from verifai_jax.systems.environments.brax_joined import Joined, join
 from verifai_jax.systems.environments.brax_model import (
     Env,
     Place,
@@ -60,7 +59,6 @@ from verifai_jax.systems.environments.episode import (
     features_at,
     fold,
     has_waveforms,
-    in_form,
     policy_function,
     policy_that_sees,
     read_signals,
@@ -96,12 +94,12 @@ class Brax(System):
     exact_step: bool = True
     observation_delay: Delay = NO_DELAY
     action_delay: Delay = NO_DELAY
-    joined: Joined | None = None
 
     @property
     def effort(self) -> Effort:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Effort of XLA: as measured, `little` is compiled in half the time, and as fast."""
-        return "most" if self.joined is None else "little"
+        """Effort of XLA: with `little` the generalized backend compiles sooner and runs as fast."""
+        backend = getattr(self.env.unwrapped, "_backend", None)
+        return "little" if backend == "generalized" else "most"
 
     @property
     def duration(self) -> float:
@@ -188,32 +186,6 @@ class Brax(System):
                 self.signals, moment, action, now, _named_parts(moment.state), self.name
             )
 
-        def either(
-            fresh: Bool[Array, ""] | bool,
-            time: Time,
-            state: Env,
-            action: PyTree,
-            keys: tuple[Key[Array, ""], Key[Array, ""]],
-            form: Moment | None,
-        ) -> Moment:
-            assert self.joined is not None
-
-            def begin(env: Env) -> Any:
-                now = features_at(features, 0.0)
-                if callable(self.initial):
-                    return self.initial(env, now, keys[0])
-                if self.initial:
-                    values = {place: now[name] for name, place in self.initial.items()}
-                    env = with_start(env, values)
-                return env.reset(keys[0])
-
-            def finish(state: Any) -> Moment:
-                moment = _moment(state, self.name)
-                return moment if form is None else in_form(moment, form)
-
-            with explain_errors(self.env, self.name, "reset and step"):
-                return self.joined.moment(fresh, env_at(time), begin, state, action, finish)
-
         decide, size = policy_function(self.policy, self.policy_memory), self.env.action_size
 
         def decide_checked(
@@ -233,7 +205,6 @@ class Brax(System):
             self.steps,
             self.dt,
             Delays.under(self.observation_delay, self.action_delay, features),
-            None if self.joined is None else either,
         )
 
     def _configure(self, features: Features, time: Time) -> Any:
@@ -401,7 +372,6 @@ def brax(
         exact_step=exact_step,
         observation_delay=as_delay(observation_delay, "observation_delay"),
         action_delay=as_delay(action_delay, "action_delay"),
-        joined=join(env),
     )
 
 

@@ -8,8 +8,7 @@ An episode that is over stays frozen where it ended: it is never reset within a 
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -63,9 +62,6 @@ class Episode:
     - `signals(time, moment, action) -> dict`: the samples of the signals.
     - `steps`, `dt`: how many at most, and seconds between two samples.
     - `delays`: of observations and actions.
-    - `joined(fresh, time, state, action, keys, form) -> Moment`: the start where `fresh`, else the
-      step, in one program that is smaller than both; `keys` are those of the start and the step,
-      and `form` is that of the moment. None where there is no such program.
     """
 
     name: str
@@ -77,7 +73,6 @@ class Episode:
     steps: int
     dt: float
     delays: Delays = NO_DELAYS
-    joined: Callable[..., Moment] | None = None
 
     def next_moment(self, time: Time, state: PyTree, action: PyTree, key: Key[Array, ""]) -> Moment:
         """Return the moment after a step, `over` as a truth value."""
@@ -134,9 +129,6 @@ def _run(
 ) -> tuple[Moment, Any, Any, Any]:
     """Return the last moment, the number of steps, the last `collected` and the outputs."""
     keys = episode_keys(key)
-    if episode.joined is not None:
-        with suppress(Exception):  # What is wrong with it is said by the plain way.
-            return _run_joined(episode, keys, collected, collect)
     first, memory, lines = _first_moment(episode, episode.start(keys.start), keys)
     delays = episode.delays
 
@@ -160,59 +152,6 @@ def _run(
     # One iteration more than there are steps samples the end and moves nothing.
     ((last, _, _, age), collected), outputs = checkpointed_scan(
         sample, ((first, memory, lines, jnp.int32(0)), collected), episode.steps + 1
-    )
-    return last, age, collected, outputs
-
-
-def _run_joined(
-    episode: Episode,
-    keys: _Keys,
-    collected: PyTree,
-    collect: Callable[[PyTree, dict[str, Array]], tuple[PyTree, PyTree]],
-) -> tuple[Moment, Any, Any, Any]:
-    """As `_run`, where the start is the first iteration of the loop."""
-    joined, delays = episode.joined, episode.delays
-    assert joined is not None
-    plain = replace(
-        episode,
-        start=lambda key: joined(True, 0.0, None, None, (key, key), None),
-        step=lambda time, state, action, key: joined(False, time, state, action, (key, key), None),
-    )
-    form, _, lines = jax.eval_shape(lambda: _first_moment(plain, plain.start(keys.start), keys))
-    memory = in_working_precision(episode.memory)
-    now = jnp.zeros(())
-    action, _ = jax.eval_shape(episode.decide, now, form.observation, memory, keys.decide)
-    nothing = lambda tree: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), tree)  # noqa: E731
-
-    def sample(carry: PyTree, k: Int[Array, ""]) -> Any:
-        (moment, safe, action, memories, lines, age), collected = carry
-        fresh, frozen = k == 0, moment.over
-        stays = fresh | frozen
-        # Of the step before. A state in which an episode has ended may have no finite derivative.
-        state = _where(frozen, safe, moment.state)
-        time, step_key = age.astype(float) * episode.dt, jax.random.fold_in(keys.step, age)
-        following = joined(fresh, time, state, action, (keys.start, step_key), form)
-        moment = _where(frozen, moment, following)
-        safe = _where(fresh, following.state, safe)
-        age = jnp.where(stays, age, age + 1)
-        memory = _where(stays, *memories)
-        begun = (Line.of(moment.observation, delays.most_observation), lines[0][1])
-        now_lines = _where(frozen, lines[0], _where(fresh, begun, lines[1]))
-        time = age.astype(float) * episode.dt
-        decide_key = jax.random.fold_in(keys.decide, age)
-        observed, observations = through(now_lines[0], moment.observation, delays.observation)
-        action, after = episode.decide(time, observed, memory, decide_key)
-        after = as_precise_as(after, memory)
-        action, actions = through(now_lines[1], action, delays.action)
-        collected, output = collect(collected, episode.signals(time, moment, action))
-        following_lines = (now_lines, (observations, actions))
-        carry = (moment, safe, action, (memory, after), following_lines, age)
-        return (carry, collected), output
-
-    first, lines = nothing(form), nothing(lines)
-    carry = (first, first.state, nothing(action), (memory, memory), (lines, lines), jnp.int32(0))
-    ((last, _, _, _, _, age), collected), outputs = checkpointed_scan(
-        sample, (carry, collected), episode.steps + 1
     )
     return last, age, collected, outputs
 
@@ -520,11 +459,6 @@ def _cast(tree: PyTree, like: PyTree) -> Any:
         return leaf if leaf.dtype == wanted.dtype else leaf.astype(wanted.dtype)
 
     return jax.tree.map(cast, tree, like)
-
-
-def in_form(moment: Moment, form: Moment) -> Moment:
-    """Return a moment in the types of the form."""
-    return _cast(moment._replace(over=jnp.asarray(moment.over, bool)), form)
 
 
 def _floats(tree: PyTree) -> list[Any]:
