@@ -110,11 +110,16 @@ def test_the_citation_has_the_version():
     assert f"\nversion: {verifai_jax.__version__}\n" in text
 
 
-def test_the_navigation_of_the_site_names_pages_that_there_are():
+def test_the_navigation_of_the_site_names_each_page_once():
     text = (ROOT / "website" / "mkdocs.yml").read_text()
     made = set(re.findall(r'"([a-z]+\.md)"', (ROOT / "website" / "pages.py").read_text()))
-    named = set(re.findall(r"([a-z_]+\.md)", text.partition("nav:")[2]))
-    assert {page for page in named - made if not (DOCS / page).exists()} == set()
+    named = re.findall(r"([a-z_]+\.md)", text.partition("nav:")[2])
+    assert sorted(named) == sorted(made | {page.name for page in DOCS.glob("*.md")})
+
+
+def test_the_first_page_links_to_each_page():
+    linked = set(re.findall(r"\]\(docs/(\w+)\.md\)", (ROOT / "README.md").read_text()))
+    assert linked == {page.stem for page in DOCS.glob("*.md")}
 
 
 @pytest.mark.thorough
