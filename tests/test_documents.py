@@ -26,6 +26,8 @@ PAGES = [
 ]
 """Pages with code."""
 CODE = re.compile(r"```.*?```|`[^`\n]*`", re.DOTALL)
+SHOWN = re.compile(r"```python\n(.*?)```\n\n```\n(.*?)```", re.DOTALL)
+"""A block of code, and below it what it prints."""
 LINK = re.compile(r"\]\(([\w./-]+)(?:#[\w-]+)?\)")
 """A link to a file; those with a scheme lead elsewhere."""
 
@@ -82,16 +84,42 @@ def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
             exec(compile(code, str(DOCS / f"{page}.md"), "exec"), names)
 
 
+def test_the_first_page_is_short():
+    assert len((ROOT / "README.md").read_text().split()) <= 900
+
+
+@pytest.mark.slow
+def test_the_first_page_shows_what_its_code_prints(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    shown = SHOWN.search((ROOT / "README.md").read_text())
+    assert shown is not None
+    exec(compile(shown[1], "README.md", "exec"), {"__name__": "first"})
+    printed = capsys.readouterr().out.splitlines()
+    expected = shown[2].splitlines()
+    assert len(printed) == len(expected)
+    for line, said in zip(expected, printed, strict=True):
+        if line.startswith("  time "):  # Seconds differ.
+            line, said = (re.sub(r"\d[\d.,]*", "0", text) for text in (line, said))
+        beginning, dots, _ = line.partition(" ...")
+        assert said.startswith(beginning) if dots else said == line
+    assert (tmp_path / "worst.png").exists()
+
+
 def test_the_citation_has_the_version():
     text = (ROOT / "CITATION.cff").read_text()
     assert f"\nversion: {verifai_jax.__version__}\n" in text
 
 
-def test_the_navigation_of_the_site_names_pages_that_there_are():
+def test_the_navigation_of_the_site_names_each_page_once():
     text = (ROOT / "website" / "mkdocs.yml").read_text()
     made = set(re.findall(r'"([a-z]+\.md)"', (ROOT / "website" / "pages.py").read_text()))
-    named = set(re.findall(r"([a-z_]+\.md)", text.partition("nav:")[2]))
-    assert {page for page in named - made if not (DOCS / page).exists()} == set()
+    named = re.findall(r"([a-z_]+\.md)", text.partition("nav:")[2])
+    assert sorted(named) == sorted(made | {page.name for page in DOCS.glob("*.md")})
+
+
+def test_the_first_page_links_to_each_page():
+    linked = set(re.findall(r"\]\(docs/(\w+)\.md\)", (ROOT / "README.md").read_text()))
+    assert linked == {page.stem for page in DOCS.glob("*.md")}
 
 
 @pytest.mark.thorough

@@ -33,18 +33,19 @@ LONGEST_OUTPUT = 6000
 
 def on_config(config: Any) -> Any:
     """Fill those parts of the navigation that are lists of files."""
-    named = json.dumps(config["nav"])
-    pages = sorted(path.name for path in (ROOT / "docs").glob("*.md"))
     lists = {
-        "pages-of-docs": [page for page in pages if f'"{page}"' not in named],
         "pages-of-notebooks": [_page_of(path) for path in _notebooks()],
         "pages-of-reference": [f"reference/{room}.md" for room in _rooms()],
     }
-    config["nav"] = [
-        {title: lists.get(entry, entry) if isinstance(entry, str) else entry}
-        for each in config["nav"]
-        for title, entry in each.items()
-    ]
+
+    def filled(entry: Any) -> Any:
+        if isinstance(entry, list):
+            return [filled(each) for each in entry]
+        if isinstance(entry, dict):
+            return {title: filled(each) for title, each in entry.items()}
+        return lists.get(entry, entry)
+
+    config["nav"] = filled(config["nav"])
     return config
 
 
