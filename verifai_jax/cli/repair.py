@@ -74,6 +74,8 @@ def repair(
         simulations=result.simulations,
         stopped=result.stopped,
         seed=result.seed,
+        sources=result.sources,
+        changed=result.changed,
     )
     if estimate is not None:
         estimates = result.estimate(budget=estimate, seed=result.seed)

@@ -54,6 +54,7 @@ def synthesize(
         held_out=result.held_out,
         stopped=result.stopped,
         seed=result.seed,
+        sources=result.sources,
     )
     if table is not None:
         result.candidates.to_csv(table, index=False)
