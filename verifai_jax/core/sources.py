@@ -167,9 +167,9 @@ class Sources:
 
     @property
     def code(self) -> str:
-        """One hash of the modules, functions and models; data that these read or name are not in it.
+        """One hash of the modules, functions and models.
 
-        Data may be what a program writes for itself, such as finished work.
+        Data that these read or name are not in it: they may be finished work that is written there.
         """
         roles = (PROBLEM, IMPORTED, FUNCTION, MODEL)
         hashes = sorted(file.sha256 for file in self.files if file.role in roles)

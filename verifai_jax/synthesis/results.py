@@ -197,8 +197,8 @@ class Repair(InNotebook):
     found nothing; `simulations` (without those of the check), `without_verdict`, `seconds`;
     `stopped`: `"repaired"`, `"no parameters"` (none found for the set), `"budget"`,
     `"max_seconds"`, `"rounds"`, `"no verdict"` or `"interrupted"`; `arrays`: whether the
-    parameters are a pytree; `notes`; `seed`; `sources`: what the model was made of, as a run records
-    it; `changed`: says that the model of the run from which it began is another one by now.
+    parameters are a pytree; `notes`; `seed`; `sources`: what the model was made of, as a run
+    records it; `changed`: says that the model of the run from which it began has changed since.
     """
 
     name: str
