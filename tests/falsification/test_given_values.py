@@ -1,5 +1,8 @@
 """What a person writes is what is simulated, in whatever form, or it is refused by name."""
 
+from decimal import Decimal
+from fractions import Fraction
+
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
@@ -184,3 +187,35 @@ def test_a_number_is_the_choice_before_it_is_an_index(choices, value, choice):
     assert domain.to_columns(np.asarray(index)[None], "c")["c"].tolist() == [choice]
     # What a system sees is an index as ever.
     assert int(domain.coerce(jnp.int32(0))) == int(domain.coerce(np.array(0, np.int32))) == 0
+
+
+@pytest.mark.thorough
+def test_numbers_of_other_types_are_simulated_or_refused_by_name():
+    written = {"wind": Decimal("0.5"), "load": Fraction(1, 4), "mass": np.array(2.0, object)}
+    row = ROW | written | {"side": np.float16(0.5), "count": Decimal(3)}
+    (found,) = vj.simulate(BLACK_BOX, [row], progress=False).table.all[NUMBERS].to_numpy().tolist()
+    assert found == [0.5, 0.25, 2.0, 0.5]
+    with pytest.raises(ValueError, match="wind must be a number; got 1000"):
+        vj.simulate(BLACK_BOX, [ROW | {"wind": 10**400}])
+
+
+def test_a_column_that_is_there_twice_is_refused():
+    frame = pd.DataFrame([[*ROW.values(), 3.0]], columns=[*ROW, "wind"])
+    for rows in (frame, frame.iloc[0]):
+        with pytest.raises(ValueError, match="there are 2 columns 'wind', and nothing says which"):
+            vj.simulate(BLACK_BOX, rows)
+    # Of others nothing is taken.
+    other = pd.DataFrame([[*ROW.values(), 1, 2]], columns=[*ROW, "note", "note"])
+    assert len(vj.simulate(BLACK_BOX, other, progress=False).table) == 1
+
+
+@pytest.mark.thorough
+def test_a_frame_without_rows_is_as_a_list_without():
+    frame = pd.DataFrame([ROW]).iloc[:0]
+    for rows in ([], frame):
+        with pytest.raises(ValueError, match="got no rows"):
+            vj.simulate(BLACK_BOX, rows)
+        run = vj.falsify(BLACK_BOX, "uniform", 2, first=rows, progress=False)
+        assert run.failure_rate is not None
+    with pytest.raises(ValueError, match="unknown column 'size'"):
+        vj.simulate(BLACK_BOX, frame.drop(columns="size"))

@@ -80,7 +80,8 @@ def certify(
     - `tie`: failure rates that differ by less count as equally safe. When left out, `p / 10` or
       less: as fine as takes about as many samples again as all policies have at least.
     - `remember(key, compute)`: a memo of simulated blocks; it returns the arrays that `compute`
-      gives, or gave under this key.
+      gives, or gave under this key. A key holds a hash of the model's code, so that blocks of
+      another model are simulated anew; data that the model reads are not in it.
     - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
       once a minute elsewhere. A function `(done, total, text)` is called instead, with the
       simulations so far; `total` may not be reached.
@@ -108,6 +109,7 @@ def certify(
         devices=devices,
         executor=executor,
     )
+    begun = time.time()
     attacker = check_attack(blocks.problem, attack)
     rounds = -(-attack_simulations // lanes)
     if tie is None:
@@ -150,6 +152,7 @@ def certify(
         stopped=stopped,
         seconds=time.perf_counter() - started,
         notes=(*notes, *blocks.notes, *_chance(blocks.problem, rows)),
+        sources=blocks.sources.settled(begun).to_json(),
     )
 
 

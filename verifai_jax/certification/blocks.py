@@ -27,6 +27,7 @@ from verifai_jax.certification.simulators import (
 )
 from verifai_jax.core.executors import Executor, Shipment, ship
 from verifai_jax.core.precision import truncate_silently
+from verifai_jax.core.sources import sources_of
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.features import FeatureSpace
@@ -63,6 +64,8 @@ class Block(NamedTuple):
 
 class Blocks:
     """Blocks of simulations of many policies; `simulated` counts those that were computed.
+
+    `sources` is the record of the model that they are simulated with.
 
     **Arguments:**
 
@@ -137,7 +140,8 @@ class Blocks:
         )
         self._samples = _Samples(self.space, points_key)
         self._digests = [digest(policy, i) for i, policy in enumerate(policies)]
-        self._about = _common_digest(first, seed, lanes)
+        self.sources = sources_of(first, problem_of, made=first.made_in or ())
+        self._about = f"{_common_digest(first, seed, lanes)}/{self.sources.code[:16]}"
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -359,7 +363,7 @@ def _check_same(first: Problem, problem: Problem, number: int) -> None:
 
 
 def _common_digest(problem: Problem, seed: int, lanes: int) -> str:
-    """Hash all that blocks depend on but the policy and the samples; code is not in it."""
+    """Hash all that blocks depend on but the policy, the samples and the model's code."""
     parts = [problem.name, str(dict(problem.formulas)), problem.end, str(problem.space.columns)]
     parts += [str(problem.space.levels), str(seed), str(lanes), "float32"]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]

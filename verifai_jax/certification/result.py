@@ -73,7 +73,8 @@ class Certificates(InNotebook):
     before all have been sampled; `chance`: its posterior probability to be the safest up to `tie`
     (an estimate, no bound); `samples` of each policy at least and `budget` of all;
     `stopped`: `"decided"`, `"budget"` (a verdict or the safest is open, and the budget or what is
-    left of it too small) or `"interrupted"`; `notes`; `seconds`; `seed`; `problem`: its name.
+    left of it too small) or `"interrupted"`; `notes`; `seconds`; `seed`; `problem`: its name;
+    `sources`: what the model was made of, as a run records it.
     """
 
     rows: tuple[Certificate, ...] = field(repr=False)
@@ -89,6 +90,7 @@ class Certificates(InNotebook):
     stopped: str
     seconds: float
     notes: tuple[str, ...] = ()
+    sources: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     def __getitem__(self, number: int) -> Certificate:
         return self.rows[number]

@@ -64,7 +64,8 @@ def repair(
     )
     show_result(
         result, None, "before", "parameters", "robustness", "repaired", "change",
-        "held_out_before", "held_out_after", "simulations", "stopped", "seed",
+        "held_out_before", "held_out_after", "simulations", "stopped", "seed", "sources",
+        "changed",
     )  # fmt: skip
     if estimate is not None:
         estimates = result.estimate(budget=estimate, seed=result.seed)

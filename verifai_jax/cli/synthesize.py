@@ -38,7 +38,7 @@ def synthesize(
     result = run_synthesize(load_problem(target), parameters, budget, **keywords)
     show_result(
         result, None, "parameters", "robustness", "holds", "margin", "converged", "simulations",
-        "without_verdict", "held_out", "stopped", "seed",
+        "without_verdict", "held_out", "stopped", "seed", "sources",
     )  # fmt: skip
     if table is not None:
         result.candidates.to_csv(table, index=False)

@@ -165,6 +165,16 @@ class Sources:
         except OSError:
             return False
 
+    @property
+    def code(self) -> str:
+        """One hash of the modules, functions and models.
+
+        Data that these read or name are not in it: they may be finished work that is written there.
+        """
+        roles = (PROBLEM, IMPORTED, FUNCTION, MODEL)
+        hashes = sorted(file.sha256 for file in self.files if file.role in roles)
+        return hashlib.sha256("\n".join(hashes).encode()).hexdigest()
+
     def changes(self, now: "Sources | None" = None) -> tuple[Change, ...]:
         """Return the files that are others by now.
 

@@ -167,7 +167,7 @@ class Modes(InNotebook):
     notes: tuple[str, ...]
     run: Run | None = field(repr=False)
     seconds: float = math.nan
-    sources: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    sources: Mapping[str, Any] = field(default_factory=dict)
     changed: str = ""
 
     def __len__(self) -> int:

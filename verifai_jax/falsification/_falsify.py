@@ -276,10 +276,13 @@ def simulate(
 
     **Returns:** the run, with a row of its table for each of these.
 
-    **Raises:** `ValueError` for features that are missing or outside the space; as `falsify`.
+    **Raises:** `ValueError` for features that are missing or outside the space, and for no rows; as
+    `falsify`.
     """
     in_precision(precision)
     given = points_of(problem, rows, precision)
+    if not len(given):
+        raise ValueError("simulate needs features of at least one simulation; got no rows")
     points = np.asarray(given[:, : problem.space.dim], np.float32)
     return falsify(
         problem, searches.PointList(points), len(points), first=given,

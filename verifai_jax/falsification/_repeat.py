@@ -9,9 +9,10 @@ Whole rounds (ask, simulate, evaluate, differentiate, tell) run in one `lax.scan
 side: for comparing searches, where a run a seed would spend its time between rounds.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -60,6 +61,7 @@ class Trials(InNotebook):
       the first failure that is claimed, unless it was to go on.
     - `differentiated`: `[seeds, simulations]`, which were differentiated; None where none or all
       were.
+    - `sources`: what the model was made of, as a run records it.
     """
 
     name: str
@@ -71,6 +73,7 @@ class Trials(InNotebook):
     failures: Float[np.ndarray, "seeds d"]
     not_claimed: Bool[np.ndarray, "seeds simulations"] | None = None
     differentiated: Bool[np.ndarray, "seeds simulations"] | None = None
+    sources: Mapping[str, Any] = field(default_factory=dict)
 
     def cost(self, derivative: float = 2.0) -> Float[np.ndarray, " seeds"]:
         """Return `first_failure` with each differentiated simulation counted as so many."""
@@ -203,6 +206,7 @@ def repeat(
     traced.check()
     search, _ = adapt_search(traced, search)
     batch = min(usual_batch(search, budget) if batch is None else batch, budget)
+    sources = problem.sources().to_json()
     claims = SeedClaims(traced, precision, every, not stop_early) if confirm else None
     if search.wants_clauses:
         # The search is in single precision whatever the simulations are, as in `falsify`.
@@ -218,6 +222,7 @@ def repeat(
             found.failures,
             found.not_claimed if confirm else None,
             found.differentiated,
+            sources,
         )
     rounds = -(-budget // batch)
     each = min(rounds, max(1, SIMULATIONS_A_CALL // batch))
@@ -228,7 +233,7 @@ def repeat(
             lambda: _WholeRounds(traced, search, batch, each, precision),
         )
         histories = program.play(every, rounds, stop_early, claims)
-    return Trials(problem.name, repr(search), every, batch, *histories)
+    return Trials(problem.name, repr(search), every, batch, *histories, sources=sources)
 
 
 def _first(failing: Bool[np.ndarray, "seeds simulations"]) -> Float[np.ndarray, " seeds"]:

@@ -38,15 +38,15 @@ def sources_of_row(recorded: Sequence[Mapping[str, Any]], row: int) -> Sources |
 
 
 def model_changes(
-    recorded: Sequence[Mapping[str, Any]], problem: Problem | None, row: int | None
+    recorded: Sequence[Mapping[str, Any]], now: Sources | None, row: int | None = None
 ) -> tuple[Change, ...]:
-    """Return the files of a run's model that are others now.
+    """Return the files of a result's model that are others now.
 
     **Arguments:**
 
-    - `recorded`: by the run.
-    - `problem`: as it is now; without it what lies on the disk counts.
-    - `row`: a row; all that the run was simulated with where it is None.
+    - `recorded`: by the run or the sweep.
+    - `now`: what the model is made of now; without it what lies on the disk counts.
+    - `row`: of a run; all that it was simulated with where it is None.
 
     **Returns:** the changes; none where nothing is recorded.
     """
@@ -55,7 +55,6 @@ def model_changes(
         parts = [part for part in parts if part.first <= row][-1:]
     if not parts:
         return ()
-    now = None if problem is None else problem.sources()
     return tuple(dict.fromkeys(change for part in parts for change in part.changes(now)))
 
 
@@ -104,11 +103,11 @@ def has_several_models(recorded: Sequence[Mapping[str, Any]]) -> bool:
     return any(before.changes(after) for before, after in pairwise(parts))
 
 
-def changed_since(changes: Sequence[Change], row: int | None) -> str:
+def changed_since(changes: Sequence[Change], row: int | None, what: str = "the run") -> str:
     """Say that the model has changed; empty where it has not."""
     if not changes:
         return ""
-    when = "the run" if row is None else f"row {row} was simulated"
+    when = what if row is None else f"row {row} was simulated"
     return f"The model has changed since {when}: {list_changes(changes)}."
 
 

@@ -250,7 +250,8 @@ class Run(InNotebook):
 
         - `row`: the row that is asked about; all rows when left out.
         """
-        return model_changes(self.sources, self.problem, row)
+        now = None if self.problem is None else self.problem.sources()
+        return model_changes(self.sources, now, row)
 
     def changed_since(self, row: int | None = None) -> str:
         """Say in a sentence which files of the model are others by now; empty where none is."""

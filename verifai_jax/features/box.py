@@ -26,6 +26,7 @@ from verifai_jax.features.domain import (
     on_device,
     real_numbers,
     short,
+    without_objects,
 )
 from verifai_jax.features.ends import (
     Reals,
@@ -248,7 +249,7 @@ class DiscreteBox(Domain):
         return jnp.ravel((as_real(jnp.asarray(value) - low) + 0.5) / count)
 
     def coerce(self, value: Numbers) -> Int[Array, "*shape"]:
-        return jnp.asarray(value, jnp.int32)
+        return jnp.asarray(without_objects(value), jnp.int32)
 
     def check(self, value: object, name: str) -> None:
         numbers = as_numbers(value, name)

@@ -28,6 +28,7 @@ from verifai_jax.features.domain import (
     format_choices,
     on_device,
     short,
+    without_objects,
 )
 
 
@@ -166,7 +167,9 @@ class Categorical(Domain):
 
     def coerce(self, value: PyTree) -> Shaped[Array, "*shape"]:
         if self.numeric:
-            return as_real(value) if self._dtype == np.float64 else jnp.asarray(value, self._dtype)
+            if self._dtype == np.float64:
+                return as_real(value)
+            return jnp.asarray(without_objects(value), self._dtype)
         if _is_index(value):
             return on_device(value if isinstance(value, jax.Array) else np.asarray(value))
         values = np.asarray(value, dtype=object)

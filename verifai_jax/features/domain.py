@@ -15,6 +15,8 @@ The unit cube is the probability space: uniform coordinates give the prior on th
 import abc
 import math
 from collections.abc import Iterable, Sequence
+from decimal import Decimal
+from fractions import Fraction
 from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import jax
@@ -34,7 +36,7 @@ LEAST_REAL = float(np.finfo(np.float32).tiny)
 MOST_REAL = float(np.finfo(np.float32).max)
 """Largest float32 number."""
 
-Numbers: TypeAlias = float | Sequence | np.generic | np.ndarray | jax.Array
+Numbers: TypeAlias = float | Decimal | Fraction | Sequence | np.generic | np.ndarray | jax.Array
 """A number or an array of them, as a person, a table or a system writes it."""
 
 Value = TypeVar("Value")
@@ -227,6 +229,7 @@ def as_real(value: Numbers) -> Float[Array, "*shape"]:
 
 def real_numbers(value: Numbers) -> Any:
     """Convert as `as_real`, to an array of NumPy where the value is not of JAX."""
+    value = without_objects(value)
     plain = float | int | np.ndarray | np.number
     several = isinstance(value, list | tuple) and all(isinstance(each, plain) for each in value)
     if several or isinstance(value, plain):
@@ -240,6 +243,16 @@ def real_numbers(value: Numbers) -> Any:
     array = jnp.asarray(value)
     real = jnp.issubdtype(array.dtype, jnp.floating) and not array.weak_type
     return array if real else array.astype(jnp.result_type(float))
+
+
+def without_objects(value: Value) -> Value | np.ndarray:
+    """Convert numbers of other types, such as `Decimal`, to those of NumPy; others stay."""
+    other = Decimal | Fraction
+    several = isinstance(value, list | tuple) and any(isinstance(each, other) for each in value)
+    objects = isinstance(value, np.ndarray) and value.dtype == object
+    if several or objects or isinstance(value, other):
+        return np.asarray(value, np.float64)
+    return value
 
 
 def on_device(numbers: Array | np.ndarray) -> Array:
@@ -270,7 +283,7 @@ def as_numbers(value: object, name: str) -> Float[np.ndarray, "*shape"]:
             if any(isinstance(each, str | bytes) for each in numbers.ravel()):
                 raise TypeError
             numbers = numbers.astype(np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = np.asarray("")
     if numbers.dtype.kind not in "iufb":
         raise ValueError(f"{name} must be a number; got {value!r}")

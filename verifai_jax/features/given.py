@@ -8,7 +8,7 @@ A point of the unit cube in float32 cannot address every value, so a given value
 point. The point serves searches, which know nothing else; the value is what is simulated.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
@@ -54,7 +54,12 @@ def given_features(space: FeatureSpace, rows: Rows, precision: str = "float32") 
     its domain or refused by the constraint; `TypeError` for rows of another form.
     """
     if _is_frame(rows):
-        return _of_columns(space, {str(name): rows[name] for name in rows}, precision)  # pyright: ignore[reportIndexIssue, reportCallIssue, reportArgumentType, reportGeneralTypeIssues]
+        frame: Any = rows
+        columns = _by_name(space, list(frame), lambda name: frame[name])
+        if len(frame):
+            return _of_columns(space, columns, precision)
+        check_names("column", space.columns, columns)
+        rows = []
     listed = _listed(rows)
     each = []
     for i, row in enumerate(listed):
@@ -83,7 +88,8 @@ def given_rows(space: FeatureSpace, features: Mapping[str, Any]) -> Float[np.nda
     numbers among its features; see `FeatureSpace.unflatten_given`.
     """
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(features)]
-    count = len(leaves[0])
+    if not (count := len(leaves[0])):
+        return np.zeros((0, space.dim))
     single = jax.tree.map(_single, features)
     points = np.asarray(space.points_at(single), np.float64).reshape(count, -1)
     points = np.clip(np.nan_to_num(points, nan=0.5), 0.0, 1.0)
@@ -154,7 +160,8 @@ def _of_row(space: FeatureSpace, row: object, precision: str) -> dict[str, Any]:
     if hasattr(row, "_asdict"):
         row = row._asdict()  # pyright: ignore[reportAttributeAccessIssue]
     elif by_columns:
-        row = {str(name): row[name] for name in row.keys()}  # noqa: SIM118  # pyright: ignore[reportAttributeAccessIssue, reportIndexIssue]
+        series: Any = row
+        row = _by_name(space, list(series.keys()), lambda name: series[name])
     if not isinstance(row, Mapping):
         raise ValueError(f"features must be a dictionary, or a row of a table; got {row!r}")
     flat = set(space.columns) - set(space.domains)
@@ -167,6 +174,20 @@ def _of_row(space: FeatureSpace, row: object, precision: str) -> dict[str, Any]:
     with in_precision(precision):
         features = space.root.coerce(space.completed(written))
         return jax.tree.map(lambda leaf: _as(np.asarray(leaf), precision)[None], features)
+
+
+def _by_name(
+    space: FeatureSpace, names: Sequence[Any], entries_of: Callable[[Any], Any]
+) -> dict[str, Any]:
+    """Return entries by their names as texts, or refuse a feature that is there twice."""
+    texts = [str(name) for name in names]
+    for name in space.columns:
+        if texts.count(name) > 1:
+            raise ValueError(
+                f"there are {texts.count(name)} columns {name!r}, and nothing says which is meant; "
+                "leave one"
+            )
+    return {text: entries_of(name) for text, name in zip(texts, names, strict=True)}
 
 
 def _features_of(row: Mapping[str, Any], known: Iterable[str]) -> list[str]:

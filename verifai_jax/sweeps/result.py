@@ -19,9 +19,11 @@ from jaxtyping import Float, Int
 
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.lazy import late
+from verifai_jax.core.sources import Change, list_changes
 from verifai_jax.core.targets import load_target
 from verifai_jax.core.trace import Trace
 from verifai_jax.falsification._falsify import falsify
+from verifai_jax.falsification.model_changes import changed_since, model_changes
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import Formula
 from verifai_jax.problem.problem import Problem
@@ -149,6 +151,18 @@ class Sweep:
         """
         return group_by_configuration(self.table, self.hyperparameters)
 
+    def changes(self) -> tuple[Change, ...]:
+        """Return the files of the study's model that are others by now, with both hashes.
+
+        What the study is made of now counts; for a sweep without it, what lies on the disk. None
+        for a sweep that does not know what it was made of.
+        """
+        if not self.record.sources:
+            return ()
+        now = None if self.study is None else self.study.sources()
+        # Certificates are of the model with which the sweep went on last.
+        return model_changes(self.record.sources[-1:], now)
+
     def policy(self, i: int | np.integer) -> Policy:
         """Return the policy of row `i` of the table: `sweep.policy(i).act(observation)`.
 
@@ -246,7 +260,8 @@ class Sweep:
 
         **Returns:** columns of the problem's features, and `rho`, the robustness.
 
-        **Raises:** as `problem` and `best`.
+        **Raises:** as `problem` and `best`; `ValueError` where more are looked for and the model
+        has changed since the sweep.
         """
         import pandas as pd
 
@@ -254,6 +269,13 @@ class Sweep:
         parts = [self.recorded_counterexamples(i)]
         if simulations:
             problem = self.problem(i)
+            if changes := self.changes():
+                raise ValueError(
+                    f"the model has changed since the sweep of {self.name!r}: "
+                    f"{list_changes(changes)}. Failures of two models are not put into one table: "
+                    f"counterexamples({i}) has those of the sweep, falsify(sweep.problem({i})) "
+                    "looks for those of the model of now"
+                )
             run = falsify(problem, search, budget=simulations, seed=seed, progress=False)
             parts.append(run.table.counterexamples.loc[:, [*problem.space.columns, "rho"]])
         failures = pd.concat([part for part in parts if len(part)] or parts[-1:])
@@ -316,8 +338,15 @@ class Sweep:
         return format_headline(self.findings)
 
     def summary(self) -> str:
-        """Write the findings of the sweep, the most important first."""
-        return format_summary(self.findings)
+        """Write the findings of the sweep, the most important first.
+
+        A loaded sweep says on its first line if the model of its study has changed since.
+        """
+        text = format_summary(self.findings)
+        if self.study is None or self.folder is None:
+            return text
+        changed = changed_since(self.changes(), None, "the sweep")
+        return f"{changed}\n{text}" if changed else text
 
     def __str__(self) -> str:
         return self.summary()

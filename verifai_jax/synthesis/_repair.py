@@ -22,6 +22,7 @@ from jaxtyping import Float
 from verifai_jax.core.budget import Budget, split_budget
 from verifai_jax.core.errors import check_names, suggests_options
 from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.sources import sources_of
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.validation import check_options, usual_batch
 from verifai_jax.problem.problem import Problem
@@ -127,6 +128,7 @@ def repair(
             whole, parameters, nominal, gradient, batch, budget, precision, backend, seed
         )
     search = attack_search(whole, attack, loop)
+    sources, begun = sources_of(whole, system_of, made=whole.made_in or ()), time.time()
     limits, checking = split_budget(lambda: loop.simulations, budget, started, max_seconds)
     region = region_of(loop, mass)
     assert region is not None
@@ -167,6 +169,8 @@ def repair(
         notes=tuple(work.notes),
         make=lambda: loop.with_parameters(theta),
         make_nominal=lambda: loop.with_parameters(start),
+        sources=sources.settled(begun).to_json(),
+        changed="" if run is None else run.changed_since(),
     )
 
 

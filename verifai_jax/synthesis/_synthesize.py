@@ -116,6 +116,7 @@ def synthesize(
         problem, parameters, gradient, batch, budget, precision, backend, seed
     )
     search = attack_search(problem, attack, loop)
+    sources, begun = problem.sources(), time.time()
     limits, checking = split_budget(lambda: loop.simulations, budget, started, max_seconds)
     region = region_of(loop, mass)
     work = _Synthesis(loop, search, limits, margin, environments, seed, region)
@@ -156,6 +157,7 @@ def synthesize(
         stopped=stopped,
         seed=seed,
         varied="" if region is None else region.describe(),
+        sources=sources.settled(begun).to_json(),
     )
 
 

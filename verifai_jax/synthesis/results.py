@@ -1,6 +1,6 @@
 """Results of a synthesis and of a repair: parameters, and the evidence that they hold."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -32,7 +32,8 @@ class Synthesis(InNotebook):
     last attack found no environment worse than those of the set; `simulations` (without
     those of the check), `without_verdict` and `seconds`; `stopped`: `"converged"`, `"budget"`,
     `"max_seconds"`, `"no verdict"` or `"interrupted"`; `problem`: the one given; `seed`;
-    `varied`: what was chosen, what the environment varied, and how far.
+    `varied`: what was chosen, what the environment varied, and how far; `sources`: what the model
+    was made of, as a run records it.
     """
 
     problem: Problem = field(repr=False)
@@ -50,6 +51,7 @@ class Synthesis(InNotebook):
     stopped: str
     seed: int
     varied: str = ""
+    sources: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @property
     def holds(self) -> bool:
@@ -195,7 +197,8 @@ class Repair(InNotebook):
     found nothing; `simulations` (without those of the check), `without_verdict`, `seconds`;
     `stopped`: `"repaired"`, `"no parameters"` (none found for the set), `"budget"`,
     `"max_seconds"`, `"rounds"`, `"no verdict"` or `"interrupted"`; `arrays`: whether the
-    parameters are a pytree; `notes`; `seed`.
+    parameters are a pytree; `notes`; `seed`; `sources`: what the model was made of, as a run
+    records it; `changed`: says that the model of the run from which it began has changed since.
     """
 
     name: str
@@ -218,6 +221,8 @@ class Repair(InNotebook):
     notes: tuple[str, ...] = ()
     make: Callable[[], Problem] | None = field(default=None, repr=False)
     make_nominal: Callable[[], Problem] | None = field(default=None, repr=False)
+    sources: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    changed: str = ""
 
     @property
     def repaired(self) -> bool:
@@ -258,7 +263,8 @@ class Repair(InNotebook):
         )
 
     def __str__(self) -> str:
-        lines = [f"repair of {self.name}: {self._changes()}"]
+        lines = [self.changed] if self.changed else []
+        lines.append(f"repair of {self.name}: {self._changes()}")
         if self.found and not self.change:
             lines.append("  the nominal parameters were kept: no attack found a failure")
         elif self.found:
