@@ -144,7 +144,7 @@ def _of_policy(policy):
 def test_policies_of_which_all_raise_are_not_certified():
     options = {"samples": 64, "attack_simulations": 64, "progress": False}
     CALLS.clear()
-    with pytest.raises(RuntimeError, match="each of the first 66 simulations .* no road at"):
+    with pytest.raises(RuntimeError, match=r"each of the first 66 simulations .* no road at"):
         vj.certify(_of_policy, [0.0, 1.0, 2.0], **options)
     assert len(CALLS) == 66
     certificates = vj.certify(_of_policy, [0.0, 5.0], **options)
@@ -157,7 +157,7 @@ def test_parameters_with_which_all_raise_are_not_searched():
     asked = vj.Problem("p", space, vj.blackbox(_raises), "x > 0", nominal={"x": 0.5, "k": 0.5})
     for verb in (vj.synthesize, vj.repair):
         CALLS.clear()
-        with pytest.raises(RuntimeError, match="each of the first 64 simulations .* no road at"):
+        with pytest.raises(RuntimeError, match=r"each of the first 64 simulations .* no road at"):
             verb(asked, ["k"], budget=2000, progress=False)
         assert len(CALLS) == 64
 

@@ -168,5 +168,5 @@ def test_what_cannot_be_compiled_ends_with_its_reason(monkeypatch):
         raise NotImplementedError("no such operation here")
 
     monkeypatch.setattr("verifai_jax.falsification.loop.Rounds.compile", refuses)
-    with pytest.raises(vj.RunError, match="after 0 simulations: .* no such operation here"):
+    with pytest.raises(vj.RunError, match=r"after 0 simulations: .* no such operation here"):
         vj.falsify(problem(lambda x: x), "uniform", 8, progress=False)

@@ -125,6 +125,8 @@ def alone_only(program: Any) -> Iterator[tuple[Any, Exception]]:
         if inside or (step.primitive.name not in _CALLBACKS and _has_rule(step.primitive)):
             continue
         call, inputs = as_function(program, step)
+        if not inputs:
+            continue
         forms = [jax.ShapeDtypeStruct((2, *each.aval.shape), each.aval.dtype) for each in inputs]
         try:
             jax.eval_shape(jax.vmap(call), *forms)
