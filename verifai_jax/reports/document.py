@@ -61,7 +61,8 @@ def write_report(
     **Returns:** the path of the HTML file.
 
     **Raises:** `UnknownNameError` for a unit or a reason of a feature that there is not;
-    `ValueError` for a number of simulations that is none;
+    `ValueError` for a number of simulations that is none, and for a run whose rows have changed
+    since they were written;
     `TypeError` for something that is no result.
     """
     path, about = Path(path), About(units or {}, reasons or {})
@@ -69,6 +70,11 @@ def write_report(
         check_count("modes", modes)
     match result:
         case Run():
+            if result.table.changed:
+                raise ValueError(
+                    f"no report is written on the run of {result.name!r}, whose rows would be its "
+                    f"evidence: {result.damage}"
+                )
             space = result.problem.space if result.problem else None
             _check(about, space, result.table.features)
             page = run_page(result, about, traces, studies, modes)
