@@ -218,7 +218,9 @@ def read_run(folder: Path, problem: "Problem | None" = None) -> "Run":
     run = load(folder, problem)
     if run.table.damage:
         # Once, in place of a warning from each part that reads the table.
-        warnings.filterwarnings("ignore", message="the error table is damaged", category=UserWarning)
+        warnings.filterwarnings(
+            "ignore", message="the error table is damaged", category=UserWarning
+        )
         click.echo(f"note: {printable(run.table.damage)}", err=True)
     return run
 
