@@ -13,6 +13,7 @@ from verifai_jax.comparison.result import Comparison
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.whole_files import replacing
 from verifai_jax.estimation.result import Estimate
 from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
@@ -93,9 +94,11 @@ def write_report(
                 f"a report is on a run, a sweep, an estimate or a comparison; got {kind}"
             )
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(render(page), encoding="utf-8", newline="\n")
+    with replacing(path) as partial:
+        partial.write_text(render(page), encoding="utf-8", newline="\n")
     claims = json.dumps(page.claims, indent=2, allow_nan=False)
-    claims_path(path).write_text(claims + "\n", encoding="utf-8", newline="\n")
+    with replacing(claims_path(path)) as partial:
+        partial.write_text(claims + "\n", encoding="utf-8", newline="\n")
     return path
 
 
