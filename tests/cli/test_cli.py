@@ -327,15 +327,16 @@ def test_exit_codes(call, tmp_path, monkeypatch):
     output = call("falsify", "specs/broken.py:nan", *few, code=3)
     last = "Error: no simulation had a verdict, so nothing is known of the property: 32 nonfinite"
     assert output.splitlines()[-1] == last
-    broken = ("falsify", "specs/broken.py:raising", *few)
+    broken = ("falsify", "specs/broken.py:raising", "--search", "uniform", "--no-pictures")
+    broken = (*broken, "--budget", 96)
     output = call(*broken, "--fail-on", "counterexample", code=3)
     ended = (
-        "ended after 16 of 32 simulations, since none succeeds: each raised RuntimeError: no road"
+        "ended after 64 of 96 simulations, since none succeeds: each raised RuntimeError: no road"
     )
     assert f"{ended} (specs/broken.py, line 6" in output
     assert output.rstrip().endswith("keep_going=True, or --keep-going, simulates all")
     output = call(*broken, "--keep-going", code=3)
-    assert "32 error. The first says: RuntimeError: no road (specs/broken.py, line 6" in output
+    assert "96 error. The first says: RuntimeError: no road (specs/broken.py, line 6" in output
     for command in ("analyze", "confirm", "shrink", "explain", "replay"):
         output = call(command, "runs/nan-1", code=3)
         assert "no simulation of the run in runs/nan-1 had a verdict, of 32" in output

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
+import verifai_jax as vj
 from verifai_jax.core.waveform import Waveform, set_durations
 from verifai_jax.remote_client import Waveform as ClientWaveform
 
@@ -248,3 +249,13 @@ def test_text_is_short_and_never_an_array():
     assert jax.eval_shape(lambda: LINEAR).knots.shape == (5,)
     assert repr(jax.eval_shape(lambda: LINEAR)) == "Waveform(5 knots, linear, over 2 s)"
     jax.jit(lambda wave: (repr(wave), wave(1.0))[-1])(LINEAR)
+
+
+def test_masked_knots_are_refused():
+    knots = np.ma.masked_array([0.0, 9e9, 0.0], mask=[0, 1, 0])
+    with pytest.raises(ValueError, match="knots of a Waveform must be numbers; number 1 is masked"):
+        Waveform(knots, duration=2.0)
+    whole = Waveform(np.ma.masked_array([0.0, 1.0], mask=False), duration=2.0)
+    assert type(whole.knots) is np.ndarray
+    with pytest.raises(ValueError, match="values of a LookupTable must be numbers; one of 3 is"):
+        vj.blocks.LookupTable([0, 1, 2], knots)

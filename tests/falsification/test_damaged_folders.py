@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 import verifai_jax as vj
+from verifai_jax.cli.json_output import describe_run
 from verifai_jax.core.locks import LOCK
 from verifai_jax.falsification import segments
 from verifai_jax.falsification.checkpoint import STATE
@@ -205,6 +206,18 @@ def test_rows_that_are_not_those_of_the_checkpoint_are_told(problem, folders, tm
     said = run.summary()
     assert said.startswith("ramp: its rows have changed since they were written, so they say noth")
     assert "violate" not in said
+    # No count that the rows do not support is elsewhere either.
+    for shown in (repr(run.table), run._repr_html_(), run.table._repr_html_()):
+        assert "say nothing" in shown
+        assert "counterexamples" not in shown
+        assert "<td>" not in shown
+    found = describe_run(run)
+    names = ("violating", "counterexamples", "verdicts", "without_verdict", "failure_rate", "worst")
+    assert {found[name] for name in names} == {None}
+    with pytest.raises(ValueError, match=f"rows that have changed say nothing: {told}"):
+        vj.analysis.coverage(run)
+    with pytest.raises(ValueError, match=f"no report .* run of 'ramp', .* evidence: {told}"):
+        run.report(tmp_path / "report.html")
     with pytest.warns(UserWarning, match=f"the error table is damaged: {told}"):
         again = vj.falsify(problem, budget=32, warm_start=run, **OPTIONS)
     assert len(again.table) == 32

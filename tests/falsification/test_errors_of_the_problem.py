@@ -9,7 +9,7 @@ import pytest
 import verifai_jax as vj
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation import raising
-from verifai_jax.evaluation.raising import ANY, FEW, Raising
+from verifai_jax.evaluation.raising import ALIKE, ALWAYS, FEW, SLOW, Raising
 
 CALLS = []
 SPACE = {"x": vj.Box(0.0, 1.0)}
@@ -57,16 +57,16 @@ def test_the_run_ends_after_its_first_simulations(name, search, tmp_path):
     with pytest.raises(vj.RunError, match=says) as caught:
         vj.falsify(asked, search, 1000, folder=folder, progress=False)
     said = str(caught.value)
-    assert said.startswith("the run of 'p' ended after 16 of 1,000 simulations, since none ")
+    assert said.startswith("the run of 'p' ended after 64 of 1,000 simulations, since none ")
     assert said.endswith("keep_going=True, or --keep-going, simulates all")
     run = caught.value.run
-    assert len(CALLS) == run.simulations == 16
+    assert len(CALLS) == run.simulations == 64
     assert run.stopped == "an error of every simulation"
-    assert list(run.table.all["status"]) == ["error"] * 16
+    assert list(run.table.all["status"]) == ["error"] * 64
     # The finished part is on disk, and the run can go on.
-    assert len(vj.load(folder).table) == 16
-    run = vj.resume(folder, asked, budget=40, keep_going=True, progress=False)
-    assert run.simulations == 40
+    assert len(vj.load(folder).table) == 64
+    run = vj.resume(folder, asked, budget=90, keep_going=True, progress=False)
+    assert run.simulations == 90
 
 
 @pytest.mark.thorough
@@ -94,8 +94,8 @@ def test_a_small_grid_is_simulated_whole():
     grid = vj.search.Grid(points=5)
     run = vj.falsify(problem(_trace), grid, 100, progress=False, confirm=False)
     assert (run.simulations, run.stopped) == (5, "exhausted")
-    with pytest.raises(vj.RunError, match="ended after 16 of 100 simulations"):
-        vj.falsify(problem(_raises), vj.search.Grid(points=50), 100, progress=False)
+    with pytest.raises(vj.RunError, match="ended after 64 of 100 simulations"):
+        vj.falsify(problem(_raises), vj.search.Grid(points=90), 100, progress=False)
 
 
 @pytest.mark.thorough
@@ -128,9 +128,50 @@ def test_other_verbs_end_too(name):
         lambda: vj.analysis.sobol_indices(asked, samples=64),
     ):
         CALLS.clear()
-        with pytest.raises(RuntimeError, match=rf"each of the first 16 simulations .*{says}"):
+        with pytest.raises(RuntimeError, match=rf"each of the first 64 simulations .*{says}"):
             verb()
-        assert len(CALLS) == 16
+        assert len(CALLS) == 64
+
+
+def _of_policy(policy):
+    def simulate(features):
+        return _raises(features) if policy < 3 else _trace(features)
+
+    return vj.Problem("p", SPACE, vj.blackbox(simulate), "always x > 0.5")
+
+
+@pytest.mark.thorough
+def test_policies_of_which_all_raise_are_not_certified():
+    options = {"samples": 64, "attack_simulations": 64, "progress": False}
+    CALLS.clear()
+    with pytest.raises(RuntimeError, match=r"each of the first 66 simulations .* no road at"):
+        vj.certify(_of_policy, [0.0, 1.0, 2.0], **options)
+    assert len(CALLS) == 66
+    certificates = vj.certify(_of_policy, [0.0, 5.0], **options)
+    assert [row.not_finite for row in certificates.rows] == [64, 0]
+
+
+@pytest.mark.thorough
+def test_parameters_with_which_all_raise_are_not_searched():
+    space = {"x": vj.Box(0.0, 1.0), "k": vj.Box(0.0, 1.0)}
+    asked = vj.Problem("p", space, vj.blackbox(_raises), "x > 0", nominal={"x": 0.5, "k": 0.5})
+    for verb in (vj.synthesize, vj.repair):
+        CALLS.clear()
+        with pytest.raises(RuntimeError, match=r"each of the first 64 simulations .* no road at"):
+            verb(asked, ["k"], budget=2000, progress=False)
+        assert len(CALLS) == 64
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("search", ["uniform", "gradient"])
+def test_seeds_of_which_all_raise_are_not_repeated(search):
+    def traced(features, key):
+        bad = jnp.int32(Status.ERROR)
+        return vj.Trace({"x": jnp.full(2, features["x"])}, dt=1.0, status=bad)
+
+    asked = vj.Problem("p", SPACE, traced, "x > 0")
+    with pytest.raises(RuntimeError, match=r"each of the first \d+ simulations .* raised an error"):
+        vj.repeat(asked, search, 400, batch=16, seeds=4, progress=False)
 
 
 def test_what_is_known_of_signals_is_checked_before():
@@ -155,11 +196,14 @@ def test_when_work_is_hopeless(monkeypatch):
         clock[0] = seconds
         return asked.reason
 
-    alike = [f"ValueError: {i / 3} is too much" for i in range(16)]
+    alike = [f"ValueError: {i / 3} is too much" for i in range(ALWAYS)]
     assert told(alike) == alike[0]
-    assert told(alike[:15]) is None
+    assert told(alike[:-1]) is None
+    # Nine of ten that raise by chance do not end a run of milliseconds; slow ones end sooner.
+    assert told(alike[:ALIKE], seconds=SLOW + 1.0) == alike[0]
+    assert told(alike[: ALIKE - 1], seconds=SLOW + 1.0) is None
     assert told(alike[:FEW], seconds=31.0) == alike[0]
-    different = [f"ValueError: {'x' * i}" for i in range(ANY)]
+    different = [f"ValueError: {'x' * i}" for i in range(ALWAYS)]
     assert told(different) == different[0]
     assert told(different[:-1], seconds=31.0) is None
     asked = Raising()

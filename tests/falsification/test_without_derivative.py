@@ -7,6 +7,7 @@ import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental import io_callback
 from jax.interpreters import batching, mlir
 
 import verifai_jax as vj
@@ -122,3 +123,50 @@ def test_other_verbs_do_without_too():
     small = vj.falsify(problem(on_host), "uniform", budget=64, progress=False, confirm=False)
     row = int(small.table.all["rho"].idxmin())
     assert vj.shrink(small, row, nominal={"x": 0.9, "z": 0.0}, budget=100) is not None
+
+
+def alone(x):
+    return jax.pure_callback(road, jax.ShapeDtypeStruct((), jnp.float32), x)
+
+
+def in_order(x):
+    return io_callback(road, jax.ShapeDtypeStruct((), jnp.float32), x, ordered=True)
+
+
+lonely = jax.extend.core.Primitive("lonely")
+lonely.def_abstract_eval(lambda x: x)
+ALONE = {
+    "callback": (alone, r"pure_callback of road \(.*line \d+\) is for one .* vmap_method='seq"),
+    "in a loop": (
+        lambda x: jax.lax.fori_loop(0, 3, lambda _, x: alone(x), x),
+        "pure_callback of road",
+    ),
+    "in order": (in_order, "io_callback of road .*; write ordered=False, or make the system a vj"),
+    "custom operation": (lonely.bind, r"lonely \(.*'lonely'.*\); give the operation a rule"),
+}
+
+
+@pytest.mark.parametrize("name", ALONE)
+def test_steps_for_one_simulation_at_a_time_are_refused(name):
+    step, said = ALONE[name]
+    for ends in (problem(step).check, lambda: vj.falsify(problem(step), budget=8)):
+        with pytest.raises(vj.ProblemError, match=said):
+            ends()
+
+
+def test_steps_that_have_a_rule_for_batches_are_not():
+    for step, _ in STEPS.values():
+        problem(step).check()
+    ruled = jax.custom_batching.custom_vmap(alone)
+    ruled.def_vmap(lambda size, moved, x: (on_host(x), True))
+    problem(ruled).check()
+
+
+@pytest.mark.thorough
+def test_what_cannot_be_compiled_ends_with_its_reason(monkeypatch):
+    def refuses(*_, **__):
+        raise NotImplementedError("no such operation here")
+
+    monkeypatch.setattr("verifai_jax.falsification.loop.Rounds.compile", refuses)
+    with pytest.raises(vj.RunError, match=r"after 0 simulations: .* no such operation here"):
+        vj.falsify(problem(lambda x: x), "uniform", 8, progress=False)

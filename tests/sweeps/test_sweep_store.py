@@ -204,3 +204,17 @@ def test_a_cache_has_one_writer(tmp_path, name):
     (tmp_path / "file").write_text("")
     with pytest.raises(CacheError, match="cannot be written"), locked_cache(tmp_path / "file/in"):
         pass
+
+
+def test_a_full_disk_is_no_damage_and_loses_nothing(tmp_path):
+    path = tmp_path / "small.sqlite"
+    with Cache(path) as cache:
+        cache.remember("first", lambda: {"x": np.zeros(8)})
+        cache._base.execute("PRAGMA max_page_count = 8")
+        with pytest.raises(
+            CacheError, match=r"cannot be written: .* full; what was finished is in"
+        ):
+            cache.remember("large", lambda: {"x": np.random.default_rng(0).normal(size=10_000)})
+    with Cache(path) as cache:
+        assert cache.names() == ["first"]
+        cache.remember("large", lambda: {"x": np.zeros(10_000)})

@@ -30,6 +30,7 @@ from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.core.text import format_features, one_line, printable
+from verifai_jax.core.whole_files import replacing
 from verifai_jax.falsification.no_rate import why_no_rate
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.table import ErrorTable
@@ -132,7 +133,8 @@ class Analysis:
                 part.result.plot(place / f"{part.name}.png")
                 lines += [f"![{part.title.lower()}]({part.name}.png)", ""]
         report = place / "report.md"
-        report.write_text("\n".join(lines))
+        with replacing(report) as partial:
+            partial.write_text("\n".join(lines))
         return report
 
     def __repr__(self) -> str:

@@ -25,6 +25,7 @@ from verifai_jax.core.lazy import late
 from verifai_jax.core.locks import write_lock
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.precision import reproducible_settings
+from verifai_jax.core.whole_files import replacing
 from verifai_jax.statistics.paired import PairedDifference
 
 TABLE, ADDED, SUMMARY = "table.parquet", "added.parquet", "summary.txt"
@@ -190,10 +191,13 @@ class Augmentation(InNotebook):
         place = Path(folder)
         place.mkdir(parents=True, exist_ok=True)
         with write_lock(place):
-            self.table.to_parquet(place / TABLE)
+            with replacing(place / TABLE) as partial:
+                self.table.to_parquet(partial)
             mixed = [n for n in self.added.columns if self.added[n].dtype == object]
-            self.added.astype(dict.fromkeys(mixed, str)).to_parquet(place / ADDED)
-            (place / SUMMARY).write_text(f"{self.summary()}\n")
+            with replacing(place / ADDED) as partial:
+                self.added.astype(dict.fromkeys(mixed, str)).to_parquet(partial)
+            with replacing(place / SUMMARY) as partial:
+                partial.write_text(f"{self.summary()}\n")
         return place
 
     def __str__(self) -> str:

@@ -93,7 +93,8 @@ def certify(
 
     **Raises:** before anything compiles, `ValueError` for numbers out of range, a search that
     cannot attack, or policies with different features; `ProblemError` and what the monitor raises
-    for a problem whose parts do not fit, such as a formula over a signal that is not there.
+    for a problem whose parts do not fit, such as a formula over a signal that is not there; and
+    `AlwaysRaises` where the first simulations of all policies raise.
     """
     started = time.perf_counter()
     policies = list(policies)

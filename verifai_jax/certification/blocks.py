@@ -29,6 +29,7 @@ from verifai_jax.core.executors import Executor, Shipment, ship
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.sources import sources_of
 from verifai_jax.core.trace import Status
+from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem, ProblemError
@@ -97,6 +98,7 @@ class Blocks:
         self._remember = compute_without_memo if remember is None else remember
         self._simulators: list[tuple[Simulator, dict[int, int]]] = []
         self._owner: dict[int, int] = {}
+        self._raising, self._tried = Raising(), set[int]()
         first: Problem | None = None
         plans = []
         for group in group_policies(policies):
@@ -256,7 +258,30 @@ class Blocks:
         u = np.stack([_fill_block(block.points, self.lanes) for block in blocks])
         members = [places[block.policy] for block in blocks]
         first = np.array([block.first for block in blocks], np.int32)
-        return simulator(members, u, first, key)
+        found = simulator(members, u, first, key)
+        for block, verdicts in zip(blocks, found, strict=True):
+            self._take_in(block.policy, verdicts)
+        if self._raising.reason is not None:
+            self._check_raising(blocks[0], key)
+        return found
+
+    def _take_in(self, policy: int, verdicts: Verdicts) -> None:
+        simulator, places = self._simulators[self._owner[policy]]
+        messages = verdicts.messages
+        if messages is None and isinstance(simulator, ExecutorSimulator):
+            messages = [simulator.messages.get(places[policy], "")]
+        self._raising.add(verdicts.status, messages)
+        self._tried.add(policy)
+
+    def _check_raising(self, block: Block, key: Any) -> None:
+        """End the work where a simulation of each policy raises, too: one may be broken alone."""
+        for policy, owner in self._owner.items():
+            if policy not in self._tried and self._raising.always:
+                simulator, places = self._simulators[owner]
+                first = np.array([block.first], np.int32)
+                (verdicts,) = simulator([places[policy]], block.points[None, :1], first, key)
+                self._take_in(policy, verdicts)
+        self._raising.check(self.problem.name)
 
     @truncate_silently()
     def _traceable(self, problem_of: Any, policy: Any, numbers: tuple[int, ...]) -> bool:

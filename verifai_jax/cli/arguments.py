@@ -3,6 +3,7 @@
 import contextlib
 import json
 import shlex
+import warnings
 from collections.abc import Callable, Container, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -217,10 +218,18 @@ def load_run(folder: Path, target: str | None) -> "Run":
 
 def read_run(folder: Path, problem: "Problem | None" = None) -> "Run":
     """Read the run in a folder; say what the folder is where it holds none."""
+    from verifai_jax.core.text import printable
     from verifai_jax.falsification.run import load
 
     read_record(folder)
-    return load(folder, problem)
+    run = load(folder, problem)
+    if run.table.damage:
+        # Once, in place of a warning from each part that reads the table.
+        warnings.filterwarnings(
+            "ignore", message="the error table is damaged", category=UserWarning
+        )
+        click.echo(f"note: {printable(run.table.damage)}", err=True)
+    return run
 
 
 def recorded_target(folder: Path, remedy: str = "--problem specs/FILE.py:NAME") -> str:

@@ -131,10 +131,10 @@ def _has_form(value: object) -> bool:
 
 
 def describe_run(run: Any) -> dict[str, Any]:
-    """Return what a run found, as plain data."""
+    """Return what a run found, as plain data; None for what a table that was changed would say."""
     counts, rate = run.table.counts, run.failure_rate
-    best = None
-    if counts.without_verdict < run.simulations:
+    best, known = None, not run.table.changed
+    if known and counts.without_verdict < run.simulations:
         row = run.best
         best = {
             "row": int(row.name),
@@ -148,11 +148,11 @@ def describe_run(run: Any) -> dict[str, Any]:
         "target": run.target,
         "formulas": run.formulas,
         "simulations": run.simulations,
-        "violating": counts.violating,
-        "counterexamples": counts.claimed,
-        "verdicts": run.verdict_counts,
-        "repetitions": asdict(counts.repetitions),
-        "without_verdict": counts.without_verdict,
+        "violating": counts.violating if known else None,
+        "counterexamples": counts.claimed if known else None,
+        "verdicts": run.verdict_counts if known else None,
+        "repetitions": asdict(counts.repetitions) if known else None,
+        "without_verdict": counts.without_verdict if known else None,
         "failure_rate": rate,
         "worst": best,
         "search": run.search,

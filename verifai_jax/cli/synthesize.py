@@ -41,6 +41,9 @@ def synthesize(
         "without_verdict", "held_out", "stopped", "seed", "sources",
     )  # fmt: skip
     if table is not None:
-        result.candidates.to_csv(table, index=False)
+        from verifai_jax.core.whole_files import replacing
+
+        with replacing(table) as partial:
+            result.candidates.to_csv(partial, index=False)
         click.echo(f"  candidates   {table}")
     check_gate(fail_on, {"unsafe": not result.holds})

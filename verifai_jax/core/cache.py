@@ -78,7 +78,8 @@ class Cache:
             self._open()
         except sqlite3.Error as error:
             self._base.close()
-            raise CacheError(f"{self.path} is no cache of {_one(kind)}: {error}") from error
+            what, hint = _trouble(error, f"is no cache of {_one(kind)}")
+            raise CacheError(f"{self.path} {what}: {error}{hint}") from error
         except BaseException:
             self._base.close()
             raise
@@ -257,14 +258,13 @@ class Cache:
             try:
                 yield
             except BaseException:
-                self._base.execute("ROLLBACK")
+                if self._base.in_transaction:  # A full disk has ended it already.
+                    self._base.execute("ROLLBACK")
                 raise
             self._base.execute("COMMIT")
         except sqlite3.Error as error:
             what = "is damaged" if isinstance(error, sqlite3.DatabaseError) else "failed"
-            hint = "; restore it from a copy, or give another folder"
-            if isinstance(error, sqlite3.OperationalError):
-                what, hint = "cannot be used", ""  # Locked, read-only, or the disk is full.
+            what, hint = _trouble(error, what, "; restore it from a copy, or give another folder")
             raise CacheError(f"{self.path} {what}: {error}{hint}") from error
 
     def _decode(self, name: str, form: str, checksum: int, data: bytes) -> Arrays:
@@ -274,6 +274,15 @@ class Cache:
             return _decode(json.loads(form), data)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise CacheError(f"{self.path} is damaged in {name!r}: {error}") from error
+
+
+def _trouble(error: sqlite3.Error, otherwise: str, hint: str = "") -> tuple[str, str]:
+    """Return what is wrong with a file, and what to do, where it is locked, read-only or full."""
+    if not isinstance(error, sqlite3.OperationalError):
+        return otherwise, hint
+    if "full" in str(error):
+        return "cannot be written", "; what was finished is in it: make room and begin again"
+    return "cannot be used", ""
 
 
 def _one(kind: str) -> str:

@@ -5,15 +5,18 @@ again = as_traced(traced)                           # of the same pytrees; nothi
 used_inputs(jax.make_jaxpr(simulate)(features, key))    # of each array, whether results use it
 call, variables = as_function(program, step)        # one equation of a program, alone
 moving = of_some(call, values, [0, 2])              # of the first and third of its arguments
+alone_only(program)                                 # steps that jax.vmap refuses, and why
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
 import jax.extend.core
 import jax.numpy as jnp
-from jax.interpreters import partial_eval
+from jax.interpreters import batching, partial_eval
+
+from verifai_jax.core.user_errors import source_line
 
 PROGRAM: Any = getattr(jax.extend.core, "ClosedJaxpr", jax.extend.core.Jaxpr)
 """The class of a program with its constants; newer versions of JAX have one class of programs."""
@@ -89,3 +92,58 @@ def of_some(
         return [each for each in call(*whole) if jnp.issubdtype(each.dtype, jnp.inexact)]
 
     return function
+
+
+def describe_step(step: Any) -> str:
+    """Write a step for people: its operation, the function that it calls, and the user's line."""
+    called = step.params.get("callback")
+    name = getattr(getattr(called, "callback_func", called), "__name__", "")
+    named = f" of {name}" if name and not name.startswith("<") else ""
+    line = source_line(getattr(step.source_info, "traceback", None))
+    return f"{step.primitive.name}{named}{'' if line is None else f' ({line})'}"
+
+
+def programs_in(step: Any) -> list[Any]:
+    """Return the programs among the parameters of a step, such as the body of a loop."""
+    kinds = (jax.extend.core.Jaxpr, PROGRAM)
+    leaves = jax.tree.leaves(
+        list(step.params.values()), is_leaf=lambda each: isinstance(each, kinds)
+    )
+    return [getattr(each, "jaxpr", each) for each in leaves if isinstance(each, kinds)]
+
+
+def alone_only(program: Any) -> Iterator[tuple[Any, Exception]]:
+    """Yield the steps of a `Jaxpr` that `jax.vmap` refuses, each with what it says.
+
+    Only calls of Python, and operations without a rule for batches, are tried.
+    """
+    for step in program.eqns:
+        inside = programs_in(step)
+        # Others, such as kernels and what has a rule of its own for batches, are not looked into.
+        for each in inside if step.primitive.name in _RUN_AS_THEY_ARE else ():
+            yield from alone_only(each)
+        if inside or (step.primitive.name not in _CALLBACKS and _has_rule(step.primitive)):
+            continue
+        call, inputs = as_function(program, step)
+        if not inputs:
+            continue
+        forms = [jax.ShapeDtypeStruct((2, *each.aval.shape), each.aval.dtype) for each in inputs]
+        try:
+            jax.eval_shape(jax.vmap(call), *forms)
+        except Exception as error:
+            # JAX says by errors of many kinds that it cannot, each operation by its own.
+            yield step, error
+
+
+def _has_rule(primitive: Any) -> bool:
+    # Some versions of JAX keep rules in two tables, of which newer ones show but one.
+    tables = (batching.fancy_primitive_batchers, batching.primitive_batchers)
+    return any(isinstance(table, dict) and primitive in table for table in tables)
+
+
+_CUSTOM = ("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
+_CALLS = ("checkpoint", "closed_call", "core_call", "jit", "pjit", "remat", "remat2")
+_RUN_AS_THEY_ARE = frozenset({*_CUSTOM, *_CALLS, "cond", "scan", "while"})
+"""Steps whose programs are in a batch if they are."""
+_CALLBACKS = frozenset({"pure_callback", "io_callback"})
+"""Calls of Python, which have a rule that refuses some of them."""

@@ -42,7 +42,7 @@ class Waveform:
     - `knots`: `[knots, ...]`. With `"linear"` and `"pchip"` the first is the value at time 0 and
       the last that at the end; with `"constant"` each is held for an equal part of the duration,
       its beginning included; with `"pulse"` for the first `width` seconds of that part, and the
-      value is 0 for the rest.
+      value is 0 for the rest. None may be masked.
     - `duration`: in seconds; None until `over` sets it. Before 0 and behind the end the first and
       the last value hold; those of pulses are 0.
     - `times`: of the control points in seconds, increasing; equal distances when left out.
@@ -62,6 +62,13 @@ class Waveform:
     def __post_init__(self) -> None:
         if self.hold not in HOLDS:
             raise unknown_name("hold", self.hold, HOLDS)
+        if isinstance(self.knots, np.ma.MaskedArray):
+            masked = np.argwhere(np.ma.getmaskarray(self.knots))
+            if len(masked):
+                raise ValueError(
+                    f"the knots of a Waveform must be numbers; number {masked[0][0]} is masked"
+                )
+            object.__setattr__(self, "knots", np.asarray(self.knots))
         if self.times is not None:
             object.__setattr__(self, "times", check_times(self.times))
         check_width(self.hold, self.times, self.width)

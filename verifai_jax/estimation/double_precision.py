@@ -138,7 +138,7 @@ class DoublePrecisionEvaluator:
         if self._differentiated is None:
             self._differentiated = Evaluator(
                 self._problem, self._batch, gradient=True, precision=self._precision,
-                seed=self._seed,
+                seed=self._seed, ends_raising=True,
             )  # fmt: skip
         # Each simulation keeps a random key of its own, by its number.
         first = self._evaluator.simulations

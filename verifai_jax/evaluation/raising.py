@@ -18,11 +18,13 @@ from jaxtyping import Integer
 from verifai_jax.core.text import one_line
 from verifai_jax.core.trace import Status
 
+ALWAYS = 64
+"""Simulations that have to raise, with none that does not: where nine of ten raise by chance, that
+happens in one of 850 runs."""
+SLOW = 10.0
+"""Seconds after which `ALIKE` simulations that raise the same are enough."""
 ALIKE = 16
-"""Simulations that have to raise the same, with none that does not: where half of them raise by
-chance, that happens in one of 65 000 runs, and where nine of ten do, in every fifth."""
-ANY = 64
-"""Simulations that have to raise, whatever they say."""
+"""Of these, where half raise by chance, all do in one of 65 000 runs."""
 LONG = 30.0
 """Seconds after which `FEW` simulations that raise the same are enough."""
 FEW = 3
@@ -39,7 +41,7 @@ class Raising:
     """The simulations of some work, as long as all of them raise."""
 
     def __init__(self) -> None:
-        self._since = time.monotonic()
+        self._since: float | None = None  # The first of them, so without what compiles before.
         self._kinds: set[str] = set()
         self._count = 0
         self._first = ""
@@ -49,6 +51,7 @@ class Raising:
         """Take in the statuses and the messages of simulations."""
         if not self.always or not len(status):
             return
+        self._since = time.monotonic() if self._since is None else self._since
         self.always = bool(np.all(np.asarray(status) == Status.ERROR))
         self._count += len(status)
         for message in messages or ("",):
@@ -70,6 +73,7 @@ class Raising:
     @property
     def reason(self) -> str | None:
         """The message of all, empty where they have none; None where others may still succeed."""
-        alike = ALIKE if time.monotonic() - self._since < LONG else FEW
-        enough = self._count >= (alike if len(self._kinds) == 1 else ANY)
+        seconds = 0.0 if self._since is None else time.monotonic() - self._since
+        alike = ALWAYS if seconds < SLOW else ALIKE if seconds < LONG else FEW
+        enough = self._count >= (alike if len(self._kinds) == 1 else ALWAYS)
         return self._first if self.always and enough else None

@@ -28,6 +28,7 @@ from verifai_jax.core.programs import Slot
 from verifai_jax.core.progress import count_done, say_done, shows_progress
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine
+from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.verdicts import violations
 from verifai_jax.falsification.claims import SeedClaims
 from verifai_jax.falsification.lockstep import lockstep
@@ -172,9 +173,10 @@ def repeat(
     **Returns:** the robustness and the verdicts of each seed's simulations, as simulated, and which
     of the violations are not claimed.
 
-    **Raises:** as `falsify`; `ValueError` for a black box, a constraint (`where=`), a priority, a
-    guide or the search `trace_surrogate`, which are dealt with between rounds: use `falsify` with
-    one seed after the other.
+    **Raises:** as `falsify`; `AlwaysRaises` where all of the first simulations raise, so that more
+    of them would say nothing else; `ValueError` for a black box, a constraint (`where=`), a
+    priority, a guide or the search `trace_surrogate`, which are dealt with between rounds: use
+    `falsify` with one seed after the other.
     """
     check_options(budget, 1 if batch is None else batch, 0, None, None)
     search = check_search(problem, search)
@@ -281,7 +283,7 @@ class _WholeRounds:
         keys = [run_keys(int(seed)) for seed in padded]
         state = self._start(jnp.stack([key for key, _ in keys]))
         simulations = jnp.stack([key for _, key in keys])
-        parts, broken, refused = [], [], []
+        parts, broken, refused, raising = [], [], [], Raising()
         failures = np.full((count, self.problem.space.dim), np.nan, np.float32)
         failed = np.zeros(count, bool)
         for first in range(0, rounds, self.rounds):
@@ -290,6 +292,8 @@ class _WholeRounds:
             u, rho, status = (np.asarray(result)[:count] for result in results)
             # The last call may have rounds beyond the budget.
             u, rho, status = (part[:, : (rounds - first) * self.batch] for part in (u, rho, status))
+            raising.add(status.ravel(), None)
+            raising.check(self.problem.name)
             violated = self._violated(u, rho, status, simulations, number)
             unclaimed = np.zeros_like(violated)
             if claims is not None:

@@ -19,6 +19,7 @@ from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.programs import Slot
 from verifai_jax.core.progress import count_done
 from verifai_jax.evaluation.engine import Engine
+from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.claims import SeedClaims
 from verifai_jax.problem.problem import Problem
@@ -64,6 +65,8 @@ def lockstep(
 
     A seed that has found a failure makes no further simulation if `stop_early`. With `claims` a
     failure is what these claim, and the search is told of the others as `falsify` tells it.
+
+    **Raises:** `AlwaysRaises` where all of the first simulations raise.
     """
     cube, n = problem.space.cube, len(seeds)
     keys = [run_keys(int(seed)) for seed in seeds]
@@ -82,7 +85,7 @@ def lockstep(
     differentiated: list[list[bool]] = [[] for _ in range(n)]
     failures = np.full((n, cube.dim), np.nan, np.float32)
     failed = np.zeros(n, bool)
-    proposed = np.zeros(n, int)
+    proposed, raising = np.zeros(n, int), Raising()
     while True:
         u, plan, state = ask(state)
         u, rows, wanted, temperature = map(
@@ -121,6 +124,8 @@ def lockstep(
                 parts.append(engine.evaluate(u[some], own, temperature=temperature[some]))
             count_done(len(seed))
             verdicts = Verdicts.concatenate(parts)
+            raising.add(verdicts.status, verdicts.messages)
+            raising.check(problem.name)
             values[seed, row], valid[seed, row] = verdicts.least, verdicts.proper
             broken[seed, row], clauses[seed, row] = verdicts.violated, verdicts.clauses
             if kind:

@@ -247,7 +247,7 @@ class Rounds:
     def exhausted(self) -> bool:
         """True where a finite search has come to its end."""
         waiting = self._pending is not None or (self._ahead is not None and not self._ahead.empty)
-        return self._proposals.exhausted and not waiting
+        return self._proposals is not None and self._proposals.exhausted and not waiting
 
     @property
     def acceptance(self) -> float | None:

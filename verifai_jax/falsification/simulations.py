@@ -21,7 +21,7 @@ from verifai_jax.core.executors import Executor
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
-from verifai_jax.evaluation.raising import ALIKE, Raising
+from verifai_jax.evaluation.raising import ALIKE, ALWAYS, Raising
 from verifai_jax.evaluation.steering import Steering
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.validation import SLOW
@@ -33,7 +33,7 @@ MOST_DIFFERENTIATED = 16
 """Rows whose clauses are differentiated in one call of the engine."""
 MEASURED = 2
 """First rows of a black box that are timed; in the first one a simulator may prepare itself. More
-follow one by one, up to `ALIKE`, while all raise."""
+follow one by one, up to `ALWAYS`, while all raise."""
 
 
 class Simulations:
@@ -158,8 +158,8 @@ class Simulations:
         """
         engine = self.evaluate.engine
         assert isinstance(engine, HostEngine)
-        points, raising = points[:ALIKE], Raising()
-        together = len(points) if not timed and engine.system.can_simulate_each else 1
+        points, raising = points[:ALWAYS], Raising()
+        together = ALIKE if not timed and engine.system.can_simulate_each else 1
         seconds, parts = float("inf") if len(points) else 0.0, []
         with self._as_in_a_batch(engine, keep_traces=True):
             for row in range(0, len(points), together):

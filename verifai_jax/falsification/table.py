@@ -387,6 +387,8 @@ class ErrorTable(InNotebook):
         return zlib.crc32(json.dumps([names, sorted(checksums.items())]).encode())
 
     def _notebook_parts(self) -> Iterator[str]:
+        if self.changed:
+            return
         # Of a long table a part is read, not all of it.
         rows = next(iter(self.blocks())) if self._segments else self.all
         if len(rows):
@@ -394,6 +396,8 @@ class ErrorTable(InNotebook):
             yield frame_html(failing if len(failing) else rows)
 
     def __repr__(self) -> str:
+        if self.changed:
+            return f"ErrorTable({len(self)} rows that say nothing: {self.damage})"
         counts = self.counts
         safe = len(self) - counts.violating - counts.without_verdict
         return (

@@ -15,6 +15,7 @@ import numpy as np
 
 from verifai_jax.core.figure import Axes, Figure, new_figure
 from verifai_jax.core.text import format_seconds
+from verifai_jax.core.whole_files import replacing
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._explain import Explanation, Node, heading
 from verifai_jax.mtl.evaluate import Evaluator
@@ -108,7 +109,8 @@ def draw(explanation: Explanation, path: str | Path | None = None) -> Figure:
             mew=1.4,
         )
     if path is not None:
-        figure.savefig(path, dpi=130)
+        with replacing(path) as partial:
+            figure.savefig(partial, dpi=130)
     return figure
 
 

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from verifai_jax.core.whole_files import replacing
 from verifai_jax.perception.camera import STATIC, described
 
 FORMAT = "verifai_jax detector 1"
@@ -187,7 +188,7 @@ def save_detector(path: str | Path, network: Detector) -> None:
     }
     about = {"format": FORMAT, "kinds": network.kinds, "shape": list(network.shape)}
     arrays["values"] = np.stack([network.centre, network.scale]).astype(np.float32)
-    with Path(path).open("wb") as file:
+    with replacing(path) as partial, partial.open("wb") as file:
         np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)
 
 

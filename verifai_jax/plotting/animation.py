@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
+from verifai_jax.core.whole_files import replacing
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.plotting.film import LAST, MOST_FRAMES, MOST_WANTED, check_film
 from verifai_jax.plotting.gymnasium_film import episode_of, film_episode
@@ -37,7 +38,8 @@ class Animation:
         _check_gif(path)
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(self.gif)
+        with replacing(path) as partial:
+            partial.write_bytes(self.gif)
         return path
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:

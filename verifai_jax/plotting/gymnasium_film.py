@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
+from verifai_jax.core.whole_files import replacing
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.plotting.film import (
     Frame,
@@ -62,7 +63,8 @@ def film_episode(
 
 def write_episode(replay: Replay, path: Path) -> Path:
     """Write the film of an episode; returns the path."""
-    path.write_bytes(film_episode(replay))
+    with replacing(path) as partial:
+        partial.write_bytes(film_episode(replay))
     return path
 
 

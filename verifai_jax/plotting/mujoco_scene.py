@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Int, UInt8
 
 from verifai_jax.core.errors import require
+from verifai_jax.core.whole_files import replacing
 from verifai_jax.plotting.film import BACKGROUND, Frame, check_film, film_samples, gif, labelled
 from verifai_jax.plotting.mujoco_motion import Motion
 from verifai_jax.plotting.mujoco_view import best_view, named_view
@@ -66,7 +67,8 @@ def film(
         for frame, sample in zip(plain, samples.tolist(), strict=True)
     ]
     path = _folder_of(path)
-    path.write_bytes(gif(drawn, shown))
+    with replacing(path) as partial:
+        partial.write_bytes(gif(drawn, shown))
     return path
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from verifai_jax.core import figure
 from verifai_jax.core.figure import Axes, Figure
 from verifai_jax.core.text import shorten
+from verifai_jax.core.whole_files import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axis import Axis
@@ -47,7 +48,8 @@ def show_or_save(drawn: Figure, path: str | Path | None) -> Figure:
     """
     _wrap_texts(drawn)
     if path is not None:
-        drawn.savefig(path)
+        with replacing(path) as partial:
+            drawn.savefig(partial)
     return drawn
 
 

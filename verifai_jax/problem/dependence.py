@@ -29,8 +29,14 @@ from jaxtyping import Array, Key, PyTree
 
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import Slot
-from verifai_jax.core.steps import PROGRAM, as_function, of_some, used_inputs, without_unused
-from verifai_jax.core.user_errors import source_line
+from verifai_jax.core.steps import (
+    as_function,
+    describe_step,
+    of_some,
+    programs_in,
+    used_inputs,
+    without_unused,
+)
 from verifai_jax.problem.problem import Problem
 
 
@@ -158,7 +164,7 @@ class _Sweep:
         if name == "cond":
             branches = [self(_program(each), moved[1:]) for each in options["branches"]]
             return [any(each) for each in zip(*branches, strict=True)]
-        if name.startswith("scatter") or (_is_of_jax(step) and not _nested(step)):
+        if name.startswith("scatter") or (_is_of_jax(step) and not programs_in(step)):
             return [name not in _FLAT] * len(step.outvars)
         return self.differentiated(program, step, moved)
 
@@ -180,7 +186,7 @@ class _Sweep:
             derivative = jax.make_jaxpr(along)(forms, [forms[i] for i in places]).jaxpr
         except Exception:
             # JAX says by errors of many kinds that there is none, each operation by its own.
-            self.lacking.setdefault(_described(step))
+            self.lacking.setdefault(describe_step(step))
             return [False] * len(step.outvars)
         # All that it is computed from in any way: the derivative is linear in the direction.
         reached = set(derivative.invars[len(inputs) :])
@@ -227,30 +233,12 @@ def _is_of_jax(step: Any) -> bool:
     )
 
 
-def _described(step: Any) -> str:
-    """Write a step for people: its operation, the function that it calls, and the user's line."""
-    called = step.params.get("callback")
-    name = getattr(getattr(called, "callback_func", called), "__name__", "")
-    named = f" of {name}" if name and not name.startswith("<") else ""
-    line = source_line(getattr(step.source_info, "traceback", None))
-    return f"{step.primitive.name}{named}{'' if line is None else f' ({line})'}"
-
-
 def _operands_of_scan(options: dict[str, Any]) -> tuple[int, int]:
     """Return how many operands of a scan are constants and how many are carried."""
     if "ft_in" in options:  # JAX 0.12 groups the operands, versions before it count them.
         constants, carried, _ = options["ft_in"].unpack()
         return len(constants), len(carried)
     return options["num_consts"], options["num_carry"]
-
-
-def _nested(step: Any) -> bool:
-    """Return whether a step has programs among its parameters."""
-    kinds = (jax.extend.core.Jaxpr, PROGRAM)
-    leaves = jax.tree.leaves(
-        list(step.params.values()), is_leaf=lambda each: isinstance(each, kinds)
-    )
-    return any(isinstance(each, kinds) for each in leaves)
 
 
 def _program(program: Any) -> jax.extend.core.Jaxpr:

@@ -23,6 +23,7 @@ from verifai_jax.core.notebook import InNotebook, text_html
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import ProgramCache, Slot
 from verifai_jax.core.sources import Maker, Sources, made_here, sources_of
+from verifai_jax.core.steps import alone_only, describe_step
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.user_errors import (
     check_called_with,
@@ -320,7 +321,30 @@ class Problem(InNotebook):
                 f"the system of problem {self.name!r} must return a Trace; "
                 f"it returned {type(trace).__name__}{defined_at(function)}"
             )
+        own = type(getattr(self.system, "function", self.system))
+        if not self.black_box and getattr(own, "abstract", System.abstract) is System.abstract:
+            self._check_batches(features)
         return trace
+
+    def _check_batches(self, features: Mapping[str, Any]) -> None:
+        """Refuse a system with a step that JAX takes for one simulation at a time only."""
+        key = jax.eval_shape(lambda: jax.random.key(0))
+        # Traced already, for its form.
+        program = jax.make_jaxpr(self.system)(features, key).jaxpr
+        for step, error in alone_only(program):
+            does = step.primitive.name
+            said = str(error).strip().partition("\n")[0].rstrip(".")
+            if does == "pure_callback":
+                said, cure = "it has no vmap_method", "give it vmap_method='sequential'"
+            elif does == "io_callback" and step.params.get("ordered"):
+                cure = "write ordered=False"
+            else:
+                cure = "give the operation a rule for jax.vmap"
+            raise ProblemError(
+                f"the system of problem {self.name!r} cannot be simulated in batches: "
+                f"{describe_step(step)} is for one simulation at a time ({said}); {cure}, or make "
+                "the system a vj.blackbox, which JAX does not trace"
+            ) from error
 
     def _wrong_system(self, error: Exception, features: Mapping[str, Any]) -> ProblemError:
         native = "native" in self.system.backends and self.system.backend != "native"

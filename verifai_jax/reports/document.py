@@ -13,6 +13,7 @@ from verifai_jax.comparison.result import Comparison
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.whole_files import replacing
 from verifai_jax.estimation.result import Estimate
 from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
@@ -61,7 +62,8 @@ def write_report(
     **Returns:** the path of the HTML file.
 
     **Raises:** `UnknownNameError` for a unit or a reason of a feature that there is not;
-    `ValueError` for a number of simulations that is none;
+    `ValueError` for a number of simulations that is none, and for a run whose rows have changed
+    since they were written;
     `TypeError` for something that is no result.
     """
     path, about = Path(path), About(units or {}, reasons or {})
@@ -69,6 +71,11 @@ def write_report(
         check_count("modes", modes)
     match result:
         case Run():
+            if result.table.changed:
+                raise ValueError(
+                    f"no report is written on the run of {result.name!r}, whose rows would be its "
+                    f"evidence: {result.damage}"
+                )
             space = result.problem.space if result.problem else None
             _check(about, space, result.table.features)
             page = run_page(result, about, traces, studies, modes)
@@ -87,9 +94,11 @@ def write_report(
                 f"a report is on a run, a sweep, an estimate or a comparison; got {kind}"
             )
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(render(page), encoding="utf-8", newline="\n")
+    with replacing(path) as partial:
+        partial.write_text(render(page), encoding="utf-8", newline="\n")
     claims = json.dumps(page.claims, indent=2, allow_nan=False)
-    claims_path(path).write_text(claims + "\n", encoding="utf-8", newline="\n")
+    with replacing(claims_path(path)) as partial:
+        partial.write_text(claims + "\n", encoding="utf-8", newline="\n")
     return path
 
 

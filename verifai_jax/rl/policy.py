@@ -27,6 +27,7 @@ from verifai_jax.core.checks import check_count, is_number
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.sources import made_here, sources_of
 from verifai_jax.core.text import one_line
+from verifai_jax.core.whole_files import replacing
 from verifai_jax.rl.task.task import Action, Continuous, Discrete
 
 Layer = tuple[Float[Array | np.ndarray, "... _ _"], Float[Array | np.ndarray, "... _"]]
@@ -196,7 +197,9 @@ def save_policy(
     for name in ("mean", "scale", "log_std"):
         if (value := getattr(policy, name)) is not None:
             arrays[name] = np.float32(value)
-    np.savez_compressed(path, **arrays)
+    path = Path(path)
+    with replacing(path if path.suffix == ".npz" else Path(f"{path}.npz")) as partial:
+        np.savez_compressed(partial, **arrays)
 
 
 def load_policy(path: str | Path) -> Policy:

@@ -12,7 +12,7 @@ is not simulated, and its robustness is infinite.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -116,12 +116,13 @@ class FeatureParameters:
         self.environment = FeatureSpace(others) if others else None
         self.free = np.array(self.space.levels) == 0
         self.differentiable = gradient and not problem.black_box and bool(self.free.any())
-        self._values = Evaluator(problem, batch, precision=precision, seed=seed)
+        evaluator = partial(Evaluator, problem, batch, precision=precision, ends_raising=True)
+        self._values = evaluator(seed=seed)
         self._slopes = None
         if self.differentiable:
             # Other random numbers than those of the verdicts.
             other = (seed + 1) % 2**63
-            self._slopes = Evaluator(problem, batch, gradient=True, precision=precision, seed=other)
+            self._slopes = evaluator(gradient=True, seed=other)
         self.without_verdict = 0
         self.nominal: dict[str, Any] = {}
         self.start: Float[np.ndarray, " p"] | None = None

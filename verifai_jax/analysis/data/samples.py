@@ -81,7 +81,8 @@ class Samples:
           robustness, are columns too, but only if named here.
         - `space`: says which columns are ordered and what their ranges are; a run knows its own.
 
-        **Raises:** `TypeError` for another source; `ValueError` for another `which`, no rows,
+        **Raises:** `TypeError` for another source; `ValueError` for another `which`, rows of a run
+        that have changed since they were written, no rows,
         row numbers that are not unique integers, unknown columns (with the nearest names), or
         columns named twice.
         """
@@ -93,6 +94,12 @@ class Samples:
         if which not in WHICH:
             raise ValueError(f"which must be one of {', '.join(map(repr, WHICH))}; got {which!r}")
         name = "table"
+        rows = source.table if isinstance(source, Run) else source
+        if isinstance(rows, ErrorTable) and rows.changed:
+            raise ValueError(
+                f"rows that have changed say nothing: {rows.damage}. Their DataFrame, .table.all, "
+                "is analysed as it is"
+            )
         if isinstance(source, Run):
             name, table = source.name, source.table.all
             space = space if space is not None or source.problem is None else source.problem

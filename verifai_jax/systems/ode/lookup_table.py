@@ -128,6 +128,8 @@ class LookupTable:
 
 
 def _real(values: Any, what: str) -> np.ndarray:
+    if np.ma.is_masked(values):
+        raise ValueError(f"{what} must be numbers; one of {np.size(values)} is masked")
     try:
         return np.asarray(values, float)
     except (TypeError, ValueError):
