@@ -15,12 +15,13 @@ import verifai_jax as vj
 from verifai_jax.cli.main import main
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.mtl import parse
+from verifai_jax.mtl.english import formula_words
 from verifai_jax.reports import write_report
 from verifai_jax.reports.commands import run_command
 from verifai_jax.reports.markup import data_block, element
 from verifai_jax.reports.provenance import Input, chained
 from verifai_jax.reports.view import MOST_ROWS, numbers_of, view_data
-from verifai_jax.reports.words import domain_words, formula_words
+from verifai_jax.reports.words import domain_words
 
 HOSTILE = "<script>alert(1)</script>"
 

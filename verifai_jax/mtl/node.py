@@ -38,8 +38,8 @@ class Node(ForUsers):
 
     _internal = frozenset((
         "below", "children", "compared", "depth", "first_look_ahead", "interval", "is_predicate",
-        "is_signal", "meaning", "operands", "operator", "side", "span", "temporal_depth", "terms",
-        "text", "valued", "word",
+        "is_signal", "meaning", "number", "operands", "operator", "side", "span", "temporal_depth",
+        "terms", "text", "valued", "word",
     ))  # fmt: skip
 
     def below(self) -> tuple["Node", ...]:

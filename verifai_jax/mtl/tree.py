@@ -24,6 +24,11 @@ class Term(Node, abc.ABC):
         """True for a signal or one component of it."""
         return False
 
+    @property
+    def number(self) -> float | None:
+        """The value of a number; None for any other expression."""
+        return None
+
     def signals(self) -> tuple[str, ...]:
         """Return the names of the signals in it, in order of appearance."""
         return ()

@@ -10,10 +10,11 @@ from verifai_jax.core.text import format_seconds, one_line
 from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import parse
+from verifai_jax.mtl.english import formula_words
 from verifai_jax.problem.problem import Problem
 from verifai_jax.reports.markup import Child, Markup, element, paragraph, table
 from verifai_jax.reports.page import Section
-from verifai_jax.reports.words import domain_words, formula_words, number
+from verifai_jax.reports.words import domain_words, number
 
 ENDS = {
     "hold": "After the end of a trace its last sample counts as if it went on for ever.",

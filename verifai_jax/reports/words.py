@@ -1,7 +1,5 @@
-"""Formulas, domains and values in words, for readers who know neither notation.
+"""Domains and values in English, for readers who do not know their notation.
 
-formula_words(parse("always[0, 4] abs(x) <= 2.4"))
-# 'at all times from 0 s to 4 s, abs(x) is at most 2.4'
 domain_words(Box(-1, 1))                            # 'uniform between -1 and 1'
 """
 
@@ -13,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from verifai_jax.core.text import format_percent, format_seconds, one_line
+from verifai_jax.core.text import format_percent, one_line
 from verifai_jax.features import Domain
 from verifai_jax.features.arrays import Array, VariableArray
 from verifai_jax.features.box import Box, DiscreteBox
@@ -26,84 +24,9 @@ from verifai_jax.features.families import Exponential, LogNormal, Triangular, We
 from verifai_jax.features.fixed import Fixed
 from verifai_jax.features.signal import Signal
 from verifai_jax.features.tabulated import Beta, Empirical, Gamma
-from verifai_jax.mtl import Formula
-from verifai_jax.mtl.formula import Atom, Interval, Predicate, surface
-from verifai_jax.mtl.formula import Constant as Truth
 
-COMPARISONS = {
-    "<=": "is at most",
-    "<": "is below",
-    ">=": "is at least",
-    ">": "is above",
-    "==": "equals",
-    "!=": "differs from",
-}
-"""Each comparison of signals as it is read."""
-UNARY = {
-    "always": "at all times{span}, {0}",
-    "eventually": "at some time{span}, {0}",
-    "historically": "at all times until now{back}, {0}",
-    "once": "at some time until now{back}, {0}",
-    "next": "at the next sample, {0}",
-    "prev": "at the previous sample, {0}",
-    "weak_prev": "at the previous sample, if there is one, {0}",
-    "not": "it is not so that {0}",
-}
-"""Operators of one part as they are read."""
-BINARY = {
-    "until": "{0} until, at some time{span}, {1}",
-    "weak_until": "{0} until {1}{within}, or all the time",
-    "release": "{1} until {0} frees it{within}, or all the time",
-    "since": "{0} since, at some time{back}, {1}",
-    "implies": "whenever {0}, {1}",
-    "iff": "{0} exactly when {1}",
-    "xor": "either {0} or {1}, and not both",
-}
-"""Operators of two parts as they are read."""
 MOST_CHOICES = 12
 """Choices that are listed one by one."""
-
-
-def formula_words(formula: Formula) -> str:
-    """Write a formula in words."""
-    return _words(formula, inner=False)
-
-
-def _words(formula: Formula, inner: bool) -> str:
-    match formula:
-        case Truth():
-            return "anything is allowed" if formula.value else "nothing is allowed"
-        case Predicate():
-            comparison = COMPARISONS.get(formula.comparison, formula.comparison)
-            return f"{formula.left} {comparison} {formula.right}"
-        case Atom():
-            return f"{formula.expression} is positive"
-    word, operands, interval = surface(formula)
-    parts = [_words(part, inner=True) for part in operands]
-    spans = {"span": _span(interval), "within": _span(interval), "back": _back(interval)}
-    if word in ("and", "or"):
-        text = f" {word} ".join(parts)
-    elif len(parts) == 1:
-        text = UNARY[word].format(*parts, **spans)
-    else:
-        text = BINARY[word].format(*parts, **spans)
-    return f"({text})" if inner else text
-
-
-def _span(interval: Interval | None) -> str:
-    if interval is None or interval.everything:
-        return ""
-    if interval.end == math.inf:
-        return f" from {format_seconds(interval.start)} on"
-    return f" from {format_seconds(interval.start)} to {format_seconds(interval.end)}"
-
-
-def _back(interval: Interval | None) -> str:
-    if interval is None or interval.everything:
-        return ""
-    if interval.end == math.inf:
-        return f", {format_seconds(interval.start)} ago or earlier"
-    return f", {format_seconds(interval.start)} to {format_seconds(interval.end)} ago"
 
 
 def domain_words(domain: Domain) -> str:
