@@ -21,7 +21,6 @@ from verifai_jax.reports.commands import run_command
 from verifai_jax.reports.markup import data_block, element
 from verifai_jax.reports.provenance import Input, chained
 from verifai_jax.reports.view import MOST_ROWS, numbers_of, view_data
-from verifai_jax.reports.words import domain_words
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -259,7 +258,7 @@ def test_formulas_in_words(text, words):
     ],
 )
 def test_priors_in_words(domain, words):
-    assert domain_words(domain) == words
+    assert domain.words() == words
 
 
 def test_the_chain_depends_on_every_input_and_their_order():

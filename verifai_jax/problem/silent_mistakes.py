@@ -22,8 +22,7 @@ from verifai_jax.core.programs import Slot
 from verifai_jax.core.steps import PROGRAM, used_inputs
 from verifai_jax.core.text import format_seconds
 from verifai_jax.core.user_errors import source_line
-from verifai_jax.features import Categorical, Domain
-from verifai_jax.features.compound import Struct
+from verifai_jax.features import Domain
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import System
 
@@ -148,7 +147,7 @@ def _unread(problem: Problem, program: Program, features: PyTree) -> Iterator[st
         one = len(unread) == 1
         more = f" and {len(unread) - 6} more" if len(unread) > 6 else ""
         domains = [problem.space.domains[names[0]] for names in unread]
-        texts = any(isinstance(d, Categorical) and not d.numeric for d in domains)
+        texts = not all(domain.numeric for domain in domains)
         yield (
             f"feature{'' if one else 's'} {shown}{more} influence{'s' if one else ''} no signal "
             f"that the property speaks of ({', '.join(problem.monitored)}): "
@@ -170,10 +169,9 @@ def _order(problem: Problem) -> Iterator[tuple[str, ...]]:
     """Yield the names of all features that vary, fields of structures one by one."""
 
     def below(names: tuple[str, ...], domain: Domain) -> Iterator[tuple[str, ...]]:
-        if isinstance(domain, Struct):
-            for name, part in domain.fields:
-                yield from below((*names, name), part)
-        elif domain.size:
+        for name, part in domain.named:
+            yield from below((*names, name), part)
+        if domain.size and not domain.named:
             yield names
 
     return below((), problem.space.root)
