@@ -15,7 +15,6 @@ from verifai_jax.mtl import parse
 from verifai_jax.problem.silent_mistakes import (
     _programs,
     difference,
-    first_look_ahead,
     silent_mistakes,
 )
 
@@ -119,7 +118,7 @@ def test_a_state_of_a_loop_that_is_not_monitored():
     ],
 )
 def test_the_first_look_ahead(spec, seconds):
-    assert first_look_ahead(parse(spec), 0.1) == pytest.approx(seconds)
+    assert parse(spec).first_look_ahead(0.1) == pytest.approx(seconds)
 
 
 def test_a_formula_that_looks_beyond_the_trace():

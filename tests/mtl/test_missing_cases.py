@@ -13,8 +13,8 @@ from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl import parse
 from verifai_jax.mtl.clauses import goals_of
+from verifai_jax.mtl.english import formula_words
 from verifai_jax.mtl.rewriting import nnf, simplify
-from verifai_jax.reports.words import formula_words
 
 TRACE = Trace({"x": np.arange(4.0)}, dt=1.0)
 

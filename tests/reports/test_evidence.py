@@ -15,12 +15,12 @@ import verifai_jax as vj
 from verifai_jax.cli.main import main
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.mtl import parse
+from verifai_jax.mtl.english import formula_words
 from verifai_jax.reports import write_report
 from verifai_jax.reports.commands import run_command
 from verifai_jax.reports.markup import data_block, element
 from verifai_jax.reports.provenance import Input, chained
 from verifai_jax.reports.view import MOST_ROWS, numbers_of, view_data
-from verifai_jax.reports.words import domain_words, formula_words
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -258,7 +258,7 @@ def test_formulas_in_words(text, words):
     ],
 )
 def test_priors_in_words(domain, words):
-    assert domain_words(domain) == words
+    assert domain.words() == words
 
 
 def test_the_chain_depends_on_every_input_and_their_order():

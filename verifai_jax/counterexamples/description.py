@@ -9,8 +9,8 @@ from verifai_jax.core.text import format_seconds
 from verifai_jax.counterexamples.influence import Influence, Span
 from verifai_jax.mtl import Explanation, robustness_signal
 from verifai_jax.mtl._explain import heading
-from verifai_jax.mtl.expression import Number
-from verifai_jax.mtl.formula import Atom, Formula, Predicate, Term
+from verifai_jax.mtl.formula import Formula, Term
+from verifai_jax.mtl.formula import formula as as_formula
 
 MUST = {
     "<": "has to be below",
@@ -76,39 +76,37 @@ def describe_verdict(name: str, row: int, why: Explanation) -> str:
     first = f"Row {row} of {name} breaks  {formula}  with robustness {why.robustness:z.4g}"
     predicate = why.predicate
     broken = f"at {at}  {predicate}  decides"
-    if isinstance(predicate, Predicate):
+    if predicate.compared:
         broken = describe_predicate(predicate, why, at)
     parts = [heading(node.formula) for node in why.path[:-1]]
     path = f", by way of {' > '.join(parts)}" if len(parts) > 1 else ""
     return f"{first}: {broken}{path}."
 
 
-def describe_predicate(predicate: Predicate, why: Explanation, at: str) -> str:
-    """Write how a predicate decides: `at 17.9 s speed is 120.4, which has to be below 120`."""
-    left = value_at(predicate.left, why)
-    if not isinstance(predicate.right, Number):
-        right = value_at(predicate.right, why)
-        shown, bound = format_apart(left, right)
-        sides = f"at {at} {predicate.left} is {shown} and {predicate.right} is {bound}"
+def describe_predicate(predicate: Formula, why: Explanation, at: str) -> str:
+    """Write how a comparison decides: `at 17.9 s speed is 120.4, which has to be below 120`."""
+    assert predicate.compared is not None
+    left, comparison, right = predicate.compared
+    value, must = value_at(left, why), MUST.get(comparison, f"has to be {comparison}")
+    if right.number is None:
+        shown, bound = format_apart(value, value_at(right, why))
+        sides = f"at {at} {left} is {shown} and {right} is {bound}"
         if why.path[-1].robustness < 0:
-            must = MUST.get(predicate.comparison, f"has to be {predicate.comparison}")
-            return f"{sides}; {predicate.left} {must} it"
+            return f"{sides}; {left} {must} it"
         return f"{sides}: {predicate} holds where it must not"
-    shown, bound = format_apart(left, predicate.right.value)
+    shown, bound = format_apart(value, right.number)
     if why.path[-1].robustness <= 0:
-        must = MUST.get(predicate.comparison, f"has to be {predicate.comparison}")
-        return f"at {at} {predicate.left} is {shown}, which {must} {bound}"
-    return f"at {at} {predicate.left} is {shown}: {predicate} holds where it must not"
+        return f"at {at} {left} is {shown}, which {must} {bound}"
+    return f"at {at} {left} is {shown}: {predicate} holds where it must not"
 
 
 def value_at(expression: Term, why: Explanation) -> float:
     """Return the value of an expression at the instant that decides."""
-    formula: Formula = Atom(expression)
     trace = why.trace.finely()
-    place = int(np.argmin(np.abs(trace.clock() - why.time)))
+    sample = int(np.argmin(np.abs(trace.clock() - why.time)))
     # Only the value is wanted, so that the clock may be any.
-    signal = robustness_signal(formula, replace(trace, dt=1.0, times=None))
-    return float(np.asarray(signal)[place])
+    signal = robustness_signal(as_formula(expression), replace(trace, dt=1.0, times=None))
+    return float(np.asarray(signal)[sample])
 
 
 def describe_reversals(matter: Sequence[Influence], rho: float) -> list[str]:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.features import Domain, Signal
+from verifai_jax.features import Domain
 
 
 class Span(NamedTuple):
@@ -21,10 +21,11 @@ def spans_of(domain: Domain, duration: float) -> tuple[Span, ...] | None:
 
     A point between two lines acts from the point before to the one behind; see `Signal.spans`.
     """
-    if not isinstance(domain, Signal):
+    spans = domain.spans(duration)
+    if spans is None:
         return None
-    spans = [Span(*span) for span in domain.spans(duration)]
-    return tuple(span for span in spans for _ in range(domain.domain.size))
+    each = domain.size // len(spans)
+    return tuple(Span(*span) for span in spans for _ in range(each))
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, PyTree
+from jaxtyping import Bool, Float, Int
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.errors import check_names
-from verifai_jax.features import Domain, FeatureSpace, Signal
-from verifai_jax.features.continuous import Continuous
+from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
 
@@ -65,7 +64,7 @@ class Nominal:
         # What a view of the space holds fixed is not said again.
         features = space.coerce({name: whole[name] for name in varied})
         for name in varied:
-            _check_reachable(space.domains[name], features[name], name)
+            space.domains[name].check_reachable(features[name], f"the nominal value of {name}")
         return cls(space, np.asarray(space.point_of(features), np.float32))
 
     def restrict_to_side(self, u: Float[np.ndarray, " d"]) -> "Nominal":
@@ -209,12 +208,3 @@ class Nominal:
     def distance(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
         """Return the Euclidean length of the departure."""
         return np.sqrt((self.gaps(points) ** 2).sum(axis=1))
-
-
-def _check_reachable(domain: Domain, value: PyTree, name: str) -> None:
-    """Refuse a nominal value so far in a tail that no point of the cube is near it."""
-    if isinstance(domain, Continuous):
-        domain.check_reachable(float(np.asarray(value)), f"the nominal value of {name}")
-    elif isinstance(domain, Signal) and isinstance(domain.domain, Continuous):
-        for knot in np.asarray(value.knots).ravel():
-            domain.domain.check_reachable(float(knot), f"the nominal value of {name}")

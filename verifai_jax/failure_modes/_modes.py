@@ -52,7 +52,6 @@ from verifai_jax.falsification import simulate
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.validation import check_options
 from verifai_jax.features import FeatureSpace
-from verifai_jax.mtl.formula import Predicate
 from verifai_jax.problem.dependence import depends_on_key, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.binomial import clopper_pearson
@@ -408,6 +407,6 @@ def _cause(numbers: _Numbers, features: dict[str, Any], key: Any, number: int) -
         return rho, ""
     at = format_seconds(why.time, 4)
     predicate = why.predicate
-    if isinstance(predicate, Predicate):
+    if predicate.compared:
         return rho, describe_predicate(predicate, why, at)
     return rho, f"at {at} {predicate} decides"

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from verifai_jax.core.trace import Trace
-from verifai_jax.mtl.formula import Formula, Interval, Next, Prev
+from verifai_jax.mtl.formula import Formula
 
 SAMPLES = 256
 """Samples of a signal that are modelled; those between are interpolated."""
@@ -114,11 +114,6 @@ def _bounds(formulas: Iterable[Formula], dt: float) -> list[int]:
     """Return the finite bounds of all windows in samples; those of one sample for "next"."""
     bounds = []
     for formula in formulas:
-        for part in formula.subformulas():
-            if isinstance(part, Next | Prev):
-                bounds.append(1)
-            window = getattr(part, "interval", None)
-            for bound in (window.start, window.end) if isinstance(window, Interval) else ():
-                if math.isfinite(bound):
-                    bounds.append(round(bound / dt))
+        for part in formula.subformulas(valued=True):
+            bounds.extend(round(bound / dt) for bound in part.span(dt) if math.isfinite(bound))
     return bounds

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int, PyTree
 
 from verifai_jax.core.waveform import Waveform
 from verifai_jax.features.domain import Domain, Row, as_numbers, cell, centre, dotted, indexed
+from verifai_jax.features.facts import Facts, integer_facts
 
 
 @dataclass(frozen=True, repr=False)
@@ -30,6 +31,8 @@ class Array(Domain):
     **Raises:** `ValueError` for a length that is not a positive integer, or a pair that is not
     `0 <= least <= most` with `most >= 1`; `TypeError` for something that is no domain.
     """
+
+    arguments = ("domain", "length")
 
     domain: Domain
     length: int
@@ -117,6 +120,16 @@ class Array(Domain):
 
     def refine(self, value: PyTree, factor: int) -> PyTree:
         return jax.vmap(lambda item: self.domain.refine(item, factor), axis_size=self.length)(value)
+
+    def words(self) -> str:
+        return f"{self.length} items, each {self.domain.words()}"
+
+    @property
+    def uniform(self) -> bool:
+        return self.domain.uniform
+
+    def parts(self, name: str) -> tuple[tuple[str, Domain], ...]:
+        return tuple((item, self.domain) for item in indexed(name, self.length))
 
     def __repr__(self) -> str:
         return f"Array({self.domain!r}, length={self.length})"
@@ -325,6 +338,16 @@ class VariableArray(Domain):
     @property
     def _absent_unit(self) -> Float[jax.Array, " size"]:
         return self.domain.to_unit(self._absent)
+
+    def words(self) -> str:
+        return f"{self.least} to {self.most} items, each {self.domain.words()}"
+
+    def parts(self, name: str) -> tuple[tuple[str, Domain], ...]:
+        return tuple((item, self.domain) for item in indexed(name, self.most))
+
+    def facts(self, name: str) -> Facts:
+        length = {**integer_facts(self.least, self.most), "length": True}
+        return {**({f"{name}.length": length} if self._varies else {}), **super().facts(name)}
 
     def __repr__(self) -> str:
         return f"Array({self.domain!r}, length=({self.least}, {self.most}))"

@@ -16,6 +16,7 @@ from verifai_jax.core.events import ABSENT, Events
 from verifai_jax.features.domain import Domain, Row, as_real, cell, centre, dotted, indexed
 from verifai_jax.features.event_descriptions import describe_event, read_event
 from verifai_jax.features.event_tables import EventTables
+from verifai_jax.features.facts import Facts, integer_facts, joined_facts
 from verifai_jax.features.transitions import Graph, Transition, check_states, unfold
 from verifai_jax.features.written_events import WrittenEvents, where_there
 
@@ -354,6 +355,18 @@ class Automaton(Domain):
 
     def from_columns(self, row: Row, name: str) -> Events:
         return self._written.from_columns(row, name)
+
+    def facts(self, name: str) -> Facts:
+        """Return what is known of the events' columns: kinds, and bounds over all their kinds."""
+        found = {f"{name}.length": {**integer_facts(0, self.most), "length": True}}
+        for item in indexed(name, self.most):
+            # An absent event is a choice of its own.
+            found[f"{item}.kind"] = {"ordered": False, "choices": (*self.names, "")}
+            for each in self.transitions:
+                for part, own in (("wait", each.wait), *each.parameters):
+                    for column, known in own.facts(f"{item}.{part}").items():
+                        found[column] = joined_facts(found.get(column), known)
+        return found
 
     def __repr__(self) -> str:
         events = ", ".join(describe_event(each) for each in self.transitions)

@@ -18,6 +18,7 @@ from verifai_jax.features.domain import (
     Domain,
     Numbers,
     Row,
+    Tuning,
     as_number,
     as_numbers,
     as_real,
@@ -37,6 +38,8 @@ from verifai_jax.features.ends import (
     replace_where,
     round_inwards,
 )
+from verifai_jax.features.english import numbers
+from verifai_jax.features.facts import Facts, integer_facts
 
 NARROW = 16
 """Roundings across a box up to which the map from the unit cube may step over an end."""
@@ -60,6 +63,8 @@ class Box(Domain):
     **Raises:** `ValueError` for ends that are reversed, equal (use `Constant`), not finite,
     farther apart or nearer than float32 can hold, or of different lengths; for an unknown `closed`.
     """
+
+    arguments = ("low", "high")
 
     low: float | Sequence[float] | np.ndarray
     high: float | Sequence[float] | np.ndarray
@@ -177,6 +182,28 @@ class Box(Domain):
         ends = (low, high, low + (high - low) / 2, high - low)
         return tuple(np.asarray(end, dtype) for end in ends)  # pyright: ignore[reportReturnType]
 
+    def words(self) -> str:
+        return f"uniform between {numbers(self.low)} and {numbers(self.high)}"
+
+    @property
+    def uniform(self) -> bool:
+        return True
+
+    @property
+    def tuning(self) -> Tuning:
+        low, high = self.low, self.high
+        if self.closed != "both":
+            low, high = (end.tolist() for end in self.ends(np.float64))
+        return Tuning("linear", low, high)
+
+    def facts(self, name: str) -> Facts:
+        known = {"ordered": True, "integer": False, "uniform": True}
+        ends = zip(np.ravel(self.low), np.ravel(self.high), strict=True)
+        return {
+            column: {**known, "bounds": end, "range": end}
+            for column, end in zip(self.columns(name), ends, strict=True)
+        }
+
     def __repr__(self) -> str:
         closed = "" if self.closed == "both" else f", closed={self.closed!r}"
         return f"Box({short(self.low)}, {short(self.high)}{closed})"
@@ -196,6 +223,8 @@ class DiscreteBox(Domain):
     **Raises:** `ValueError` for ends that are no integers, reversed, of different lengths, beyond
     32 bits, or with more than 2^20 values between them.
     """
+
+    arguments = ("low", "high")
 
     low: int | Sequence[int] | np.ndarray
     high: int | Sequence[int] | np.ndarray
@@ -288,6 +317,25 @@ class DiscreteBox(Domain):
         """Return the lower ends and the numbers of values."""
         low = np.asarray(self.low, np.int32)
         return low, np.asarray(self.levels, np.int32).reshape(low.shape)
+
+    def words(self) -> str:
+        ends = f"{numbers(self.low)} to {numbers(self.high)}"
+        return f"the integers from {ends}, all equally probable"
+
+    @property
+    def uniform(self) -> bool:
+        return True
+
+    @property
+    def tuning(self) -> Tuning:
+        return Tuning("integer", self.low, self.high)
+
+    def facts(self, name: str) -> Facts:
+        ends = zip(np.ravel(self.low).tolist(), np.ravel(self.high).tolist(), strict=True)
+        return {
+            column: integer_facts(low, high)
+            for column, (low, high) in zip(self.columns(name), ends, strict=True)
+        }
 
     def __repr__(self) -> str:
         return f"DiscreteBox({short(self.low)}, {short(self.high)})"

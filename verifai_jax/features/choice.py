@@ -12,12 +12,14 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree, Shaped
 
 from verifai_jax.core.checks import check_name
+from verifai_jax.core.text import format_percent
 from verifai_jax.features.domain import (
     MOST_LEVELS,
     MOST_REAL,
     Domain,
     Numbers,
     Row,
+    Tuning,
     as_number,
     as_numbers,
     as_real,
@@ -30,6 +32,11 @@ from verifai_jax.features.domain import (
     short,
     without_objects,
 )
+from verifai_jax.features.english import number
+from verifai_jax.features.facts import Facts
+
+MOST_CHOICES = 12
+"""Choices that English lists one by one: more make no sentence that anybody reads."""
 
 
 @dataclass(frozen=True, init=False, repr=False)
@@ -258,6 +265,33 @@ class Categorical(Domain):
         place = int(np.argmin(np.abs(numbers - value)))
         return place if np.float32(numbers[place]) == np.float32(value) else None
 
+    def words(self) -> str:
+        chances = self.probabilities
+        choices = [number(choice) for choice in self.choices]
+        if chances is not None:
+            choices = [
+                f"{choice} ({format_percent(float(chance))})"
+                for choice, chance in zip(choices, chances, strict=True)
+            ]
+        listed = ", ".join(choices[:MOST_CHOICES])
+        more = f", and {len(choices) - MOST_CHOICES} more" if len(choices) > MOST_CHOICES else ""
+        return f"one of {listed}{more}" + ("" if chances is not None else ", all equally probable")
+
+    @property
+    def uniform(self) -> bool:
+        return self.probabilities is None
+
+    @property
+    def tuning(self) -> Tuning:
+        return Tuning("choice", choices=self.choices)
+
+    def facts(self, name: str) -> Facts:
+        count, weights = len(self.choices), self.probabilities
+        prior = tuple(float(weight) for weight in weights) if weights else (1 / count,) * count
+        # As the table shows them, in the order of the space.
+        choices = self.choices if self.numeric else tuple(map(str, self.choices))
+        return {name: {"ordered": False, "choices": choices, "prior": prior}}
+
     def __repr__(self) -> str:
         weights = ""
         if self.probabilities is not None:
@@ -291,6 +325,8 @@ class Constant(Domain):
 
     **Raises:** `ValueError` for a number that is not finite, or a value of another kind.
     """
+
+    arguments = ("value",)
 
     value: float | bool | str | PyTree
 
@@ -352,6 +388,17 @@ class Constant(Domain):
             return jnp.asarray(0, jnp.int32)
         kind = np.asarray(self.value).dtype.kind
         return jnp.asarray(self.value, {"b": bool, "i": jnp.int32}.get(kind, real))
+
+    def words(self) -> str:
+        return f"always {number(self.value)}"
+
+    @property
+    def uniform(self) -> bool:
+        return True
+
+    @property
+    def held_at(self) -> PyTree:
+        return self.value
 
     def __repr__(self) -> str:
         return f"Constant({short(self.value)})"

@@ -216,6 +216,20 @@ class Struct(Domain):
     def _dotted_names(self, name: str) -> list[str]:
         return [dotted(name, field) for field, _ in self.fields]
 
+    def words(self) -> str:
+        return "; ".join(f"{name}: {field.words()}" for name, field in self.fields)
+
+    @property
+    def uniform(self) -> bool:
+        return all(part.uniform for _, part in self.fields)
+
+    @property
+    def named(self) -> tuple[tuple[str, Domain], ...]:
+        return self.fields
+
+    def parts(self, name: str) -> tuple[tuple[str, Domain], ...]:
+        return tuple((dotted(name, field), part) for field, part in self.fields)
+
     def __repr__(self) -> str:
         fields = ", ".join(f"{name!r}: {domain!r}" for name, domain in self.fields)
         return f"Struct({{{fields}}})"

@@ -139,11 +139,8 @@ class Continuous(Domain):
                 f"{nearest(number.item(), max(first, -MOST_REAL), min(last, MOST_REAL))}"
             )
 
-    def check_reachable(self, value: float, name: str) -> None:
-        """Check that a coordinate of the unit cube reaches a value nearly, where only that will do.
-
-        **Raises:** `ValueError` for a value so far in a tail that none does.
-        """
+    def check_reachable(self, value: Numbers, name: str) -> None:
+        value = float(np.asarray(value))
         if self._is_central(value):
             return  # What follows takes JAX a second the first time.
         reached = np.float64(self.from_unit(self.to_unit(jnp.float32(value))))
@@ -169,6 +166,10 @@ class Continuous(Domain):
     def from_columns(self, row: Row, name: str) -> Float[Array, ""]:
         number = as_numbers(row[name], name).astype(jnp.result_type(float))
         return on_device(self.rounded(number))
+
+    @property
+    def tailed(self) -> tuple[bool, ...]:
+        return (True,)
 
 
 def _bounds_text(low: float, high: float, closed: str) -> str:

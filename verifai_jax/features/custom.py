@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from verifai_jax.core.precision import in_precision
 from verifai_jax.features.continuous import HIGHEST, OUTERMOST, Continuous, at_least
 from verifai_jax.features.ends import replace_where
+from verifai_jax.features.english import quantile_words
 
 
 @dataclass(frozen=True, repr=False)
@@ -132,6 +133,12 @@ class Distribution(Continuous):
             return " ".join(inspect.getsource(self.inverse_cdf).split())
         except (OSError, TypeError):
             return getattr(self.inverse_cdf, "__qualname__", repr(self.inverse_cdf))
+
+    def words(self) -> str:
+        return (
+            f"the distribution {self.name!r} of the user's own, {quantile_words(self)}; "
+            f"its quantiles are computed by {self.source}"
+        )
 
     def __repr__(self) -> str:
         return f"Distribution(name={self.name!r})"

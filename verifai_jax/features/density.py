@@ -17,7 +17,7 @@ from verifai_jax.features.box import Box, DiscreteBox
 from verifai_jax.features.choice import Categorical, Constant
 from verifai_jax.features.compound import Struct
 from verifai_jax.features.continuous import Continuous
-from verifai_jax.features.domain import Domain, dotted, indexed
+from verifai_jax.features.domain import Domain, dotted
 from verifai_jax.features.fixed import Fixed
 from verifai_jax.features.given import check_columns
 from verifai_jax.features.signal import Signal
@@ -113,20 +113,9 @@ def _log_density(domain: Domain, values: PyTree, name: str) -> Float[np.ndarray,
 
 def _continuous(domain: Domain, name: str) -> list[tuple[str, Continuous]]:
     """Return the columns that hold values of distributions."""
-    match domain:
-        case Continuous():
-            return [(name, domain)]
-        case Struct():
-            parts = [(dotted(name, field), part) for field, part in domain.fields]
-        case Signal():
-            parts = [(item, domain.domain) for item in indexed(name, domain.knots)]
-        case Array():
-            parts = [(item, domain.domain) for item in indexed(name, domain.length)]
-        case VariableArray():
-            parts = [(item, domain.domain) for item in indexed(name, domain.most)]
-        case _:
-            parts = []
-    return [column for part, inner in parts for column in _continuous(inner, part)]
+    if isinstance(domain, Continuous):
+        return [(name, domain)]
+    return [found for part, inner in domain.parts(name) for found in _continuous(inner, part)]
 
 
 def _item(values: PyTree, i: int) -> PyTree:

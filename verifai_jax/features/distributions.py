@@ -25,8 +25,9 @@ from verifai_jax.features.continuous import (
     normal_score,
     scipy_special,
 )
-from verifai_jax.features.domain import LEAST_REAL, short
+from verifai_jax.features.domain import LEAST_REAL, Tuning, short
 from verifai_jax.features.ends import replace_where
+from verifai_jax.features.english import number
 
 CENTRAL = 4.0
 """Standard deviations from the mean within which float32 coordinates are closely spaced."""
@@ -51,6 +52,8 @@ class Normal(Continuous):
     **Raises:** `ValueError` for parameters that are not finite, a standard deviation that is not
     positive, or values that do not fit into float32.
     """
+
+    arguments = ("mean", "std")
 
     mean: float
     std: float
@@ -81,6 +84,9 @@ class Normal(Continuous):
             -np.abs((np.asarray(value, np.float64) - self.mean) / self.std)
         )
 
+    def words(self) -> str:
+        return f"normal with mean {number(self.mean)} and standard deviation {number(self.std)}"
+
     def __repr__(self) -> str:
         return f"Normal({short(self.mean)}, {short(self.std)})"
 
@@ -101,6 +107,8 @@ class TruncatedNormal(Continuous):
     positive, ends that are reversed or equal, ends so near that it is uniform between them, or so
     far in one tail (11 standard deviations) that float32 cannot hold the probabilities.
     """
+
+    arguments = ("mean", "std", "low", "high")
 
     mean: float
     std: float
@@ -180,6 +188,16 @@ class TruncatedNormal(Continuous):
         whole = Normal(self.mean, self.std).log_density(value) - math.log(self._inside)
         return np.where(self.contains(value), whole, -np.inf)
 
+    def words(self) -> str:
+        return (
+            f"normal with mean {number(self.mean)} and standard deviation {number(self.std)}, cut "
+            f"off at {number(self.low)} and {number(self.high)}"
+        )
+
+    @property
+    def tuning(self) -> Tuning:
+        return Tuning("other", self.low, self.high)
+
     def __repr__(self) -> str:
         shown = ", ".join(short(x) for x in (self.mean, self.std, self.low, self.high))
         return f"TruncatedNormal({shown})"
@@ -195,6 +213,8 @@ class LogUniform(Continuous):
 
     **Raises:** `ValueError` for ends that are not finite, not positive, reversed or equal.
     """
+
+    arguments = ("low", "high")
 
     low: float
     high: float
@@ -236,6 +256,17 @@ class LogUniform(Continuous):
         inside = self.contains(value)
         density = -np.log(np.where(inside, value, 1.0)) - math.log(self._width)
         return np.where(inside, density, -np.inf)
+
+    def words(self) -> str:
+        return f"log-uniform between {number(self.low)} and {number(self.high)}"
+
+    @property
+    def tailed(self) -> tuple[bool, ...]:
+        return (False,)
+
+    @property
+    def tuning(self) -> Tuning:
+        return Tuning("log", self.low, self.high)
 
     def __repr__(self) -> str:
         return f"LogUniform({short(self.low)}, {short(self.high)})"

@@ -17,7 +17,16 @@ import math
 from collections.abc import Iterable, Sequence
 from decimal import Decimal
 from fractions import Fraction
-from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
+from typing import (
+    Any,
+    ClassVar,
+    Literal,
+    NamedTuple,
+    Protocol,
+    TypeAlias,
+    TypeVar,
+    runtime_checkable,
+)
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +35,8 @@ from jax import dtypes
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from verifai_jax.core.notebook import ForUsers
+from verifai_jax.core.text import one_line
+from verifai_jax.features.facts import Facts, drawn_facts
 
 MOST_LEVELS = 2**20
 """Cells of a coordinate at most: narrower ones are not distinct in a float32 coordinate."""
@@ -55,6 +66,21 @@ class Row(Protocol):
         ...
 
 
+class Tuning(NamedTuple):
+    """One number or one choice, as tools have it that tune hyper-parameters.
+
+    - `scale`: `"linear"`, `"log"` or `"integer"` for what is uniform between the ends on that
+      scale, `"choice"`, or `"other"` for what such tools do not have.
+    - `low`, `high`: the ends as they were written, not rounded to float32.
+    - `choices`: of a choice.
+    """
+
+    scale: Literal["linear", "log", "integer", "choice", "other"]
+    low: Any = None
+    high: Any = None
+    choices: tuple[object, ...] = ()
+
+
 class Domain(ForUsers, abc.ABC):
     """Values of one feature, addressed by `size` coordinates in `[0, 1]`.
 
@@ -64,11 +90,15 @@ class Domain(ForUsers, abc.ABC):
     """
 
     _internal = frozenset((
-        "check_reachable", "closed", "coerce", "coordinates", "ends", "from_columns", "items",
-        "labels", "lengths", "levels", "mark_count", "marks", "nominal", "numeric", "ordered",
-        "refine", "refined", "rounded", "sequences", "settled", "signals", "spans", "tail",
-        "to_columns", "used", "weights", "without",
+        "arguments", "check_reachable", "closed", "coerce", "coordinates", "ends", "facts",
+        "from_columns", "graph", "held_at", "items", "labels", "lengths", "levels", "mark_count",
+        "marks", "named", "nominal", "numeric", "ordered", "parts", "refine", "refined", "rounded",
+        "sequences", "settled", "signals", "spans", "tail", "tailed", "to_columns", "tuning",
+        "uniform", "used", "weights", "without", "words",
     ))  # fmt: skip
+
+    arguments: ClassVar[tuple[str, ...] | None] = None
+    """Attributes of which it can be made again, for JSON; None for a domain of a user's own."""
 
     @property
     @abc.abstractmethod
@@ -185,6 +215,81 @@ class Domain(ForUsers, abc.ABC):
     def marks(self, value: PyTree) -> Int[Array, " marks"]:
         """Return the numbers of what a value covers, below `mark_count`; -1 for nothing."""
         return jnp.zeros(0, jnp.int32)
+
+    # What other rooms ask. Each has a default, so that a domain defines what is special about it.
+
+    def words(self) -> str:
+        """Return in English what values there are, and how probable they are."""
+        return one_line(repr(self))
+
+    def parts(self, name: str) -> "tuple[tuple[str, Domain], ...]":
+        """Return the domains of which each value is made, with the names of their columns.
+
+        **Arguments:**
+
+        - `name`: of the feature.
+        """
+        return ()
+
+    @property
+    def named(self) -> "tuple[tuple[str, Domain], ...]":
+        """The fields of a structure with their domains; none for any other domain."""
+        return ()
+
+    def facts(self, name: str) -> Facts:
+        """Return what is known of the table columns of a feature before any row; see `facts`."""
+        found: Facts = {}
+        parts = self.parts(name)
+        for part_name, part in parts:
+            found |= part.facts(part_name)
+        return found if parts else drawn_facts(self, name)
+
+    @property
+    def held_at(self) -> PyTree:
+        """The value at which the feature is held; None for one that varies."""
+        return None
+
+    @property
+    def numeric(self) -> bool:
+        """True if a system sees the value itself, and not the index of a choice."""
+        return True
+
+    @property
+    def uniform(self) -> bool:
+        """True if all values are known to be equally likely over their range."""
+        return False
+
+    @property
+    def tailed(self) -> tuple[bool, ...]:
+        """Whether values thin out towards an end, for each unit coordinate."""
+        inner = tuple(tailed for _, part in self.parts("") for tailed in part.tailed)
+        return (False,) * (self.size - len(inner)) + inner
+
+    @property
+    def tuning(self) -> "Tuning | None":
+        """The domain as tools have it that tune hyper-parameters; None where they have none."""
+        return None
+
+    @property
+    def graph(self) -> Any:
+        """The graph of an automaton; None for any other domain."""
+        return None
+
+    def spans(self, duration: float) -> list[tuple[float, float]] | None:
+        """Return from when to when each control point acts, in seconds; None without any.
+
+        **Arguments:**
+
+        - `duration`: of the simulation in seconds.
+        """
+        return None
+
+    def check_reachable(self, value: PyTree, name: str) -> None:
+        """Check that a coordinate of the unit cube reaches a value nearly.
+
+        **Raises:** `ValueError` for a value so far in a tail that none does.
+        """
+        return
 
     def coordinates(self, name: str) -> tuple[str, ...]:
         """Return the names of the unit coordinates of the feature called `name`."""

@@ -29,6 +29,7 @@ from verifai_jax.features.continuous import (
 from verifai_jax.features.distributions import HALF_LOG_2PI, Normal
 from verifai_jax.features.domain import LEAST_REAL, short
 from verifai_jax.features.ends import replace_where
+from verifai_jax.features.english import number
 
 HAZARDS = (math.log(2), -math.log(OUTERMOST))
 """What an exponential distribution of mean one has at its median and at its outermost point."""
@@ -72,6 +73,8 @@ class LogNormal(Positive):
     positive, or values that do not fit into float32.
     """
 
+    arguments = ("mean", "std")
+
     mean: float
     std: float
 
@@ -96,6 +99,12 @@ class LogNormal(Positive):
         whole = Normal(self.mean, self.std).tail(np.log(x))
         return np.where(value > 0, whole, 0.0)
 
+    def words(self) -> str:
+        return (
+            f"log-normal with median {number(math.exp(self.mean))}, its logarithm with mean "
+            f"{number(self.mean)} and standard deviation {number(self.std)}"
+        )
+
     def __repr__(self) -> str:
         return f"LogNormal({short(self.mean)}, {short(self.std)})"
 
@@ -114,6 +123,8 @@ class Weibull(Positive):
     **Raises:** `ValueError` for parameters that are not finite and positive, or values that do not
     fit into float32.
     """
+
+    arguments = ("shape", "scale")
 
     shape: float
     scale: float
@@ -137,6 +148,9 @@ class Weibull(Positive):
             density = math.log(self.shape) - math.log(self.scale) + (self.shape - 1) * log
             return _at_positive(value, density - np.exp(self.shape * log))
 
+    def words(self) -> str:
+        return f"Weibull with shape {number(self.shape)} and scale {number(self.scale)}"
+
     def __repr__(self) -> str:
         return f"Weibull({short(self.shape)}, {short(self.scale)})"
 
@@ -152,6 +166,8 @@ class Exponential(Positive):
     **Raises:** `ValueError` for a mean that is not finite and positive, or values that do not fit
     into float32.
     """
+
+    arguments = ("mean",)
 
     mean: float
 
@@ -170,6 +186,9 @@ class Exponential(Positive):
         value, x = _positive(value)
         return _at_positive(value, -x / self.mean - math.log(self.mean))
 
+    def words(self) -> str:
+        return f"exponential with mean {number(self.mean)}"
+
     def __repr__(self) -> str:
         return f"Exponential({short(self.mean)})"
 
@@ -187,6 +206,8 @@ class Triangular(Continuous):
 
     **Raises:** `ValueError` for numbers that are not finite or not in this order.
     """
+
+    arguments = ("low", "mode", "high")
 
     low: float
     mode: float
@@ -232,6 +253,12 @@ class Triangular(Continuous):
         height = np.where(value < self.mode, up, down) * 2 / (self.high - self.low)
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self.contains(value), np.log(height), -np.inf)
+
+    def words(self) -> str:
+        return (
+            f"triangular between {number(self.low)} and {number(self.high)}, most likely "
+            f"{number(self.mode)}"
+        )
 
     def __repr__(self) -> str:
         shown = ", ".join(short(x) for x in (self.low, self.mode, self.high))

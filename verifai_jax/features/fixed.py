@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, PyTree
 
 from verifai_jax.core.precision import in_precision
 from verifai_jax.features.domain import Domain, Row, as_scalar
+from verifai_jax.features.english import number
 
 
 @dataclass(frozen=True, init=False, repr=False)
@@ -86,6 +87,14 @@ class Fixed(Domain):
             f"{value:z.4g}" if isinstance(value, float) else str(value) for value in values[:6]
         ]
         return f"{', '.join(shown)}{', ...' * (len(values) > 6)}"
+
+    @property
+    def held_at(self) -> PyTree:
+        return self.value
+
+    def words(self) -> str:
+        values = ", ".join(number(value) for _, value in self.row)
+        return f"fixed at {values}; otherwise {self.domain.words()}"
 
     def __repr__(self) -> str:
         return f"{self._format()}, fixed in {self.domain!r}"

@@ -1,10 +1,10 @@
 """Plain data of domains, for JSON: `to_plain(domain)` and back.
 
-Data holds a `kind`, one of the names below, and the arguments of that domain. Code, that is the
+Data holds a `kind`, the name of a domain, and the `arguments` of that domain. Code, that is the
 functions of a `Distribution`, is not data: it has to be given again by name.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from jaxtyping import PyTree
@@ -13,39 +13,17 @@ from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.precision import in_precision
 from verifai_jax.features.arrays import Array, VariableArray
 from verifai_jax.features.automaton import Automaton
-from verifai_jax.features.box import Box, DiscreteBox
-from verifai_jax.features.choice import Categorical, Constant
+from verifai_jax.features.box import Box
+from verifai_jax.features.choice import Categorical
 from verifai_jax.features.compound import Struct
 from verifai_jax.features.custom import Distribution
-from verifai_jax.features.distributions import LogUniform, Normal, TruncatedNormal
 from verifai_jax.features.domain import Domain
-from verifai_jax.features.families import Exponential, LogNormal, Triangular, Weibull
 from verifai_jax.features.fixed import Fixed
-from verifai_jax.features.reactive import Reactive
 from verifai_jax.features.signal import Signal
-from verifai_jax.features.tabulated import Beta, Empirical, Gamma
+from verifai_jax.features.tabulated import Empirical
 
-FIELDS: dict[type[Domain], tuple[str, ...]] = {
-    Box: ("low", "high"),
-    DiscreteBox: ("low", "high"),
-    Normal: ("mean", "std"),
-    TruncatedNormal: ("mean", "std", "low", "high"),
-    LogUniform: ("low", "high"),
-    LogNormal: ("mean", "std"),
-    Exponential: ("mean",),
-    Weibull: ("shape", "scale"),
-    Gamma: ("shape", "scale"),
-    Beta: ("a", "b", "low", "high"),
-    Triangular: ("low", "mode", "high"),
-    Empirical: ("values", "ranks", "count"),
-    Constant: ("value",),
-    Signal: ("domain", "knots", "hold", "duration"),
-    Array: ("domain", "length"),
-    Reactive: ("inputs", "hidden", "bounds", "scale"),
-}
 SIGNAL_OPTIONS = ("times", "width")
 """Arguments of a Signal that are written where they are given."""
-KINDS: dict[str, Any] = {kind.__name__: kind for kind in FIELDS}
 
 
 def to_plain(domain: Domain) -> dict[str, Any]:
@@ -73,10 +51,10 @@ def to_plain(domain: Domain) -> dict[str, Any]:
             return {"kind": "Distribution", "name": domain.name}
         case Automaton():
             return _automaton_to_plain(domain)
-    if type(domain) not in FIELDS:
+    if domain.arguments is None:
         raise ValueError(f"{domain!r} is a domain of your own, which JSON cannot describe")
     data: dict[str, Any] = {"kind": type(domain).__name__}
-    for name in FIELDS[type(domain)]:
+    for name in domain.arguments:
         value = getattr(domain, name)
         data[name] = to_plain(value) if isinstance(value, Domain) else _lists(value)
     if isinstance(domain, Box) and domain.closed != "both":
@@ -136,12 +114,13 @@ def _build(data: Mapping[str, Any], distributions: Mapping[str, Distribution]) -
             return distributions[data["name"]]
         case "Automaton":
             return _automaton_from_plain(data, distributions)
-    if kind not in KINDS:
+    kinds = {each.__name__: each for each in _kinds(Domain)}
+    if kind not in kinds:
         others = ("Struct", "Categorical", "Fixed", "Distribution", "Automaton")
-        raise unknown_name("kind of domain", kind, (*KINDS, *others))
+        raise unknown_name("kind of domain", kind, (*kinds, *others))
     arguments: dict[str, Any] = {
         name: from_plain(data[name], distributions) if name == "domain" else data[name]
-        for name in FIELDS[KINDS[kind]]
+        for name in kinds[kind].arguments or ()
     }
     if kind == "Empirical":
         return Empirical.from_ranks(**arguments)
@@ -149,7 +128,15 @@ def _build(data: Mapping[str, Any], distributions: Mapping[str, Distribution]) -
         arguments["closed"] = data["closed"]
     if kind == "Signal":
         arguments |= {name: data[name] for name in SIGNAL_OPTIONS if name in data}
-    return KINDS[kind](**arguments)
+    return kinds[kind](**arguments)
+
+
+def _kinds(kind: type[Domain]) -> Iterator[type[Domain]]:
+    """Yield the domains of this package that their arguments describe."""
+    for below in kind.__subclasses__():
+        if below.__module__.startswith("verifai_jax.") and "arguments" in vars(below):
+            yield below
+        yield from _kinds(below)
 
 
 def _automaton_to_plain(domain: Automaton) -> dict[str, Any]:

@@ -37,6 +37,8 @@ class Reactive(Domain):
     hidden units, or a scale that is not positive.
     """
 
+    arguments = ("inputs", "hidden", "bounds", "scale")
+
     inputs: tuple[tuple[str, float, float], ...]
     hidden: int
     bounds: tuple[float, float]

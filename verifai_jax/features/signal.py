@@ -62,6 +62,8 @@ class Signal(Domain):
     and times that do not increase, lie behind the duration or are not as many as the knots.
     """
 
+    arguments = ("domain", "knots", "hold", "duration")
+
     domain: Domain
     knots: int = DEFAULT_KNOTS
     hold: str = "linear"
@@ -230,6 +232,17 @@ class Signal(Domain):
             None if self.times is None else tuple(self.times),
             self.width,
         )
+
+    def words(self) -> str:
+        each = self.domain.words()
+        return f"a function of time with {self.knots} control points, each {each}"
+
+    def parts(self, name: str) -> tuple[tuple[str, Domain], ...]:
+        return tuple((knot, self.domain) for knot in indexed(name, self.knots))
+
+    def check_reachable(self, value: Waveform, name: str) -> None:
+        for knot in np.asarray(value.knots).ravel():
+            self.domain.check_reachable(float(knot), name)
 
     def __repr__(self) -> str:
         points = f"knots={self.knots}" if self.times is None else f"times={short(self.times)}"

@@ -25,7 +25,6 @@ from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.core.notebook import ForUsers, rows_html
 from verifai_jax.core.precision import in_precision
 from verifai_jax.features.acceptance import acceptance_rate
-from verifai_jax.features.choice import Constant
 from verifai_jax.features.compound import Struct
 from verifai_jax.features.custom import Distribution
 from verifai_jax.features.domain import Domain, Numbers, Row, as_real
@@ -472,7 +471,7 @@ class FeatureSpace(ForUsers):
         others = [
             name
             for name, domain in self.root.fields
-            if name not in features and not isinstance(domain, Constant | Fixed)
+            if name not in features and domain.held_at is None
         ]
         missing = [name for name in others if name not in (nominal or {})]
         if missing:
@@ -575,7 +574,7 @@ class FeatureSpace(ForUsers):
         """Return features with the constant, fixed ones and events that were left out."""
         if not isinstance(features, Mapping):
             return features
-        known = {n: d.value for n, d in self.root.fields if isinstance(d, Constant | Fixed)}
+        known = {n: d.held_at for n, d in self.root.fields if d.held_at is not None}
         known |= {n: d.nominal for n, d in self.root.fields if d.nominal is not None}
         return {**known, **features}
 

@@ -30,6 +30,7 @@ from verifai_jax.features.continuous import (
 )
 from verifai_jax.features.domain import LEAST_REAL, MOST_REAL, as_numbers, short
 from verifai_jax.features.ends import replace_where
+from verifai_jax.features.english import number, quantile_words
 from verifai_jax.features.families import Positive
 
 KNOTS = 1025
@@ -97,6 +98,8 @@ class Gamma(Positive):
     values that do not fit into float32.
     """
 
+    arguments = ("shape", "scale")
+
     shape: float
     scale: float
 
@@ -151,6 +154,9 @@ class Gamma(Positive):
         sides = scipy_special().gammainc(self.shape, x), scipy_special().gammaincc(self.shape, x)
         return 2 * np.minimum(*sides)
 
+    def words(self) -> str:
+        return f"gamma with shape {number(self.shape)} and scale {number(self.scale)}"
+
     def __repr__(self) -> str:
         return f"Gamma({short(self.shape)}, {short(self.scale)})"
 
@@ -167,6 +173,8 @@ class Beta(Continuous):
     **Raises:** `ValueError` for parameters that are not finite, `a` or `b` below 0.05, or ends that
     are reversed or equal.
     """
+
+    arguments = ("a", "b", "low", "high")
 
     a: float
     b: float
@@ -245,6 +253,12 @@ class Beta(Continuous):
             scipy_special().betainc(self.a, self.b, x), scipy_special().betaincc(self.a, self.b, x)
         )
 
+    def words(self) -> str:
+        return (
+            f"beta with a = {number(self.a)} and b = {number(self.b)} between "
+            f"{number(self.low)} and {number(self.high)}"
+        )
+
     def __repr__(self) -> str:
         ends = "" if self.support == (0, 1) else f", {short(self.low)}, {short(self.high)}"
         return f"Beta({short(self.a)}, {short(self.b)}{ends})"
@@ -266,6 +280,8 @@ class Empirical(Continuous):
     **Raises:** `ValueError` for fewer, for more than 65 536 different ones, or for what is no
     finite number.
     """
+
+    arguments = ("values", "ranks", "count")
 
     values: tuple[float, ...]
     ranks: tuple[float, ...]
@@ -335,6 +351,13 @@ class Empirical(Continuous):
         i = np.clip(np.searchsorted(knots, value, side="right") - 1, 0, len(knots) - 2)
         density = np.diff(self.ranks) / np.diff(self.values)
         return np.where(self.contains(value), np.log(density[i]), -np.inf)
+
+    def words(self) -> str:
+        low, high = self.support
+        return (
+            f"as {self.count} measured numbers between {number(low)} and {number(high)}, "
+            f"{quantile_words(self)}"
+        )
 
     def __repr__(self) -> str:
         low, high = self.support

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -11,7 +12,7 @@ from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.trace import Status
-from verifai_jax.features import Automaton, Domain, Struct
+from verifai_jax.features import Automaton, Domain
 from verifai_jax.problem.problem import Problem
 
 MOST_NAMED = 4
@@ -130,11 +131,10 @@ class FuzzCoverage(InNotebook):
 
 def _automata(domain: Domain, name: str) -> Iterator[tuple[str, Automaton]]:
     """Yield the automata of a space in the order of their marks."""
-    if isinstance(domain, Automaton):
-        yield name, domain
-    elif isinstance(domain, Struct):
-        for field, part in domain.fields:
-            yield from _automata(part, f"{name}.{field}" if name else field)
+    if domain.graph is not None:
+        yield name, cast(Automaton, domain)
+    for field, part in domain.named:
+        yield from _automata(part, f"{name}.{field}" if name else field)
 
 
 def _of_automaton(

@@ -173,9 +173,7 @@ def explain(
     )
     walk = _Walk(evaluator_of(setting, signals, None, None, 0), series, trace)
     tree = walk.node(formula, 0, True)
-    leaves: dict[Formula, np.ndarray] = {
-        f: series[f] for f in series if isinstance(f, ast.Predicate | ast.Atom)
-    }
+    leaves: dict[Formula, np.ndarray] = {f: series[f] for f in series if f.is_predicate}
     critical: tuple[Instant, ...] = ()
     if leaves:
         if tau is None:
@@ -187,7 +185,8 @@ def explain(
 
 
 def _distinct(formula: Formula) -> tuple[Formula, ...]:
-    return tuple(dict.fromkeys(formula.subformulas()))
+    """Return itself and every formula that its value is computed from, each once."""
+    return tuple(dict.fromkeys(formula.subformulas(valued=True)))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -206,7 +205,7 @@ def _influence(
     setting: Setting, signals: dict[str, Array], tau: float | Float[Array, ""]
 ) -> list[Float[Array, " time"]]:
     """Compute the gradient of the smooth robustness with respect to every leaf at every sample."""
-    leaves = [f for f in _distinct(setting.formula) if isinstance(f, ast.Predicate | ast.Atom)]
+    leaves = [f for f in _distinct(setting.formula) if f.is_predicate]
     dtype = next(iter(signals.values())).dtype if signals else jnp.result_type(float)
 
     def rho(nudges: list[Array]) -> Array:
@@ -269,23 +268,21 @@ class _Walk:
         match f:
             case ast.Not(p):
                 return [(p, i)]
-            case ast.And(parts) | ast.Or(parts):
+            case ast.Join(parts):
                 return [(p, i) for p in parts]
+            case ast.Derived():
+                return [(f.meaning, i)]
             case ast.Next(p):
                 later = i + self.evaluator.stride
                 return [(p, later if self.evaluator.end != "truncate" else min(later, self.last))]
             case ast.Prev(p):
                 earlier = i - self.evaluator.stride
                 return [(p, earlier)] if earlier >= 0 else []
-            case ast.Always(p, span) | ast.Eventually(p, span):
-                return self.best(p, self.ahead(span, i, p), isinstance(f, ast.Always))
-            case ast.Historically(p, span) | ast.Once(p, span):
-                return self.best(p, self.behind(span, i), isinstance(f, ast.Historically))
-            case ast.Until(p, q, span):
-                return self.witness(p, q, self.ahead(span, i, p, q), i, 1)
-            case ast.Since(p, q, span):
-                return self.witness(p, q, self.behind(span, i), i, -1)
-            case ast.Constant() | ast.Predicate() | ast.Atom():
+            case ast.Window(p):
+                return self.best(p, self.window(f, i), f.sign < 0)
+            case ast.Witness(p, q):
+                return self.witness(p, q, self.window(f, i), i, 1 if f.side == "ahead" else -1)
+            case ast.Leaf():
                 return []
         raise missing_case("the explanation", f)
 
@@ -294,21 +291,20 @@ class _Walk:
         if not operands:
             return None
         values = [self.at(p, j) for p, j in operands]
-        if isinstance(f, ast.Or):
+        if isinstance(f, ast.Join) and f.sign > 0:
             return int(np.argmax(values))
         return int(np.argmin(values)) if len(values) > 1 else 0
 
-    def ahead(self, span: ast.Interval, i: int, *parts: Formula) -> range:
-        a, b = self.evaluator.span(span)
+    def window(self, f: Formula, i: int) -> range:
+        """Return the samples at which an operator with an interval looks from sample `i` on."""
+        a, b = self.evaluator.span(f.interval)
+        if f.side == "back":
+            return range(0 if math.isinf(b) else max(0, i - int(b)), i - a + 1)
         if self.evaluator.end == "truncate":
             stop = self.last
         else:
-            stop = max(i + a, *(len(self.series[p]) - 1 for p in parts))
+            stop = max(i + a, *(len(self.series[p]) - 1 for p in f.operands()))
         return range(i + a, (stop if math.isinf(b) else min(i + int(b), stop)) + 1)
-
-    def behind(self, span: ast.Interval, i: int) -> range:
-        a, b = self.evaluator.span(span)
-        return range(0 if math.isinf(b) else max(0, i - int(b)), i - a + 1)
 
     def best(self, p: Formula, window: range, least: bool) -> list[tuple[Formula, int]]:
         if not window:

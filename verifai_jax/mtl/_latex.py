@@ -7,16 +7,7 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.expression import PRECEDENCE, Arithmetic, Component, Number, Signal
 from verifai_jax.mtl.formula import Formula, Term, surface
 from verifai_jax.mtl.node import missing_case
-from verifai_jax.mtl.words import number_text
-
-_LATEX = {
-    "and": r"\land", "or": r"\lor", "implies": r"\rightarrow", "iff": r"\leftrightarrow",
-    "xor": r"\oplus", "not": r"\lnot", "always": r"\Box", "eventually": r"\Diamond",
-    "historically": r"\boxminus", "once": r"\diamondminus", "next": r"\bigcirc",
-    "prev": r"\ominus", "weak_prev": r"\widetilde{\ominus}",
-    "until": r"\mathbin{\mathcal{U}}", "since": r"\mathbin{\mathcal{S}}",
-    "weak_until": r"\mathbin{\mathcal{W}}", "release": r"\mathbin{\mathcal{R}}",
-}  # fmt: skip
+from verifai_jax.mtl.words import OPERATORS, number_text
 
 _COMPARISON_LATEX = {">=": r"\geq", "<=": r"\leq", "==": "=", "!=": r"\neq"}
 
@@ -32,7 +23,7 @@ def latex(f: Formula) -> str:
         case ast.Atom(e):
             return _expression_latex(e)
     word, operands, interval = surface(f)
-    symbol = _LATEX[word]
+    symbol = OPERATORS[word].latex
     if interval is not None and not interval.everything:
         end = r"\infty" if interval.end == float("inf") else number_text(interval.end)
         symbol += f"_{{[{number_text(interval.start)}, {end}]}}"

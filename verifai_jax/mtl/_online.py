@@ -31,11 +31,12 @@ from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import Evaluator, samples
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.node import missing_case
-from verifai_jax.mtl.rewriting import simplify
+from verifai_jax.mtl.rewriting import expand, simplify
 from verifai_jax.mtl.semantics import Semantics, hard
 
 Leaf = Callable[[Formula, int], Array]
 Cells = dict[str, Any]
+_JOIN = {-1: jnp.minimum, 1: jnp.maximum}
 
 
 class State(NamedTuple):
@@ -101,7 +102,7 @@ def online(formula: Formula | str, dt: float, semantics: Semantics = hard) -> On
     smooth semantics, and for an unbounded future operator within another temporal operator, which
     no bounded memory can follow.
     """
-    formula = simplify(parse(formula) if isinstance(formula, str) else formula)
+    formula = simplify(expand(parse(formula) if isinstance(formula, str) else formula))
     if not dt > 0:
         raise ValueError(f"the sampling period dt must be positive; got {dt}")
     if semantics.kind == "smooth":
@@ -205,8 +206,8 @@ class _Machine:
     def _delay(self, f: Formula) -> int:
         below = max((self.delay(p) for p in f.operands()), default=0)
         match f:
-            case ast.Always(_, interval) | ast.Eventually(_, interval) | ast.Until(_, _, interval):
-                b = self.span(interval)[1]
+            case ast.Window() | ast.Witness() if f.side == "ahead":
+                b = self.span(f.interval)[1]
                 if math.isinf(b):
                     raise ValueError(
                         f"{f} looks ahead without end within another operator, which no bounded "
@@ -215,18 +216,7 @@ class _Machine:
                 return below + int(b)
             case ast.Next():
                 return below + 1
-            case (
-                ast.Constant()
-                | ast.Predicate()
-                | ast.Atom()
-                | ast.Not()
-                | ast.And()
-                | ast.Or()
-                | ast.Historically()
-                | ast.Once()
-                | ast.Prev()
-                | ast.Since()
-            ):
+            case ast.Leaf() | ast.Not() | ast.Join() | ast.Window() | ast.Prev() | ast.Witness():
                 return below
         raise missing_case("the online monitor", f)
 
@@ -239,16 +229,18 @@ class _Machine:
     def _settling(self, f: Formula) -> int:
         below = max((self.settling(p) for p in f.operands()), default=0)
         match f:
-            case ast.Historically(_, i) | ast.Once(_, i) | ast.Since(_, _, i):
-                a, b = self.span(i)
+            case ast.Window() | ast.Witness() if f.side == "back":
+                a, b = self.span(f.interval)
                 return below + int(a if math.isinf(b) else b) + 1
-            case ast.Always(_, i) | ast.Eventually(_, i) | ast.Until(_, _, i):
-                b = self.span(i)[1]
+            case ast.Window() | ast.Witness():
+                b = self.span(f.interval)[1]
                 # An unbounded operator is anchored, and then needs no more than its operands.
                 return below + (0 if math.isinf(b) else int(b))
             case ast.Next() | ast.Prev():
                 return below + 1
-        return below
+            case ast.Leaf() | ast.Not() | ast.Join():
+                return below
+        raise missing_case("the online monitor", f)
 
     def stream(self, path: str, f: Formula, sign: int) -> Array:
         """Return the value of `f` at the instant `now - delay(f)`; anything before time 0.
@@ -264,26 +256,23 @@ class _Machine:
         match f:
             case ast.Not(p):
                 return -self.stream(path + "0", p, -sign)
-            case ast.And(parts) | ast.Or(parts):
-                values = self.align(path, parts, sign)
-                join = jnp.minimum if isinstance(f, ast.And) else jnp.maximum
-                return functools.reduce(join, values)
+            case ast.Join(parts):
+                return functools.reduce(_JOIN[f.sign], self.align(path, parts, sign))
             case ast.Next(p):
                 return self.stream(path + "0", p, sign)
             case ast.Prev(p, weak):
                 value = self.past(path, p, sign, math.inf if weak else -math.inf)
                 return self.push(path, value, math.inf if weak else -math.inf, 2)[0]
-            case ast.Always(p, i) | ast.Eventually(p, i):
+            case ast.Window(p, i) if f.side == "ahead":
                 a, b = self.span(i)
                 value = self.stream(path + "0", p, sign)
                 window = self.push(path, value, 0.0, int(b) - a + 1)
-                return window.min() if isinstance(f, ast.Always) else window.max()
-            case ast.Historically(p, i) | ast.Once(p, i):
-                least = isinstance(f, ast.Historically)
-                nothing = math.inf if least else -math.inf
+                return window.min() if f.sign < 0 else window.max()
+            case ast.Window(p, i):
+                nothing = -f.sign * math.inf
                 value = self.past(path, p, sign, nothing)
-                return self.window(path, value, *self.span(i), nothing, least)
-            case ast.Until(p, q, i):
+                return self.window(path, value, *self.span(i), nothing, f.sign < 0)
+            case ast.Witness(p, q, i) if f.side == "ahead":
                 a, b = self.span(i)
                 left, right = self.align(path, (p, q), sign)
                 n = int(b) + 1
@@ -291,9 +280,9 @@ class _Machine:
                 rights = self.push(path + "r", right, 0.0, n)
                 before = jnp.concatenate([jnp.full(1, jnp.inf, left.dtype), lefts[:-1]])
                 return jnp.minimum(rights, jax.lax.cummin(before))[a:].max()
-            case ast.Since(p, q, i):
+            case ast.Witness(p, q, i):
                 return self.since(path, p, q, *self.span(i), sign)
-            case ast.Constant() | ast.Predicate() | ast.Atom():
+            case ast.Leaf():
                 return self.leaf(f, sign)
         raise missing_case("the online monitor", f)
 
@@ -362,17 +351,14 @@ class _Machine:
                 return self.constant(f)
             case ast.Not(p):
                 return -self.value_at_start(path + "0", p, -sign)
-            case ast.And(parts) | ast.Or(parts):
+            case ast.Join(parts):
                 values = [self.value_at_start(f"{path}{k}.", p, sign) for k, p in enumerate(parts)]
-                return functools.reduce(
-                    jnp.minimum if isinstance(f, ast.And) else jnp.maximum, values
-                )
-            case ast.Always(p, i) | ast.Eventually(p, i):
+                return functools.reduce(_JOIN[f.sign], values)
+            case ast.Window(p, i) if f.side == "ahead":
                 a, b = self.span(i)
-                least = isinstance(f, ast.Always)
                 value = self.stream(path + "0", p, sign)
-                return self.accumulate(path, value, self.now - self.delay(p), a, b, least)
-            case ast.Until(p, q, i):
+                return self.accumulate(path, value, self.now - self.delay(p), a, b, f.sign < 0)
+            case ast.Witness(p, q, i) if f.side == "ahead":
                 return self.until_at_start(path, p, q, *self.span(i), sign)
         value = self.stream(path + "s", f, sign)
         return self.accumulate(path, value, self.now - self.delay(f), 0, 0, True)

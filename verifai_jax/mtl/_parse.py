@@ -18,8 +18,8 @@ from verifai_jax.core.errors import unknown_name
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.expression import Arithmetic, Expression, Number, Signal
 from verifai_jax.mtl.formula import Formula, Interval
-from verifai_jax.mtl.grammar import BINARY, FormulaSyntaxError, Tree, explain_error, parser
-from verifai_jax.mtl.words import ANGLES, FUNCTIONS, NAME, NUMBERS
+from verifai_jax.mtl.grammar import FormulaSyntaxError, Tree, explain_error, parser
+from verifai_jax.mtl.words import ANGLES, FUNCTIONS, NAME, NUMBERS, OPERATORS
 
 _UNITS = {
     "s": Decimal(1),
@@ -44,7 +44,6 @@ MOST_DEEP_TEMPORAL = 40
 
 _TOKEN = re.compile(r'"[^"\n]*"|[\w.]+|\S')
 _CONNECTIVES = ("iff", "impl", "or_", "and_", "bin", "negation", "temporal")
-_TIMED = ("always", "eventually", "historically", "once", *BINARY)
 
 
 def parse(
@@ -326,8 +325,7 @@ class _Builder:
             raise self._chained(parts, words)
         left, right = map(self._formula, parts)
         interval = self._interval(intervals[0])
-        a, b = interval.start, interval.end
-        value = getattr(left, words[0].type.lower())(right, a, b)
+        value = ast.build(words[0].type.lower(), (left, right), interval)
         return _Part(value, *self._span(tree), rule="bin")
 
     def _chained(self, parts: list[_Part], words: list[Any]) -> FormulaSyntaxError:
@@ -396,16 +394,9 @@ class _Builder:
         part = self._build(operand)
         value = self._formula(part)
         name = word.type.lower()
-        if interval is not None and name not in _TIMED:
+        if interval is not None and not OPERATORS[name].timed:
             raise self._fail(f"{str(word)!r} takes no interval", *self._span(interval))
-        span = self._interval(interval)
-        match name:
-            case "next":
-                value = ast.Next(value)
-            case "prev" | "weak_prev":
-                value = ast.Prev(value, weak=name.startswith("weak"))
-            case _:
-                value = getattr(ast, name.capitalize())(value, span)
+        value = ast.build(name, (value,), self._interval(interval))
         symbol = not str(word).rstrip("_").islower()
         rule = part.rule if symbol else "word"
         return _Part(value, *self._span(tree), closed=part.closed, rule=rule)

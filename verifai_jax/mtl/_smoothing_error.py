@@ -97,40 +97,34 @@ def _joined(kind: str, parts: list[_Slack], repeats: float = 1.0) -> _Slack:
     return _Slack(above, below, kind, log_count)
 
 
+_KIND = {-1: "min", 1: "max"}
+
+
 def _slack(e: Evaluator, f: Formula, first: int, last: int) -> _Slack:
     match f:
         case ast.Not(operand):
             return _slack(e, operand, first, last).negated()
-        case ast.And(parts) | ast.Or(parts):
-            kind = "min" if isinstance(f, ast.And) else "max"
-            return _joined(kind, [_slack(e, p, first, last) for p in parts])
-        case ast.Always(operand, interval) | ast.Eventually(operand, interval):
-            kind = "min" if isinstance(f, ast.Always) else "max"
-            return _future(e, operand, kind, *e.span(interval), first, last)
-        case ast.Historically(operand, interval) | ast.Once(operand, interval):
-            kind = "min" if isinstance(f, ast.Historically) else "max"
-            return _past(e, operand, kind, *e.span(interval), first, last)
+        case ast.Join(parts):
+            return _joined(_KIND[f.sign], [_slack(e, p, first, last) for p in parts])
+        case ast.Window(operand, interval):
+            window = _future if f.side == "ahead" else _past
+            return window(e, operand, _KIND[f.sign], *e.span(interval), first, last)
+        case ast.Derived():
+            return _slack(e, f.meaning, first, last)
         case ast.Next(operand) | ast.Prev(operand):
             step = e.stride if isinstance(f, ast.Next) else -e.stride
             return _slack(e, operand, max(0, first + step), max(0, last + step))
-        case ast.Until(left, right, interval):
+        case ast.Witness(left, right, interval):
             a, b = e.span(interval)
-            end = max(e.settles(left), e.settles(right), first + a)
-            begin = min(first + a, end)
+            ahead = f.side == "ahead"
+            window = _future if ahead else _past
+            end = max(e.settles(left), e.settles(right), first + a) if ahead else max(last - a, 0)
+            begin = min(first + a, end) if ahead else 0
             terms = [_until(e, left, right, end - begin + 1, begin, end)]
             if math.isfinite(b):
-                terms.append(_future(e, right, "max", a, b, first, last))
+                terms.append(window(e, right, "max", a, b, first, last))
             if a > 0:
-                terms.append(_future(e, left, "min", 0, a - 1, first, last))
-            return _joined("min", terms) if len(terms) > 1 else terms[0]
-        case ast.Since(left, right, interval):
-            a, b = e.span(interval)
-            end = max(last - a, 0)
-            terms = [_until(e, left, right, end + 1, 0, end)]
-            if math.isfinite(b):
-                terms.append(_past(e, right, "max", a, b, first, last))
-            if a > 0:
-                terms.append(_past(e, left, "min", 0, a - 1, first, last))
+                terms.append(window(e, left, "min", 0, a - 1, first, last))
             return _joined("min", terms) if len(terms) > 1 else terms[0]
         case ast.Constant() | ast.Predicate() | ast.Atom():
             return _Slack()

@@ -102,7 +102,7 @@ def goals_of(formulas: Iterable[Formula]) -> Goals:
             for goal in goals
             for clause in goal
             for leaf in clause.subformulas()
-            if isinstance(leaf, ast.Predicate | ast.Atom)
+            if leaf.is_predicate
         )
     )
     names: dict[Formula, Formula] = {
@@ -123,9 +123,7 @@ def _parts(formula: Formula, kind: type[ast.And] | type[ast.Or]) -> tuple[Formul
     """Split a conjunction or disjunction, through the operators that distribute over it."""
     if isinstance(formula, kind):
         return tuple(part for each in formula.operands() for part in _parts(each, kind))
-    if isinstance(
-        formula, ast.Always | ast.Historically if kind is ast.And else ast.Eventually | ast.Once
-    ):
+    if isinstance(formula, ast.Window) and formula.sign == kind.sign:
         inner = _parts(formula.operand, kind)
         if len(inner) > 1:
             return tuple(rebuild(formula, (part,)) for part in inner)
@@ -144,6 +142,4 @@ def _over(formula: Formula, names: dict[Formula, Formula]) -> Formula:
     """Return the formula over other leaves."""
     if formula in names:
         return names[formula]
-    if isinstance(formula, ast.Constant):
-        return formula
     return rebuild(formula, tuple(_over(part, names) for part in formula.operands()))

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from verifai_jax.core.trace import Trace
-from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.evaluate import End, Evaluator
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.semantics import hard
@@ -25,7 +24,7 @@ from verifai_jax.mtl.setting import prepare
 def leaves_of(formulas: Sequence[Formula]) -> tuple[Formula, ...]:
     """Return the different predicates of formulas, in their order."""
     every = (part for formula in formulas for part in formula.subformulas())
-    return tuple(dict.fromkeys(p for p in every if isinstance(p, ast.Predicate | ast.Atom)))
+    return tuple(dict.fromkeys(p for p in every if p.is_predicate))
 
 
 def deciding_instant(

@@ -97,22 +97,22 @@ class Evaluator:
         return self._settled[f]
 
     def _settles(self, f: Formula) -> int:
-        below = [self.settles(part) for part in f.operands()]
+        below = [self.settles(part) for part in f.valued()]
         match f:
             case ast.Constant():
                 return 0
             case ast.Predicate() | ast.Atom():
                 return self._last
-            case ast.Always(_, interval) | ast.Eventually(_, interval):
-                return max(0, below[0] - self.span(interval)[0])
             case ast.Next():
                 return max(0, below[0] - self.stride)
             case ast.Prev():
                 return below[0] + self.stride
-            case ast.Historically(_, interval) | ast.Once(_, interval) | ast.Since(_, _, interval):
-                a, b = self.span(interval)
+            case ast.Window() | ast.Witness() if f.side == "back":
+                a, b = self.span(f.interval)
                 return max(below) + int(a if math.isinf(b) else b)
-            case ast.Not() | ast.And() | ast.Or() | ast.Until():
+            case ast.Window():
+                return max(0, below[0] - self.span(f.interval)[0])
+            case ast.Not() | ast.Join() | ast.Witness() | ast.Derived():
                 return max(below)
         raise missing_case("the instant from which the value is constant", f)
 
@@ -131,27 +131,21 @@ class Evaluator:
                 return self._leaf(f, first, last)
             case ast.Not(operand):
                 return -self.value(operand, first, last)
-            case ast.And(parts):
-                return self._join([self.value(p, first, last) for p in parts], -1)
-            case ast.Or(parts):
-                return self._join([self.value(p, first, last) for p in parts], 1)
-            case ast.Eventually(operand, interval):
-                return self._future(operand, 1, *self.span(interval), first, last)
-            case ast.Always(operand, interval):
-                return self._future(operand, -1, *self.span(interval), first, last)
+            case ast.Join(parts):
+                return self._join([self.value(p, first, last) for p in parts], f.sign)
+            case ast.Window(operand, interval):
+                window = self._future if f.side == "ahead" else self._past
+                return window(operand, f.sign, *self.span(interval), first, last)
             case ast.Next(operand):
                 return self._next(operand, first, last)
-            case ast.Once(operand, interval):
-                return self._past(operand, 1, *self.span(interval), first, last)
-            case ast.Historically(operand, interval):
-                return self._past(operand, -1, *self.span(interval), first, last)
             case ast.Prev(operand, weak):
                 sign = -1 if weak else 1
                 return self._past(operand, sign, self.stride, self.stride, first, last)
-            case ast.Until(left, right, interval):
-                return self._until(left, right, *self.span(interval), first, last)
-            case ast.Since(left, right, interval):
-                return self._since(left, right, *self.span(interval), first, last)
+            case ast.Witness(left, right, interval):
+                witness = self._until if f.side == "ahead" else self._since
+                return witness(left, right, *self.span(interval), first, last)
+            case ast.Derived():
+                return self.value(f.meaning, first, last)
         raise missing_case("the robustness", f)
 
     # Leaves

@@ -160,6 +160,11 @@ class Number(Expression):
         if not math.isfinite(self.value):
             raise ValueError(f"a number in a formula must be finite; got {self.value}")
 
+    @property
+    def number(self) -> float:
+        """Its value."""
+        return self.value
+
     def __neg__(self) -> "Expression":
         return Number(-self.value)
 

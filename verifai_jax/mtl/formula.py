@@ -7,75 +7,31 @@
 
 A formula is a frozen tree, hashable and equal by value, so it is a static argument under `jax.jit`.
 Sugar (implication, equivalence, weak until, release) is rewritten into the few nodes below when it
-is written, and restored when it is printed; their meaning lives in `evaluate`.
+is written, and restored when it is printed. What is said of an operator stands in the table
+`OPERATORS` of `words`; its meaning is that of the kind of node that it is: a `Join` of operands, a
+`Window` over time, a `Witness` with what holds up to it, or `Derived` from other operators.
 """
 
-import abc
 import html
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import ClassVar, TypeAlias, Union
 
 from verifai_jax.core.lazy import late
-from verifai_jax.mtl.node import Node, missing_case, postorder
-from verifai_jax.mtl.words import Text, number_text, operator_text
-
-
-class Term(Node, abc.ABC):
-    """A number at every instant, which predicates compare; made as an `Expression`."""
-
-    @abc.abstractmethod
-    def text(self, outer: int = 0) -> str:
-        """Return the text, in parentheses if its operator binds weaker than `outer`."""
-
-    @property
-    def is_signal(self) -> bool:
-        """True for a signal or one component of it."""
-        return False
-
-    def signals(self) -> tuple[str, ...]:
-        """Return the names of the signals in it, in order of appearance."""
-        return ()
-
-    def __str__(self) -> str:
-        return self.text()
-
+from verifai_jax.mtl.node import Node, missing_case
+from verifai_jax.mtl.tree import EVERYTHING as EVERYTHING
+from verifai_jax.mtl.tree import Interval as Interval
+from verifai_jax.mtl.tree import Term as Term
+from verifai_jax.mtl.tree import Tree
+from verifai_jax.mtl.words import OPERATORS, Text, operator_text
 
 Formulaic: TypeAlias = Union["Formula", Term]
 """What stands for a formula: a formula, or an expression that is its own robustness."""
 
 
-@dataclass(frozen=True)
-class Interval:
-    """A closed interval of time in seconds; `end` may be infinite."""
-
-    start: float = 0.0
-    end: float = math.inf
-
-    def __post_init__(self) -> None:
-        start, end = float(self.start), float(self.end)
-        object.__setattr__(self, "start", start)
-        object.__setattr__(self, "end", end)
-        if not (start >= 0 and math.isfinite(start)):
-            raise ValueError(f"an interval starts at a finite time, at least 0; got {self}")
-        if not end >= start:
-            raise ValueError(f"an interval ends no earlier than it starts; got {self}")
-
-    @property
-    def everything(self) -> bool:
-        """True for `[0, inf]`, which the text leaves out."""
-        return self.start == 0 and self.end == math.inf
-
-    def __str__(self) -> str:
-        return f"[{number_text(self.start)},{number_text(self.end)}]"
-
-
-EVERYTHING = Interval()
-"""The interval of an operator that is written without one."""
-
-
-class Formula(Node):
+class Formula(Tree):
     """A property of a trace at every instant, true or false, with a margin (its robustness)."""
 
     children: ClassVar[tuple[str, ...]] = ()
@@ -144,59 +100,19 @@ class Formula(Node):
         """Return the expressions that a leaf compares; none for an operator."""
         return ()
 
-    def horizon(self, dt: float = 0.0) -> float:
-        """Return the seconds of trace beyond an instant on which its truth there depends.
-
-        Infinite for an unbounded future operator. Past operators look back, so they never add (and
-        are not subtracted, which keeps the bound simple).
-
-        **Arguments:**
-
-        - `dt`: sampling period in seconds, by which `next` looks ahead.
-        """
-        return self._total_reach(dt, 1)
-
-    def history(self, dt: float = 0.0) -> float:
-        """Return the seconds of trace before an instant on which its truth there depends.
-
-        **Arguments:**
-
-        - `dt`: sampling period in seconds, by which `prev` looks back.
-        """
-        return self._total_reach(dt, 0)
-
-    def _total_reach(self, dt: float, side: int) -> float:
-        reach: dict[int, float] = {}
-        for part in postorder(self):
-            if isinstance(part, Formula):
-                below = max((reach[id(p)] for p in part.operands()), default=0.0)
-                reach[id(part)] = below + part._reach(dt)[side]
-        return reach[id(self)]
+    @property
+    def compared(self) -> "tuple[Term, str, Term] | None":
+        """Both sides of a comparison with its symbol between them; None for any other formula."""
+        return None
 
     @property
-    def depth(self) -> int:
-        """Operators that stand within each other; 0 for a leaf."""
-        for part in postorder(self, "_depth"):
-            if isinstance(part, Formula):
-                below = [p.__dict__["_depth"] + 1 for p in part.operands()]
-                object.__setattr__(part, "_depth", max(below, default=0))
-        return self.__dict__["_depth"]
+    def is_predicate(self) -> bool:
+        """True for a leaf with a margin: a comparison, or an expression by itself."""
+        return bool(self.terms())
 
-    @property
-    def temporal_depth(self) -> int:
-        """Temporal operators that stand within each other."""
-        for part in postorder(self, "_temporal_depth"):
-            if isinstance(part, Formula):
-                below = max((p.__dict__["_temporal_depth"] for p in part.operands()), default=0)
-                own = bool(part.operands()) and not isinstance(part, Not | And | Or)
-                object.__setattr__(part, "_temporal_depth", below + own)
-        return self.__dict__["_temporal_depth"]
-
-    def _reach(self, dt: float) -> tuple[float, float]:
-        """Return how many seconds the operator itself looks back and ahead."""
-        if isinstance(self, Constant | Predicate | Atom | Not | And | Or):
-            return 0.0, 0.0
-        raise missing_case("the horizon, or the history,", self)
+    def valued(self) -> tuple["Formula", ...]:
+        """Return the formulas whose values decide its own: its operands, but for `Derived`."""
+        return self.operands()
 
     def operands(self) -> tuple["Formula", ...]:
         """Return the formulas that it is made of, left to right."""
@@ -206,8 +122,13 @@ class Formula(Node):
             parts.extend(value if isinstance(value, tuple) else (value,))
         return tuple(parts)
 
-    def subformulas(self) -> Iterator["Formula"]:
-        """Yield itself and everything below, parents first, left to right, each part once."""
+    def subformulas(self, valued: bool = False) -> Iterator["Formula"]:
+        """Yield itself and everything below, parents first, left to right, each part once.
+
+        **Arguments:**
+
+        - `valued`: whether the meaning of a `Derived` operator stands for its operands.
+        """
         seen: set[int] = set()
         stack: list[Formula] = [self]
         while stack:
@@ -215,7 +136,7 @@ class Formula(Node):
             if id(part) not in seen:
                 seen.add(id(part))
                 yield part
-                stack.extend(reversed(part.operands()))
+                stack.extend(reversed(part.valued() if valued else part.operands()))
 
     def __bool__(self) -> bool:
         raise TypeError(
@@ -240,8 +161,17 @@ class Formula(Node):
         return html.escape(self._repr_latex_())
 
 
+class Leaf(Formula):
+    """A formula without operands."""
+
+    @property
+    def side(self) -> str:
+        """Nothing: a leaf looks at the instant alone."""
+        return ""
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Constant(Formula):
+class Constant(Leaf):
     """`TRUE` (robustness +inf) or `FALSE` (-inf)."""
 
     value: bool
@@ -252,7 +182,7 @@ class Constant(Formula):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Predicate(Formula):
+class Predicate(Leaf):
     """A comparison; its robustness is the margin by which it holds."""
 
     comparison: str
@@ -270,13 +200,18 @@ class Predicate(Formula):
         """Return both sides."""
         return self.left, self.right
 
+    @property
+    def compared(self) -> tuple[Term, str, Term]:
+        """Both sides with the comparison between them."""
+        return self.left, self.comparison, self.right
+
     def text(self) -> Text:
         """Return both sides with the comparison between them."""
         return Text(f"{self.left} {self.comparison} {self.right}", "leaf")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Atom(Formula):
+class Atom(Leaf):
     """A bare expression that is its own robustness; it holds where it is positive."""
 
     expression: Term
@@ -295,7 +230,7 @@ class Atom(Formula):
     def text(self) -> Text:
         """Return the text of the expression."""
         text = str(self.expression)
-        # A signal or one of its components ends where it ends, whatever comes behind.
+        # A signal or one of its components ends where it ends, whatever comes after it.
         return Text(text, "name" if self.expression.is_signal else "leaf")
 
 
@@ -305,70 +240,62 @@ class Not(Formula):
 
     operand: Formula
     children: ClassVar[tuple[str, ...]] = ("operand",)
+    word = "not"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class And(Formula):
+class Join(Formula):
+    """The least (`sign` -1) or the greatest (1) value of two operands or more."""
+
+    parts: tuple[Formula, ...]
+    children: ClassVar[tuple[str, ...]] = ("parts",)
+    sign: ClassVar[int]
+
+
+class And(Join):
     """`f & g & ...`, two operands or more."""
 
-    parts: tuple[Formula, ...]
-    children: ClassVar[tuple[str, ...]] = ("parts",)
+    word, sign = "and", -1
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Or(Formula):
+class Or(Join):
     """`f | g | ...`, two operands or more."""
 
-    parts: tuple[Formula, ...]
-    children: ClassVar[tuple[str, ...]] = ("parts",)
+    word, sign = "or", 1
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Always(Formula):
+class Window(Formula):
+    """The least (`sign` -1) or the greatest (1) value over an interval, ahead or back."""
+
+    operand: Formula
+    interval: Interval = field(default=EVERYTHING)
+    children: ClassVar[tuple[str, ...]] = ("operand",)
+    sign: ClassVar[int]
+
+
+class Always(Window):
     """`f` at every instant of the interval ahead."""
 
-    operand: Formula
-    interval: Interval = field(default=EVERYTHING)
-    children: ClassVar[tuple[str, ...]] = ("operand",)
-
-    def _reach(self, dt: float) -> tuple[float, float]:
-        return 0.0, self.interval.end
+    word, sign = "always", -1
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Eventually(Formula):
+class Eventually(Window):
     """`f` at some instant of the interval ahead."""
 
-    operand: Formula
-    interval: Interval = field(default=EVERYTHING)
-    children: ClassVar[tuple[str, ...]] = ("operand",)
-
-    def _reach(self, dt: float) -> tuple[float, float]:
-        return 0.0, self.interval.end
+    word, sign = "eventually", 1
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Historically(Formula):
-    """`f` at every instant of the interval behind."""
+class Historically(Window):
+    """`f` at every instant of the interval before now."""
 
-    operand: Formula
-    interval: Interval = field(default=EVERYTHING)
-    children: ClassVar[tuple[str, ...]] = ("operand",)
-
-    def _reach(self, dt: float) -> tuple[float, float]:
-        return self.interval.end, 0.0
+    word, sign = "historically", -1
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Once(Formula):
-    """`f` at some instant of the interval behind."""
+class Once(Window):
+    """`f` at some instant of the interval before now."""
 
-    operand: Formula
-    interval: Interval = field(default=EVERYTHING)
-    children: ClassVar[tuple[str, ...]] = ("operand",)
-
-    def _reach(self, dt: float) -> tuple[float, float]:
-        return self.interval.end, 0.0
+    word, sign = "once", 1
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -377,9 +304,7 @@ class Next(Formula):
 
     operand: Formula
     children: ClassVar[tuple[str, ...]] = ("operand",)
-
-    def _reach(self, dt: float) -> tuple[float, float]:
-        return 0.0, dt
+    word = "next"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -390,34 +315,87 @@ class Prev(Formula):
     weak: bool = False
     children: ClassVar[tuple[str, ...]] = ("operand",)
 
-    def _reach(self, dt: float) -> tuple[float, float]:
-        return dt, 0.0
+    @property
+    def word(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The operator, which depends on `weak`."""
+        return "weak_prev" if self.weak else "prev"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Until(Formula):
+class Witness(Formula):
+    """`right` at some instant of an interval, and `left` at every one between now and there."""
+
+    left: Formula
+    right: Formula
+    interval: Interval = field(default=EVERYTHING)
+    children: ClassVar[tuple[str, ...]] = ("left", "right")
+
+
+class Until(Witness):
     """`right` at some instant of the interval ahead, and `left` at every one before it."""
 
-    left: Formula
-    right: Formula
-    interval: Interval = field(default=EVERYTHING)
-    children: ClassVar[tuple[str, ...]] = ("left", "right")
-
-    def _reach(self, dt: float) -> tuple[float, float]:
-        return 0.0, self.interval.end
+    word = "until"
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Since(Formula):
-    """`right` at some instant of the interval behind, and `left` at every one after it."""
+class Since(Witness):
+    """`right` at some instant of the interval before now, and `left` at every one after it."""
 
-    left: Formula
-    right: Formula
-    interval: Interval = field(default=EVERYTHING)
-    children: ClassVar[tuple[str, ...]] = ("left", "right")
+    word = "since"
 
-    def _reach(self, dt: float) -> tuple[float, float]:
-        return self.interval.end, 0.0
+
+class Derived(Formula):
+    """An operator whose meaning is a formula of other operators, which gives it every semantics.
+
+    A subclass has its operands and its interval as fields, and defines `meaning`.
+    """
+
+    @cached_property
+    def meaning(self) -> Formula:
+        """The formula of other operators that it stands for."""
+        raise missing_case("the meaning", self)
+
+    @property
+    def side(self) -> str:
+        """Nothing: its meaning is what looks ahead or back."""
+        return ""
+
+    def below(self) -> tuple[Node, ...]:
+        """Return the nodes among its fields, and its meaning."""
+        return *super().below(), self.meaning
+
+    def valued(self) -> tuple[Formula, ...]:
+        """Return its meaning."""
+        return (self.meaning,)
+
+
+NODES: dict[str, Callable[..., Formula]] = {
+    "not": Not,
+    "and": lambda *parts: And(parts),
+    "or": lambda *parts: Or(parts),
+    "next": Next,
+    "prev": Prev,
+    "weak_prev": lambda operand: Prev(operand, weak=True),
+    "implies": Formula.implies,
+    "iff": Formula.iff,
+    "xor": Formula.__xor__,
+    "weak_until": lambda left, right, span: left.weak_until(right, span.start, span.end),
+    "release": lambda left, right, span: left.release(right, span.start, span.end),
+    **{kind.word: kind for kind in (Always, Eventually, Historically, Once, Until, Since)},
+}
+"""What makes each operator of its operands, and of its interval if it takes one."""
+
+
+def build(word: str, operands: Iterable[Formula], interval: Interval = EVERYTHING) -> Formula:
+    """Return the formula of an operator over operands.
+
+    **Arguments:**
+
+    - `word`: of the operator, a key of `OPERATORS`.
+    - `operands`: as many as the operator takes.
+    - `interval`: for an operator that takes one.
+    """
+    spans = (interval,) if OPERATORS[word].timed else ()
+    return NODES[word](*operands, *spans)
 
 
 def surface(f: Formula) -> tuple[str, tuple[Formula, ...], Interval | None]:
@@ -438,28 +416,7 @@ def surface(f: Formula) -> tuple[str, tuple[Formula, ...], Interval | None]:
             return "weak_until", (p, q), interval
         case Or((Not(p), q)):
             return "implies", (p, q), None
-        case Not(p):
-            return "not", (p,), None
-        case And(parts):
-            return "and", parts, None
-        case Or(parts):
-            return "or", parts, None
-        case Next(p):
-            return "next", (p,), None
-        case Prev(p, weak):
-            return "weak_prev" if weak else "prev", (p,), None
-        case Until(p, q, interval):
-            return "until", (p, q), interval
-        case Since(p, q, interval):
-            return "since", (p, q), interval
-        case (
-            Always(p, interval)
-            | Eventually(p, interval)
-            | Historically(p, interval)
-            | Once(p, interval)
-        ):
-            return type(f).__name__.lower(), (p,), interval
-    raise missing_case("the text", f)
+    return f.operator.word, f.operands(), f.interval if f.operator.timed else None
 
 
 TRUE = Constant(True)

@@ -5,13 +5,13 @@ import functools
 import re
 from typing import Any, Protocol, runtime_checkable
 
-from verifai_jax.mtl.words import ANGLES, NAME, RESERVED, WORDS
+from verifai_jax.mtl.words import ANGLES, NAME, OPERATORS, RESERVED, WORDS
 
-UNARY = ("always", "eventually", "historically", "once", "next", "prev", "weak_prev")
-"""Operators in front of one operand."""
+UNARY = tuple(word for word, o in OPERATORS.items() if o.side and o.operands == 1)
+"""Temporal operators in front of one operand."""
 
-BINARY = ("until", "weak_until", "release", "since")
-"""Operators between two operands."""
+BINARY = tuple(word for word, o in OPERATORS.items() if o.side and o.operands == 2)
+"""Temporal operators between two operands."""
 
 
 _SHOWN = 400

@@ -37,7 +37,9 @@ class Node(ForUsers):
     """A node that is equal to another of the same kind with equal fields."""
 
     _internal = frozenset((
-        "below", "children", "depth", "is_signal", "operands", "temporal_depth", "terms", "text",
+        "below", "children", "compared", "depth", "first_look_ahead", "interval", "is_predicate",
+        "is_signal", "meaning", "number", "operands", "operator", "side", "span", "temporal_depth",
+        "terms", "text", "valued", "word",
     ))  # fmt: skip
 
     def below(self) -> tuple["Node", ...]:

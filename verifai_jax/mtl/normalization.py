@@ -47,7 +47,7 @@ def normalize(formula: Formula, scales: Mapping[str, float] | Trace) -> Formula:
     leaves: dict[Formula, float] = {
         leaf: max(float(scales[name]) for name in leaf.signals())
         for leaf in formula.subformulas()
-        if isinstance(leaf, ast.Predicate | ast.Atom)
+        if leaf.is_predicate
     }
     return _mapped(formula, leaves)
 
@@ -74,7 +74,7 @@ def _spreads(formula: Formula, trace: Trace) -> dict[Formula, float]:
     evaluator = Evaluator(arrays, setting.length, setting.dt)
     spreads = {}
     for leaf in formula.subformulas():
-        if isinstance(leaf, ast.Predicate | ast.Atom):
+        if leaf.is_predicate:
             margin = np.asarray(evaluator.value(leaf, 0, setting.length - 1))
             spread = float(np.ptp(margin[np.isfinite(margin)])) if np.isfinite(margin).any() else 0
             # Three digits are plenty for a scale, and the formula stays readable.

@@ -8,7 +8,7 @@ from decimal import Decimal
 
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.formula import FALSE, TRUE, Formula, Interval
-from verifai_jax.mtl.node import missing_case
+from verifai_jax.mtl.node import missing_case, postorder
 
 
 def nnf(f: Formula) -> Formula:
@@ -23,12 +23,6 @@ def nnf(f: Formula) -> Formula:
 
 
 _OPPOSITE = {">": "<=", ">=": "<", "<": ">=", "<=": ">", "==": "!=", "!=": "=="}
-_DUAL: dict[type, type] = {
-    ast.Always: ast.Eventually,
-    ast.Eventually: ast.Always,
-    ast.Historically: ast.Once,
-    ast.Once: ast.Historically,
-}
 
 
 def _nnf(f: Formula, positive: bool, known: dict[tuple[Formula, bool], Formula]) -> Formula:
@@ -48,25 +42,16 @@ def _nnf_node(f: Formula, positive: bool, known: dict[tuple[Formula, bool], Form
             return f if positive else ast.Not(f)
         case ast.Not(operand):
             return _nnf(operand, not positive, known)
-        case ast.And(parts) | ast.Or(parts):
-            kind = ast.And if isinstance(f, ast.And) == positive else ast.Or
-            return kind(tuple(_nnf(part, positive, known) for part in parts))
-        case ast.Next(operand):
-            return ast.Next(_nnf(operand, positive, known))
-        case ast.Prev(operand, weak):
-            return ast.Prev(_nnf(operand, positive, known), weak == positive)
-        case ast.Until(left, right, interval) | ast.Since(left, right, interval):
+        case ast.Witness(left, right, interval):
             kept = type(f)(_nnf(left, True, known), _nnf(right, True, known), interval)
             return kept if positive else ast.Not(kept)
-        case (
-            ast.Always(operand, interval)
-            | ast.Eventually(operand, interval)
-            | ast.Historically(operand, interval)
-            | ast.Once(operand, interval)
-        ):
-            kind = type(f) if positive else _DUAL[type(f)]
-            return kind(_nnf(operand, positive, known), interval)
-    raise missing_case("the negation normal form", f)
+        case ast.Derived():
+            return _nnf(f.meaning, positive, known)
+    if not f.operator.dual:
+        raise missing_case("the negation normal form", f)
+    word = f.operator.word if positive else f.operator.dual
+    operands = [_nnf(part, positive, known) for part in f.operands()]
+    return ast.build(word, operands, *([f.interval] if f.operator.timed else ()))
 
 
 def simplify(f: Formula) -> Formula:
@@ -145,21 +130,16 @@ def _simplified_join(parts: tuple[Formula, ...], neutral: Formula, absorbing: Fo
 
 def rebuild(f: Formula, operands: tuple[Formula, ...]) -> Formula:
     """Return the same operator over other operands."""
-    match f:
-        case ast.And():
-            return ast.And(operands)
-        case ast.Or():
-            return ast.Or(operands)
-        case ast.Until() | ast.Since():
-            return type(f)(operands[0], operands[1], f.interval)
-        case ast.Always() | ast.Eventually() | ast.Historically() | ast.Once():
-            return type(f)(operands[0], f.interval)
-        case ast.Next():
-            return ast.Next(operands[0])
-        case ast.Prev():
-            return ast.Prev(operands[0], f.weak)
-        case ast.Not():
-            return ast.Not(operands[0])
-        case ast.Constant() | ast.Predicate() | ast.Atom():
-            return f
-    raise missing_case("the rewriting", f)
+    if isinstance(f, ast.Leaf):
+        return f
+    return ast.build(f.operator.word, operands, *([f.interval] if f.operator.timed else ()))
+
+
+def expand(f: Formula) -> Formula:
+    """Return a formula with the meaning of each operator that is made of others in its place."""
+    known: dict[Formula, Formula] = {}
+    for part in postorder(f):
+        if isinstance(part, Formula):
+            operands = tuple(known[p] for p in part.valued())
+            known[part] = operands[0] if isinstance(part, ast.Derived) else rebuild(part, operands)
+    return known[f]

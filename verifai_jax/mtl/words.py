@@ -1,7 +1,8 @@
-"""The words of the text grammar, and how operators are put together from the text of their parts.
+"""The table of operators, the words of the text grammar, and how texts are put together.
 
     number_text(2.0), name_text("theta")                          # '2', 'theta'
     operator_text("always", "[0,4]", [Text("x <= 2", "leaf")])    # 'always[0,4] (x <= 2)'
+    OPERATORS["always"].latex                                     # a backslash and 'Box'
 
 Nothing here knows formulas: they hand over their operator's word and the text of their operands.
 """
@@ -9,6 +10,7 @@ Nothing here knows formulas: they hand over their operator's word and the text o
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
@@ -23,34 +25,112 @@ NUMBERS = {"pi": math.pi}
 ANGLES = {"deg": math.pi / 180, "rad": 1.0}
 """Units that may follow a number in an expression, in rad."""
 
+
+@dataclass(frozen=True)
+class Operator:
+    """All that is known of an operator but its meaning, which its node in `formula` has.
+
+    - `words`: the words and symbols that are read as it, the one that names it first.
+    - `latex`: symbol in LaTeX.
+    - `english`: sentence, with `{0}` and `{1}` for the operands and `{when}` for the interval.
+    - `operands`: 1 for an operator in front of its operand, 2 for one between its operands.
+    - `side`: where it looks from an instant on, or nothing for a Boolean connective.
+    - `timed`: whether it takes an interval.
+    - `symbol`: what is printed instead of the first word.
+    - `dual`: word of the operator by whose help a negation moves inwards, as in `!always f`, which
+      is `eventually !f`; nothing where no node is the dual.
+    """
+
+    words: tuple[str, ...]
+    latex: str
+    english: str
+    operands: Literal[1, 2] = 1
+    side: Literal["", "ahead", "back"] = ""
+    timed: bool = False
+    symbol: str = ""
+    dual: str = ""
+
+    @property
+    def word(self) -> str:
+        """The word that names it."""
+        return self.words[0]
+
+
+OPERATORS: dict[str, Operator] = {
+    operator.word: operator
+    for operator in (
+        Operator(
+            ("always", "alw", "G", "[]"), r"\Box", "at all times{when}, {0}",
+            side="ahead", timed=True, dual="eventually",
+        ),
+        Operator(
+            ("eventually", "ev", "F", "<>"), r"\Diamond", "at some time{when}, {0}",
+            side="ahead", timed=True, dual="always",
+        ),
+        Operator(
+            ("historically", "hist", "H"), r"\boxminus", "at all times until now{when}, {0}",
+            side="back", timed=True, dual="once",
+        ),
+        Operator(
+            ("once", "O"), r"\diamondminus", "at some time until now{when}, {0}",
+            side="back", timed=True, dual="historically",
+        ),
+        Operator(
+            ("next", "X", "@"), r"\bigcirc", "at the next sample, {0}", side="ahead", dual="next",
+        ),
+        Operator(
+            ("prev", "Y"), r"\ominus", "at the previous sample, {0}",
+            side="back", dual="weak_prev",
+        ),
+        Operator(
+            ("weak_prev",), r"\widetilde{\ominus}",
+            "at the previous sample, if there is one, {0}", side="back", dual="prev",
+        ),
+        Operator(
+            ("until", "U"), r"\mathbin{\mathcal{U}}", "{0} until, at some time{when}, {1}",
+            operands=2, side="ahead", timed=True,
+        ),
+        Operator(
+            ("weak_until", "unless", "W"), r"\mathbin{\mathcal{W}}",
+            "{0} until {1}{when}, or all the time", operands=2, side="ahead", timed=True,
+        ),
+        Operator(
+            ("release", "R"), r"\mathbin{\mathcal{R}}",
+            "{1} until {0} frees it{when}, or all the time", operands=2, side="ahead", timed=True,
+        ),
+        Operator(
+            ("since", "S"), r"\mathbin{\mathcal{S}}", "{0} since, at some time{when}, {1}",
+            operands=2, side="back", timed=True,
+        ),
+        Operator(("not", "!", "~"), r"\lnot", "it is not so that {0}", symbol="!"),
+        Operator(
+            ("and", "&&", "&"), r"\land", "{0} and {1}", operands=2, symbol="&", dual="or"
+        ),
+        Operator(("or", "||", "|"), r"\lor", "{0} or {1}", operands=2, symbol="|", dual="and"),
+        Operator(
+            ("implies", "->", "=>"), r"\rightarrow", "whenever {0}, {1}", operands=2, symbol="->"
+        ),
+        Operator(
+            ("iff", "<->"), r"\leftrightarrow", "{0} exactly when {1}", operands=2, symbol="<->"
+        ),
+        # The symbol `^` is read, and not printed: it is read as a power, too.
+        Operator(
+            ("xor", "^"), r"\oplus", "either {0} or {1}, and not both", operands=2, symbol="xor"
+        ),
+    )
+}  # fmt: skip
+"""Every operator by its word: the one table that parsing, printing, rewriting, horizons, LaTeX and
+English read."""
+
 WORDS: dict[str, tuple[str, ...]] = {
-    "always": ("always", "alw", "G", "[]"),
-    "eventually": ("eventually", "ev", "F", "<>"),
-    "historically": ("historically", "hist", "H"),
-    "once": ("once", "O"),
-    "next": ("next", "X", "@"),
-    "prev": ("prev", "Y"),
-    "weak_prev": ("weak_prev",),
-    "until": ("until", "U"),
-    "weak_until": ("weak_until", "unless", "W"),
-    "release": ("release", "R"),
-    "since": ("since", "S"),
-    "not": ("not", "!", "~"),
-    "and": ("and", "&&", "&"),
-    "or": ("or", "||", "|"),
-    "implies": ("implies", "->", "=>"),
-    "iff": ("iff", "<->"),
-    "xor": ("xor", "^"),
+    **{word: operator.words for word, operator in OPERATORS.items()},
     "TRUE": ("TRUE", "True", "true"),
     "FALSE": ("FALSE", "False", "false"),
 }
-"""Every word and symbol of the text grammar, by the operator it stands for."""
+"""Every word and symbol of the text grammar, by the operator or constant it stands for."""
 
 RESERVED = frozenset(w for words in WORDS.values() for w in words if NAME.fullmatch(w))
 """Words that a signal's name can only be in quotes."""
-
-SYMBOLS = {"and": "&", "or": "|", "implies": "->", "iff": "<->", "xor": "xor"}
-"""Boolean connectives as they are printed: symbols, but for `^`, which is read as a power too."""
 
 
 class Text(NamedTuple):
@@ -87,18 +167,19 @@ def operator_text(word: str, interval: str, operands: Sequence[Text]) -> Text:
 
     **Arguments:**
 
-    - `word`: operator, a key of `WORDS`.
+    - `word`: operator, a key of `OPERATORS`.
     - `interval`: text of its interval; empty where it has none.
     - `operands`: text of its operands.
     """
-    if word in SYMBOLS:
+    symbol = OPERATORS[word].symbol
+    if symbol and len(operands) == 1:
+        return Text(f"{symbol}{operands[0].wrapped()}", "negation")
+    if symbol:
         plain = ("name", "leaf", "negation")
         texts = [part.text if part.kind in plain else f"({part.text})" for part in operands]
         if word == "implies" and operands[1].kind == "prefix":
             texts[1] = operands[1].text
-        return Text(f" {SYMBOLS[word]} ".join(texts), "infix")
-    if word == "not":
-        return Text(f"!{operands[0].wrapped()}", "negation")
+        return Text(f" {symbol} ".join(texts), "infix")
     if len(operands) == 1:
         (operand,) = operands
         chain = operand.kind in ("negation", "prefix")

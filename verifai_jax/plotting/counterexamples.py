@@ -18,8 +18,8 @@ from verifai_jax.counterexamples._explain import Explained, Influence
 from verifai_jax.counterexamples._shrink import Shrunk
 from verifai_jax.counterexamples.description import format_apart, format_number
 from verifai_jax.mtl import Explanation, robustness_signal
-from verifai_jax.mtl.expression import Arithmetic, Number
-from verifai_jax.mtl.formula import Atom, Predicate
+from verifai_jax.mtl.bounds import constant_bounds
+from verifai_jax.mtl.formula import formula
 from verifai_jax.plotting.style import (
     BOUND,
     FAILING,
@@ -72,28 +72,24 @@ def draw_decision(axes: Axes, why: Explanation) -> None:
     """Draw the deciding predicate's left side over time, its bound, and the decisive instant."""
     trace, predicate = why.trace, why.predicate
     clock = np.asarray(trace.clock())
-    expression: Any = predicate.left if isinstance(predicate, Predicate) else None
-    bounds: list[float] = []
-    if isinstance(predicate, Predicate) and isinstance(predicate.right, Number):
-        limit, bounds = predicate.right.value, [predicate.right.value]
-        absolute = isinstance(expression, Arithmetic) and expression.name == "abs"
-        if absolute and predicate.comparison in ("<", "<="):
-            # A person looks at x, not at its absolute value.
-            expression, bounds = expression.arguments[0], [limit, -limit]
-    if expression is None:
+    # A person looks at x, not at its absolute value.
+    bounded = constant_bounds(predicate)
+    if bounded is None:
         values, label = (
             np.asarray(robustness_signal(predicate, trace)),
             f"robustness of {predicate}",
         )
         bounds = [0.0]
     else:
-        values = np.asarray(robustness_signal(Atom(expression), trace))
+        expression, bounds = bounded
+        values = np.asarray(robustness_signal(formula(expression), trace))
         label = str(expression)
     values, margin = values[: len(clock)], np.asarray(robustness_signal(predicate, trace))
     axes.plot(clock, values, color=BOUND, linewidth=1.7)
-    if isinstance(predicate, Predicate) and not bounds:
-        other = np.asarray(robustness_signal(Atom(predicate.right), trace))[: len(clock)]
-        axes.plot(clock, other, "--", color=QUIET, linewidth=1.2, label=str(predicate.right))
+    if predicate.compared and not bounds:
+        _, _, right = predicate.compared
+        other = np.asarray(robustness_signal(formula(right), trace))[: len(clock)]
+        axes.plot(clock, other, "--", color=QUIET, linewidth=1.2, label=str(right))
         axes.legend(fontsize=8, frameon=False)
     reach = max(float(np.nanmax(np.abs(values))), 1e-9)
     for bound in bounds:

@@ -16,16 +16,9 @@ from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import is_waveform
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.mtl import Expression, Formula, explain, nnf, robustness_signal
+from verifai_jax.mtl.bounds import predicates_of, signal_bounds
 from verifai_jax.mtl.evaluate import End
-from verifai_jax.mtl.expression import (
-    Arithmetic,
-    Component,
-    Number,
-    Signal,
-    constant_value,
-    expression,
-)
-from verifai_jax.mtl.formula import Atom, Predicate
+from verifai_jax.mtl.expression import constant_value
 from verifai_jax.plotting.style import (
     BOUND,
     FAILING,
@@ -208,68 +201,6 @@ def decisive_instant(formula: Formula, trace: Trace, end: End = "hold") -> tuple
     return named[0], int(np.argmin(np.abs(clock - why.time)))
 
 
-def signal_bounds(formula: Formula, signal: str) -> list[tuple[Formula, list[Expression]]]:
-    """Return what predicates compare this signal with, as far as they can be solved for it.
-
-    `abs(x - 1) <= 0.2` bounds x by 1.2 and 0.8, `y >= 2 * x` bounds y by 2 * x.
-    """
-    bounds = []
-    for part in _comparisons(formula):
-        sides = (part.expression, Number(0)) if isinstance(part, Atom) else part.terms()
-        left, right = map(expression, sides)
-        for inner, limit in ((left, right), (right, left)):
-            if signal in inner.signals() and signal not in limit.signals():
-                limits = _solved(inner, signal, limit)
-                if limits:
-                    bounds.append((part, limits))
-    return bounds
-
-
-def _comparisons(formula: Formula) -> list[Predicate | Atom]:
-    """Return the predicates of a formula, each once."""
-    parts = dict.fromkeys(formula.subformulas())
-    return [part for part in parts if isinstance(part, Predicate | Atom)]
-
-
-def _solved(inner: Expression, signal: str, limit: Expression) -> list[Expression]:
-    """Return the values of the signal at which `inner` is `limit`; none where it is not linear.
-
-    An absolute value has two.
-    """
-    limits = [limit]
-    try:
-        while isinstance(inner, Arithmetic):
-            if inner.name == "abs":
-                inner, limits = inner.arguments[0], [*limits, *(-each for each in limits)]
-                continue
-            if inner.name == "neg":
-                inner, limits = inner.arguments[0], [-each for each in limits]
-                continue
-            if inner.name not in ("+", "-", "*", "/"):
-                return []
-            left, right = inner.arguments
-            first = signal in left.signals()
-            if first and signal in right.signals():
-                return []
-            other = right if first else left
-            if inner.name in ("*", "/") and constant_value(other) is None:
-                return []
-            if inner.name == "+":
-                limits = [each - other for each in limits]
-            elif inner.name == "-":
-                limits = [each + other if first else other - each for each in limits]
-            elif inner.name == "*":
-                limits = [each / other for each in limits]
-            else:
-                limits = [each * other if first else other / each for each in limits]
-            inner = left if first else right
-    except ValueError:  # a division by zero
-        return []
-    if isinstance(inner, Component):
-        inner = inner.vector
-    return limits if inner == Signal(signal) else []
-
-
 def _bounds(replay: Replay, signal: str, shown: Sequence[str]) -> dict[Formula, list[Expression]]:
     """Return the predicates of all formulas that belong to a panel, with their limits in it.
 
@@ -277,7 +208,7 @@ def _bounds(replay: Replay, signal: str, shown: Sequence[str]) -> dict[Formula, 
     """
     bounds: dict[Formula, list[Expression]] = {}
     for formula in replay.problem.formulas.values():
-        for part in _comparisons(formula):
+        for part in predicates_of(formula):
             drawn = [name for name in shown if name in part.signals()]
             if any(signal_bounds(part, name) for name in drawn):
                 bounds |= dict(signal_bounds(part, signal))
@@ -295,7 +226,7 @@ def _predicates_to_blame(replay: Replay) -> set[Formula]:
     for name, formula in replay.problem.formulas.items():
         rho = replay.rho[name]
         if rho < 0 or (rho == 0 and replay.violated):
-            blamed |= set(_comparisons(nnf(formula)))
+            blamed |= set(predicates_of(nnf(formula)))
     return blamed
 
 

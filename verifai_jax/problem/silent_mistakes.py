@@ -22,10 +22,7 @@ from verifai_jax.core.programs import Slot
 from verifai_jax.core.steps import PROGRAM, used_inputs
 from verifai_jax.core.text import format_seconds
 from verifai_jax.core.user_errors import source_line
-from verifai_jax.features import Categorical, Domain
-from verifai_jax.features.compound import Struct
-from verifai_jax.mtl import Formula
-from verifai_jax.mtl.formula import Always, Eventually, Next, Until
+from verifai_jax.features import Domain
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import System
 
@@ -73,7 +70,7 @@ def beyond_the_trace(problem: Problem) -> Iterator[str]:
     if form is None or form.dt is None or duration is None or problem.end not in END_OF_TRACE:
         return
     for name, formula in problem.formulas.items():
-        ahead = first_look_ahead(formula, form.dt)
+        ahead = formula.first_look_ahead(form.dt)
         # A trace of n samples lasts n - 1 periods, and many count n.
         if math.isfinite(ahead) and ahead > duration + 1.01 * form.dt:
             which = "the formula" if len(problem.formulas) == 1 else f"formula {name!r}"
@@ -82,27 +79,6 @@ def beyond_the_trace(problem: Problem) -> Iterator[str]:
                 f"{format_seconds(duration)}: "
                 f"{END_OF_TRACE[problem.end]}"
             )
-
-
-def first_look_ahead(formula: Formula, dt: float, start: float = 0.0) -> float:
-    """Return the end of the latest window of a formula whose every operator begins at its earliest.
-
-    Unbounded windows end with the trace and do not count.
-
-    **Arguments:**
-
-    - `formula`: any.
-    - `dt`: sampling period in seconds, by which `next` looks ahead.
-    - `start`: instant at which the formula is asked, in seconds.
-    """
-    begin = end = start
-    if isinstance(formula, Always | Eventually | Until):
-        begin, end = start + formula.interval.start, start + formula.interval.end
-    elif isinstance(formula, Next):
-        begin = end = start + dt
-    latest = end if math.isfinite(end) else begin
-    parts = [first_look_ahead(part, dt, begin) for part in formula.operands()]
-    return max([latest, *parts])
 
 
 def mistakes_of_the_system(problem: Problem) -> Iterator[str]:
@@ -171,7 +147,7 @@ def _unread(problem: Problem, program: Program, features: PyTree) -> Iterator[st
         one = len(unread) == 1
         more = f" and {len(unread) - 6} more" if len(unread) > 6 else ""
         domains = [problem.space.domains[names[0]] for names in unread]
-        texts = any(isinstance(d, Categorical) and not d.numeric for d in domains)
+        texts = not all(domain.numeric for domain in domains)
         yield (
             f"feature{'' if one else 's'} {shown}{more} influence{'s' if one else ''} no signal "
             f"that the property speaks of ({', '.join(problem.monitored)}): "
@@ -193,10 +169,9 @@ def _order(problem: Problem) -> Iterator[tuple[str, ...]]:
     """Yield the names of all features that vary, fields of structures one by one."""
 
     def below(names: tuple[str, ...], domain: Domain) -> Iterator[tuple[str, ...]]:
-        if isinstance(domain, Struct):
-            for name, part in domain.fields:
-                yield from below((*names, name), part)
-        elif domain.size:
+        for name, part in domain.named:
+            yield from below((*names, name), part)
+        if domain.size and not domain.named:
             yield names
 
     return below((), problem.space.root)

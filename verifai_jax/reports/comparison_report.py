@@ -2,6 +2,7 @@
 
 from verifai_jax.comparison.result import BETTER, SAME, WORSE, Comparison
 from verifai_jax.core.text import format_percent
+from verifai_jax.features.english import number
 from verifai_jax.problem.problem import Problem
 from verifai_jax.reports.claims import Claim, claims_json
 from verifai_jax.reports.markup import Markup, bullets, element, paragraph, preformatted, table
@@ -17,7 +18,6 @@ from verifai_jax.reports.sections import (
     problem_content,
     provenance_content,
 )
-from verifai_jax.reports.words import number
 
 PAIRED = (
     "Both sides of a pair have the same features, drawn independently from the prior, and the same "

@@ -2,12 +2,12 @@
 
 from verifai_jax.core.text import format_percent
 from verifai_jax.failure_modes import Mode, Modes
+from verifai_jax.features.english import number
 from verifai_jax.reports.markup import Markup, bullets, element, paragraph, picture, table
 from verifai_jax.reports.page import Section
 from verifai_jax.reports.run_question import About
 from verifai_jax.reports.sections import MODEL, NOT_SEEN, SAMPLES
 from verifai_jax.reports.studies import png
-from verifai_jax.reports.words import number
 
 MOST_MODES = 8
 """Ways of failing that are written out."""

@@ -10,6 +10,7 @@ from verifai_jax.falsification.no_rate import what_lies_between, why_no_rate
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.summary import first_message
 from verifai_jax.features.density import tails
+from verifai_jax.features.english import number
 from verifai_jax.plotting.scatter import plot_features
 from verifai_jax.reports.commands import replay_command
 from verifai_jax.reports.markup import (
@@ -26,7 +27,6 @@ from verifai_jax.reports.markup import (
 from verifai_jax.reports.page import Section
 from verifai_jax.reports.run_question import About
 from verifai_jax.reports.studies import Failure, Studies, png
-from verifai_jax.reports.words import number
 
 DRAWN = ("clusters", "importance", "coverage")
 """Analyses of the table that a report draws."""

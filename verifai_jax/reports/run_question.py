@@ -9,11 +9,12 @@ import numpy as np
 from verifai_jax.core.text import format_seconds, one_line
 from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
+from verifai_jax.features.english import number
 from verifai_jax.mtl import parse
+from verifai_jax.mtl.english import formula_words
 from verifai_jax.problem.problem import Problem
 from verifai_jax.reports.markup import Child, Markup, element, paragraph, table
 from verifai_jax.reports.page import Section
-from verifai_jax.reports.words import domain_words, formula_words, number
 
 ENDS = {
     "hold": "After the end of a trace its last sample counts as if it went on for ever.",
@@ -91,7 +92,7 @@ def _all(count: int) -> str:
 
 def prior_rows(space: FeatureSpace) -> list[tuple[str, str]]:
     """Return each feature with its prior in words."""
-    return [(name, domain_words(domain)) for name, domain in space.domains.items()]
+    return [(name, domain.words()) for name, domain in space.domains.items()]
 
 
 def _space(run: Run, space: FeatureSpace | None, about: About) -> Markup:

@@ -8,6 +8,7 @@ from verifai_jax.falsification.no_rate import why_no_rate
 from verifai_jax.falsification.record import RECORD
 from verifai_jax.falsification.run import Run
 from verifai_jax.mtl import parse
+from verifai_jax.mtl.english import formula_words
 from verifai_jax.reports.claims import Claim, claims_json
 from verifai_jax.reports.commands import replay_command, report_command, run_command, run_python
 from verifai_jax.reports.markup import element, paragraph, preformatted
@@ -40,7 +41,6 @@ from verifai_jax.reports.sections import (
 )
 from verifai_jax.reports.studies import Studies, study
 from verifai_jax.reports.view import view_data
-from verifai_jax.reports.words import formula_words
 
 FILES = (
     (RECORD, "the record of the run"),

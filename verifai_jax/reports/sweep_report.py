@@ -3,6 +3,7 @@
 from typing import Any
 
 from verifai_jax.core.text import format_percent
+from verifai_jax.features.english import number
 from verifai_jax.reports.claims import Claim, claims_json
 from verifai_jax.reports.commands import report_command
 from verifai_jax.reports.markup import bullets, paragraph, picture, preformatted, table
@@ -18,7 +19,6 @@ from verifai_jax.reports.sections import (
     provenance_content,
 )
 from verifai_jax.reports.studies import png
-from verifai_jax.reports.words import number
 from verifai_jax.sweeps.result import Sweep
 
 FILES = (

@@ -161,24 +161,22 @@ class Chosen(Leaf):
 
     def draw(self, parts: Parts, given: Given, xp: Any) -> Any:
         part = parts[self.feature]
-        domain = self.domains[self.feature]
         if self.values is None:
             return int(part) if xp is np else part
-        if isinstance(domain, Categorical):
-            place = part
-            if domain.numeric:
-                choices = np.array(domain.choices, np.float64)
-                place = xp.argmin(xp.abs(choices.astype(np.float32) - xp.float32(part)))
-        else:
-            place = 0
-        return self.values[int(place)] if xp is np else jnp.asarray(self.values)[place]
+        domain = self.domains[self.feature]
+        # A single option is a constant, and has no choices to be told apart.
+        index = 0 if domain.tuning is None else part
+        if domain.tuning is not None and domain.numeric:
+            choices = np.array(domain.tuning.choices, np.float64)
+            index = xp.argmin(xp.abs(choices.astype(np.float32) - xp.float32(part)))
+        return self.values[int(index)] if xp is np else jnp.asarray(self.values)[index]
 
     def invert(self, value: Any, given: Given) -> dict[str, Any]:
         if self.values is None:
             return {self.feature: int(value)}
-        place = self.values.index(int(value))
-        domain = self.domains[self.feature]
-        return {self.feature: domain.choices[place] if isinstance(domain, Categorical) else place}
+        index = self.values.index(int(value))
+        tuning = self.domains[self.feature].tuning
+        return {self.feature: index if tuning is None else tuning.choices[index]}
 
 
 class Place(Leaf):

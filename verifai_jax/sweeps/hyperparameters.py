@@ -11,15 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.features import (
-    Box,
-    Categorical,
-    Constant,
-    DiscreteBox,
-    FeatureSpace,
-    LogUniform,
-    TruncatedNormal,
-)
+from verifai_jax.features import FeatureSpace
 from verifai_jax.features.domain import Domain
 
 Hyperparameters: TypeAlias = dict[str, Any]
@@ -56,31 +48,25 @@ def values_of_features(space: FeatureSpace, features: Mapping[str, Any]) -> list
     for name, domain in space.domains.items():
         texts = {str(choice): choice for choice in getattr(domain, "choices", ())}
         for i in range(count):
-            if isinstance(domain, Constant):
-                value = domain.value
-            else:
-                value = columns[name][i]
-                value = value.item() if isinstance(value, np.generic) else value
+            # A constant has no column.
+            value = columns[name][i] if domain.columns(name) else domain.held_at
+            value = value.item() if isinstance(value, np.generic) else value
             values[i][name] = texts.get(value, value) if isinstance(value, str) else value
     return values
 
 
 def probe_values(domain: Domain) -> list[tuple[Any, str]]:
     """Return choices or ends of a domain to check, and the place of each in words."""
-    match domain:
-        case Constant():
-            return [(domain.value, "the value")]
-        case Categorical() if len(domain.choices) <= _MOST_PROBES:
-            return [(choice, "a choice") for choice in domain.choices]
-        case DiscreteBox(int(low), int(high)) if high - low < _MOST_PROBES:
-            inner = [(value, "a value") for value in range(low + 1, high)]
-            return [(domain.low, "the lower end"), *inner, (domain.high, "the upper end")]
-        case Box(closed="left" | "right" | "neither"):
-            low, high = domain.ends(np.float64)
-            return [(low.tolist(), "the lower end"), (high.tolist(), "the upper end")]
-        case Box() | DiscreteBox() | LogUniform() | TruncatedNormal():
-            # The ends as they were written, not rounded to float32.
-            return [(domain.low, "the lower end"), (domain.high, "the upper end")]
+    if not domain.columns("value"):
+        return [(domain.held_at, "the value")]
+    if (tuning := domain.tuning) is not None:
+        if 0 < len(tuning.choices) <= _MOST_PROBES:
+            return [(choice, "a choice") for choice in tuning.choices]
+        if not tuning.choices:
+            low, high = tuning.low, tuning.high
+            few = tuning.scale == "integer" and np.ndim(low) == 0 and high - low < _MOST_PROBES
+            inner = [(value, "a value") for value in range(low + 1, high)] if few else []
+            return [(low, "the lower end"), *inner, (high, "the upper end")]
     space = FeatureSpace({"value": domain})
     if not domain.size:
         return [(values_at(space, np.zeros((1, 0)))[0]["value"], "the value")]

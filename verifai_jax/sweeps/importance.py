@@ -25,7 +25,7 @@ from jaxtyping import Float, Int
 
 from verifai_jax.core.lazy import late
 from verifai_jax.core.text import format_percent
-from verifai_jax.features import Constant, FeatureSpace
+from verifai_jax.features import FeatureSpace
 from verifai_jax.sweeps.fanova import leaf_boxes, variance_shares
 from verifai_jax.sweeps.trends import trends
 
@@ -314,7 +314,7 @@ def _inputs(
         number = pd.api.types.is_numeric_dtype(entries) and not pd.api.types.is_bool_dtype(entries)
         # Checkpoints need not lie in the domain of the lengths of trainings.
         domain = None if name == "steps" else domains.get(name)
-        if domain is not None and domain.size == 1 and not isinstance(domain, Constant):
+        if domain is not None and domain.size == 1:
             present = entries.dropna().unique().tolist()
             place = {
                 entry: float(domain.to_unit(domain.from_columns({name: entry}, name))[0])

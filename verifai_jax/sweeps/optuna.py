@@ -13,9 +13,8 @@ import jax
 import numpy as np
 
 from verifai_jax.core.errors import MissingExtra, require, unknown_name
-from verifai_jax.features import Box, Categorical, Constant, DiscreteBox, FeatureSpace, LogUniform
+from verifai_jax.features import FeatureSpace
 from verifai_jax.features.domain import Domain
-from verifai_jax.features.fixed import Fixed
 from verifai_jax.sweeps.hyperparameters import Hyperparameters, values_at, values_of_features
 from verifai_jax.sweeps.optuna_distributions import optuna_distribution, plain_choice
 
@@ -147,16 +146,14 @@ def _distributions(space: FeatureSpace) -> "dict[str, BaseDistribution]":
     return {
         name: optuna_distribution(domain) or unit
         for name, domain in space.domains.items()
-        if not isinstance(domain, Constant | Fixed)
+        if domain.held_at is None
     }
 
 
 def _values(space: FeatureSpace, parameters: Mapping[str, object]) -> tuple[Hyperparameters, bool]:
     """Return values as a training sees them, and whether the constraint accepts them."""
     features = {
-        name: domain.value
-        if isinstance(domain, Constant | Fixed)
-        else _value(domain, parameters[name])
+        name: _value(domain, parameters[name]) if domain.held_at is None else domain.held_at
         for name, domain in space.domains.items()
     }
     coerced = space.root.coerce(features)
@@ -166,10 +163,10 @@ def _values(space: FeatureSpace, parameters: Mapping[str, object]) -> tuple[Hype
 
 
 def _value(domain: Domain, parameter: object) -> object:
-    match domain:
-        case LogUniform() | DiscreteBox() | Box():
-            return parameter
-        case Categorical():
-            return next(c for c in domain.choices if plain_choice(c) == parameter)
+    tuning = domain.tuning
+    if tuning is not None and tuning.scale == "choice":
+        return next(c for c in tuning.choices if plain_choice(c) == parameter)
+    if tuning is not None and tuning.scale != "other":
+        return parameter
     point = np.array([[parameter]], np.float32)
     return values_at(FeatureSpace({"value": domain}), point)[0]["value"]

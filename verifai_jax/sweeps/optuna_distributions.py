@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from verifai_jax.core.errors import require
-from verifai_jax.features import Box, Categorical, DiscreteBox, LogUniform
 from verifai_jax.features.domain import Domain
 
 if TYPE_CHECKING:
@@ -18,18 +17,15 @@ def optuna_distribution(domain: Domain | None) -> "BaseDistribution | None":
     **Raises:** `MissingExtra` without Optuna.
     """
     distributions = require("optuna", "optuna").distributions
-    match domain:
-        case LogUniform():
-            return distributions.FloatDistribution(float(domain.low), float(domain.high), log=True)
-        case DiscreteBox() if domain.size == 1:
-            low, high = np.ravel(domain.low)[0], np.ravel(domain.high)[0]
-            return distributions.IntDistribution(int(low), int(high))
-        case Categorical():
-            return distributions.CategoricalDistribution([plain_choice(c) for c in domain.choices])
-        case Box() if domain.size == 1:
-            low, high = map(np.ravel, domain.ends(np.float64))
-            return distributions.FloatDistribution(float(low[0]), float(high[0]))
-    return None
+    tuning = None if domain is None or domain.size != 1 else domain.tuning
+    if tuning is None or tuning.scale == "other":
+        return None
+    if tuning.scale == "choice":
+        return distributions.CategoricalDistribution([plain_choice(c) for c in tuning.choices])
+    low, high = np.ravel(tuning.low)[0], np.ravel(tuning.high)[0]
+    if tuning.scale == "integer":
+        return distributions.IntDistribution(int(low), int(high))
+    return distributions.FloatDistribution(float(low), float(high), log=tuning.scale == "log")
 
 
 def plain_choice(choice: object) -> bool | int | float | str | None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from verifai_jax.core.errors import require
-from verifai_jax.features import Constant, FeatureSpace
+from verifai_jax.features import FeatureSpace
 from verifai_jax.features.domain import Domain
 from verifai_jax.sweeps.optuna_distributions import optuna_distribution
 from verifai_jax.sweeps.record import algorithm_uses
@@ -94,7 +94,7 @@ def _distribution(
     """Return the distribution of a hyper-parameter; None for one that does not vary."""
     import pandas as pd
 
-    if isinstance(domain, Constant):
+    if domain is not None and not domain.columns(""):
         return None
     if (distribution := optuna_distribution(domain)) is not None:
         return distribution

@@ -17,12 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from verifai_jax.core.text import format_percent
-from verifai_jax.features import Domain
-from verifai_jax.features.arrays import Array, VariableArray
-from verifai_jax.features.compound import Struct
-from verifai_jax.features.continuous import Continuous, scipy_special
-from verifai_jax.features.distributions import LogUniform
-from verifai_jax.features.signal import Signal
+from verifai_jax.features.continuous import scipy_special
 from verifai_jax.synthesis.parametric import Parametric
 
 LEAST = 1e-12
@@ -105,28 +100,11 @@ def region_of(loop: Parametric, mass: float) -> Region | None:
     if loop.environment is None:
         return None
     fields = loop.environment.root.fields
-    tailed = [(name, _tailed(domain)) for name, domain in fields]
+    tailed = [(name, domain.tailed) for name, domain in fields]
     each = [has for _, coordinates in tailed for has in coordinates]
     names = tuple(name for name, coordinates in tailed if any(coordinates))
     features = tuple(name for name, domain in fields if domain.size)
     return Region(getattr(loop, "names", ()), features, np.array(each, bool), names, float(mass))
-
-
-def _tailed(domain: Domain) -> list[bool]:
-    """Return of each coordinate of a domain whether its values thin out towards an end."""
-    match domain:
-        case Continuous():
-            return [not isinstance(domain, LogUniform)] * domain.size
-        case Struct():
-            return [has for _, part in domain.fields for has in _tailed(part)]
-        case Array():
-            return _tailed(domain.domain) * domain.length
-        case VariableArray():
-            items = _tailed(domain.domain) * domain.most
-            return [False] * (domain.size - len(items)) + items
-        case Signal():
-            return _tailed(domain.domain) * domain.knots
-    return [False] * domain.size
 
 
 def _listed(names: tuple[str, ...]) -> str:

@@ -14,8 +14,6 @@ from jaxtyping import Float, Int
 
 from verifai_jax.analysis.data.columns import Column
 from verifai_jax.analysis.data.samples import Samples
-from verifai_jax.features import Array, Box, Categorical, Constant, DiscreteBox, Struct
-from verifai_jax.features.domain import Domain
 
 POINTS = 12  # As a power of two.
 
@@ -96,7 +94,7 @@ def marginals(samples: Samples) -> tuple[Marginal, ...]:
 
 
 def _prior(samples: Samples) -> dict[str, Any]:
-    if samples.space is None or _uniform(samples.space.root):
+    if samples.space is None or samples.space.root.uniform:
         return {}
     import jax.numpy as jnp
     from scipy.stats import qmc
@@ -105,17 +103,6 @@ def _prior(samples: Samples) -> dict[str, Any]:
     # One program: step by step, each of the columns would compile its own.
     features = samples.space.features_at(jnp.asarray(u, jnp.float32))
     return {name: pd.Series(v) for name, v in samples.space.rows(features).items()}
-
-
-def _uniform(domain: Domain) -> bool:
-    """Whether the values are known to be equally likely over their range."""
-    if isinstance(domain, Struct):
-        return all(_uniform(part) for _, part in domain.fields)
-    if isinstance(domain, Array):
-        return _uniform(domain.domain)
-    if isinstance(domain, Categorical):
-        return all(weights is None for weights in domain.weights)
-    return isinstance(domain, Box | DiscreteBox | Constant)
 
 
 def _marginal(column: Column, prior: pd.Series | None) -> Marginal:

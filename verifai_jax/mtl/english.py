@@ -1,0 +1,56 @@
+"""Formulas in English, for readers who do not know their notation.
+
+formula_words(parse("always[0, 4] abs(x) <= 2.4"))
+# 'at all times from 0 s to 4 s, abs(x) is at most 2.4'
+"""
+
+import functools
+import math
+
+from verifai_jax.core.text import format_seconds
+from verifai_jax.mtl import formula as ast
+from verifai_jax.mtl.formula import Formula, Interval, surface
+from verifai_jax.mtl.words import OPERATORS
+
+COMPARISONS = {
+    "<=": "is at most",
+    "<": "is below",
+    ">=": "is at least",
+    ">": "is above",
+    "==": "equals",
+    "!=": "differs from",
+}
+"""Each comparison of signals as it is read."""
+
+
+def formula_words(formula: Formula) -> str:
+    """Write a formula in English."""
+    return _words(formula, inner=False)
+
+
+def _words(formula: Formula, inner: bool) -> str:
+    match formula:
+        case ast.Constant(value):
+            return "anything is allowed" if value else "nothing is allowed"
+        case ast.Predicate(comparison, left, right):
+            return f"{left} {COMPARISONS.get(comparison, comparison)} {right}"
+        case ast.Atom(expression):
+            return f"{expression} is positive"
+    word, operands, interval = surface(formula)
+    operator = OPERATORS[word]
+    first, *others = (_words(part, inner=True) for part in operands)
+    when = "" if interval is None or interval.everything else _when(interval, operator.side)
+
+    def joined(one: str, *other: str) -> str:
+        return operator.english.format(one, *other, when=when)
+
+    text = functools.reduce(joined, others, first) if others else joined(first)
+    return f"({text})" if inner else text
+
+
+def _when(interval: Interval, side: str) -> str:
+    start, endless = format_seconds(interval.start), interval.end == math.inf
+    end = "" if endless else f"to {format_seconds(interval.end)}"
+    if side == "back":
+        return f", {start} {'ago or earlier' if endless else f'{end} ago'}"
+    return f" from {start} {'on' if endless else end}"
