@@ -16,10 +16,10 @@ from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.trace import Trace
 from verifai_jax.counterexamples._confirm import confirm
-from verifai_jax.evaluation.confirmation import Confirmer
-from verifai_jax.evaluation.confirmation_verdicts import VERDICTS, Checked
+from verifai_jax.evaluation.confirmations import VERDICTS, Confirmations
+from verifai_jax.evaluation.confirmer import Confirmer
 from verifai_jax.evaluation.replay import replay
-from verifai_jax.evaluation.replays import ONE_BY_ONE
+from verifai_jax.evaluation.resimulate import ONE_BY_ONE
 from verifai_jax.systems.base import System
 
 
@@ -96,12 +96,13 @@ def test_a_search_is_told_that_what_is_refused_holds():
         "quarter_step": np.array([-0.9, 0.5, -0.1, np.nan]),
     }
     rho = np.array([-1.0, -0.1, -0.3, -2.0])
-    refused, told = Checked(verdict, replayed, np.zeros(4), [""] * 4, ()).refuse(rho)
-    assert refused.tolist() == [False, True, True, False]
-    assert told[1:3].tolist() == [0.5, 1e-6]
-    refused, told = Checked(verdict, {}, np.zeros(4), [""] * 4, ()).refuse(rho)
+    found = replace(Confirmations.blank("", np.arange(4), rho), verdict=verdict)
+    refused, learned = found.refuse()
     assert refused.sum() == 2
-    assert np.isnan(told).all()
+    assert np.isnan(learned).all()
+    refused, learned = replace(found, rho=replayed).refuse()
+    assert refused.tolist() == [False, True, True, False]
+    assert learned[1:3].tolist() == [0.5, 1e-6]
 
 
 @pytest.mark.thorough
@@ -148,14 +149,14 @@ def test_one_row_in_words(circles, confirmed_circles):
 
 
 def test_all_rows_in_words(circles, confirmed_circles):
-    told = str(confirmed_circles)
+    said = str(confirmed_circles)
     counts = confirmed_circles.counts
-    assert told.startswith(
+    assert said.startswith(
         f"circle: of {len(confirmed_circles)} counterexamples, {counts['confirmed']} confirmed "
         "in double precision, at a half and a quarter of the step and one rounding of the features "
         f"away, {counts['refuted']} refuted, {counts['fragile']} fragile\n"
     )
-    assert f"the worst confirmed is row {circles.best.name}, robustness" in told
+    assert f"the worst confirmed is row {circles.best.name}, robustness" in said
 
 
 def test_a_mapping_of_features_needs_no_row(circles):
@@ -175,7 +176,7 @@ def test_single_precision_is_not_believed():
     rows = {"x": np.array([0.9], np.float32), "rho": np.array([-0.2])}
     doubtful = Confirmer(rounded)(rows, [0])
     assert doubtful.verdict.tolist() == ["fragile"]
-    assert doubtful.why == ["its robustness -0.1 moves by 0.1 between replays"]
+    assert doubtful.why.tolist() == ["its robustness -0.1 moves by 0.1 between replays"]
 
 
 def test_chaos_is_fragile():
@@ -232,14 +233,14 @@ def test_a_simulation_that_breaks_down_at_a_finer_step_is_fragile():
 
     found = checked(steps(raising), [0.9])
     assert found.verdict.tolist() == ["raised"]
-    assert found.why == ["the replay at half the step raised: RuntimeError: too fine"]
+    assert found.why.tolist() == ["the replay at half the step raised: RuntimeError: too fine"]
 
 
 def test_steps_that_disagree_are_fragile_and_neither_is_taken_for_the_truth():
     halves = {1: 1.0, 2: 0.4, 4: 1.0}
     found = checked(steps(lambda x, factor: x * halves[factor]), [0.9])
     assert found.verdict.tolist() == ["fragile"]
-    assert found.why == ["it holds at half the step"]
+    assert found.why.tolist() == ["it holds at half the step"]
 
 
 def test_a_factor_that_must_be_an_integer_is_one():
@@ -424,10 +425,10 @@ def test_of_many_those_that_may_flip_are_examined(circles, monkeypatch):
     assert not left[worst]
     assert np.delete(rho, worst)[~np.delete(left, worst)].max() <= rho[left].min()
     assert rho[left].min() > 10 * confirmer.band > 0
-    told = found.why[int(np.argmax(left))]
-    assert told == found.notes[-1]
-    assert told.startswith(f"{left.sum()} of {len(failing)} were not replayed: 0.")
-    assert "where none of 100 replays moved a row by more than" in told
+    said = found.why[int(np.argmax(left))]
+    assert said == found.notes[-1]
+    assert said.startswith(f"{left.sum()} of {len(failing)} were not replayed: 0.")
+    assert "where none of 100 replays moved a row by more than" in said
     assert np.isnan(found.rho["float64"][left]).all()
     # Where rounding or the step decides, all of them are.
     rows = circles.table.counterexamples

@@ -12,7 +12,7 @@ import pytest
 import verifai_jax as vj
 from verifai_jax.blocks import LookupTable, delay_line
 from verifai_jax.core.keys import run_keys
-from verifai_jax.evaluation.confirmation import Confirmer
+from verifai_jax.evaluation.confirmer import Confirmer
 from verifai_jax.evaluation.replay import replay
 
 CAR = vj.Struct({"size": vj.Box(1, 2), "at": vj.Struct({"kind": vj.Categorical("a", "b")})})

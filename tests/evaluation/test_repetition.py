@@ -8,8 +8,8 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax.core.trace import Trace
-from verifai_jax.evaluation.confirmation import REPEATED
-from verifai_jax.evaluation.confirmation_verdicts import Repetitions, came_otherwise
+from verifai_jax.evaluation.confirmations import Repetitions, came_otherwise
+from verifai_jax.evaluation.confirmer import REPEATED
 from verifai_jax.systems.base import System
 
 SPACE = vj.FeatureSpace({"a": vj.Box(0.0, 1.0)})

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.evaluation.confirmation_verdicts import UNDECIDED, VERDICTS
+from verifai_jax.evaluation.confirmations import UNDECIDED, VERDICTS
 from verifai_jax.plotting.robustness_history import plot_robustness_history
 from verifai_jax.plotting.scatter import plot_features
 

@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float
 
 from verifai_jax.certification.attack import PolicyRecord
 from verifai_jax.certification.blocks import Blocks
-from verifai_jax.evaluation.confirmation import LIMIT, MORE, REPEATED, SHARE_REPEATED
-from verifai_jax.evaluation.confirmation_verdicts import Repetitions, came_otherwise
+from verifai_jax.evaluation.confirmations import Repetitions, came_otherwise
+from verifai_jax.evaluation.confirmer import LIMIT, MORE, REPEATED, SHARE_REPEATED
 
 
 def repeat_failures(

@@ -1,7 +1,5 @@
 """Studies of a counterexample: whether it is real, how little it takes, and why."""
 
-from verifai_jax.counterexamples._confirm import Confirmation as Confirmation
-from verifai_jax.counterexamples._confirm import Confirmations as Confirmations
 from verifai_jax.counterexamples._confirm import confirm as confirm
 from verifai_jax.counterexamples._explain import Explained as Explained
 from verifai_jax.counterexamples._explain import Influence as Influence
@@ -15,3 +13,5 @@ from verifai_jax.counterexamples._shrink import shrink as shrink
 from verifai_jax.counterexamples.corpus import CorpusError as CorpusError
 from verifai_jax.counterexamples.corpus import SavedCounterexample as SavedCounterexample
 from verifai_jax.counterexamples.corpus import save_counterexamples as save_counterexamples
+from verifai_jax.evaluation.confirmations import Confirmation as Confirmation
+from verifai_jax.evaluation.confirmations import Confirmations as Confirmations

@@ -21,7 +21,7 @@ from verifai_jax.core.text import format_error, one_line, printable
 from verifai_jax.core.trace import Status
 from verifai_jax.counterexamples.corpus import SavedCounterexample, read_corpus, renamed
 from verifai_jax.evaluation.backends import resolved
-from verifai_jax.evaluation.replays import HostReplays, Replays
+from verifai_jax.evaluation.resimulate import HostReplays, Replays
 from verifai_jax.features import FeatureSpace
 from verifai_jax.features.given import given_features
 from verifai_jax.problem.problem import Problem

@@ -42,7 +42,7 @@ from verifai_jax.estimation.methods import (
 )
 from verifai_jax.estimation.normal_space import Ended, LimitState, to_unit_cube
 from verifai_jax.evaluation.backends import resolved
-from verifai_jax.evaluation.confirmation_verdicts import NOT_CLAIMED
+from verifai_jax.evaluation.confirmations import NOT_CLAIMED
 from verifai_jax.evaluation.replay import replay
 from verifai_jax.failure_modes.held_keys import Divided, Held, divide_under_keys
 from verifai_jax.failure_modes.naming import name_mode

@@ -414,7 +414,7 @@ def _resume(
         rounds.suggestions.restore(checkpoint)
         rounds.suggestions.check_source()
 
-    rounds.checked = run.checked
+    rounds.checks = tuple(run.checks)
 
     def prepare() -> None:
         if checkpoint:
@@ -533,7 +533,7 @@ def _run_rounds(
             confirm_seconds=spent.get(CONFIRM, 0.0),
             search_seconds=spent.get(SEARCH, 0.0),
             simulate_seconds=spent.get(SIMULATE, 0.0),
-            checked=rounds.checked,
+            checks=rounds.checks,
             version=__version__,
             prior=origin == "prior",
             origin=origin,

@@ -30,7 +30,7 @@ from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.verdicts import violations
-from verifai_jax.falsification.claims import SeedClaims
+from verifai_jax.falsification.confirm_seeds import SeedConfirmer
 from verifai_jax.falsification.lockstep import lockstep
 from verifai_jax.falsification.validation import (
     adapt_search,
@@ -209,7 +209,7 @@ def repeat(
     search, _ = adapt_search(traced, search)
     batch = min(usual_batch(search, budget) if batch is None else batch, budget)
     sources = problem.sources().to_json()
-    claims = SeedClaims(traced, precision, every, not stop_early) if confirm else None
+    claims = SeedConfirmer(traced, precision, every, not stop_early) if confirm else None
     if search.wants_clauses:
         # The search is in single precision whatever the simulations are, as in `falsify`.
         with in_precision("float32"):
@@ -270,7 +270,7 @@ class _WholeRounds:
         seeds: Int[np.ndarray, " seeds"],
         rounds: int,
         stop_early: bool,
-        claims: SeedClaims | None,
+        claims: SeedConfirmer | None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
         """Play the rounds.
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.evaluation.confirmation_verdicts import NOT_CLAIMED, Repetitions
+from verifai_jax.evaluation.confirmations import NOT_CLAIMED, Repetitions
 from verifai_jax.falsification.columns import Columns
 
 

@@ -21,7 +21,7 @@ from verifai_jax.core.progress import count_done
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.verdicts import Verdicts
-from verifai_jax.falsification.claims import SeedClaims
+from verifai_jax.falsification.confirm_seeds import SeedConfirmer
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Observations, Search
 from verifai_jax.search.proposals import effort_of
@@ -59,7 +59,7 @@ def lockstep(
     batch: int,
     precision: str,
     stop_early: bool,
-    claims: SeedClaims | None = None,
+    claims: SeedConfirmer | None = None,
 ) -> SeedHistories:
     """Run the search from every seed and return the histories.
 

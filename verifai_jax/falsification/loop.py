@@ -17,6 +17,7 @@ from verifai_jax.core.compilation import while_compiling
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.stopwatch import Stopwatch
+from verifai_jax.evaluation.confirmer import Confirmer
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.raising import Raising
@@ -28,7 +29,6 @@ from verifai_jax.falsification.columns import import_tables
 from verifai_jax.falsification.marks import MarkBook
 from verifai_jax.falsification.question import describe_run
 from verifai_jax.falsification.rows import rows_of, without_failure
-from verifai_jax.falsification.run_claims import RunClaims
 from verifai_jax.falsification.simulations import MEASURED, Simulations
 from verifai_jax.falsification.suggestions import Suggestions
 from verifai_jax.falsification.surrogates import Surrogate
@@ -55,7 +55,7 @@ class Rounds:
     `first` are rows of given features (`given_rows`) that are simulated before the search proposes
     any, and `suggestions` those that somebody gives on the way, None where nobody is asked.
     `record_checksum` is that of the run's record, for the checkpoints.
-    `checked` says in words which closer replays there were. `watch` has the seconds of all: to
+    `checks` names the closer replays that were made. `watch` has the seconds of all: to
     `COMPILE`; to `SEARCH`, which the search took for its proposals and to learn, and whoever
     suggests points to think of them; to `SIMULATE`, and to put the rows into the table; to
     `CONFIRM`. The rest is whoever advances the rounds.
@@ -103,13 +103,13 @@ class Rounds:
         self.found = self.violating = self.without_verdict = 0
         self.best = float("nan")
         self.watch = Stopwatch(COMPILE)
-        self.checked = ""
+        self.checks: tuple[str, ...] = ()
         self.checkpoint: dict[str, Any] = {}
         self.record_checksum = 0
         self.suggestions: Suggestions | None = None
-        self._claims = None
+        self._confirmer = None
         if confirm:
-            self._claims = RunClaims(problem, precision, seed, executor, target)
+            self._confirmer = Confirmer(problem, precision, seed, executor=executor, target=target)
         self._objective = None if problem.rulebook is None else Objective(problem.rulebook)
         self._proposals: Any = None
         self._pending: Any = None  # Points of the first round that are proposed already.
@@ -136,9 +136,9 @@ class Rounds:
         self.evaluate.begin_compiling()
         if differentiates:
             self._simulations.begin_derivatives()
-        if self._claims is not None:
+        if self._confirmer is not None:
             # Meanwhile; whatever fails will be replayed.
-            self._claims.prepare()
+            self._confirmer.prepare()
         self.evaluate.compile()
         self._propose()
 
@@ -216,7 +216,7 @@ class Rounds:
     @property
     def confirms(self) -> bool:
         """True where only what closer replays confirm is claimed."""
-        return self._claims is not None
+        return self._confirmer is not None
 
     @property
     def distinct(self) -> int:
@@ -228,7 +228,7 @@ class Rounds:
     @property
     def notes(self) -> tuple[str, ...]:
         """Decisions of the engines that a user may not expect."""
-        raised = () if self._claims is None else self._claims.raised
+        raised = () if self._confirmer is None else self._confirmer.raised
         suggested = () if self.suggestions is None else self.suggestions.notes
         return (*self._chosen, *self._simulations.notes, *raised, *suggested)
 
@@ -332,18 +332,20 @@ class Rounds:
         if self._objective is not None:
             objective = self._objective(verdicts.rho, verdicts.rho < 0)
         claimed = verdicts.violated
-        if self._claims is not None:
+        if self._confirmer is not None:
             with self.watch.on(CONFIRM):
-                found = self._claims(columns, first)
-                self.watch.move(found.compile_seconds, COMPILE)
+                compiled = self._confirmer.compile_seconds
+                found = self._confirmer.check_round(columns, first)
+                self.watch.move(self._confirmer.compile_seconds - compiled, COMPILE)
             columns["verdict"] = found.verdict
-            if found.again is not None:
-                columns["rho_again"] = found.again
-            self.checked = self._claims.checked or self.checked
-            claimed = verdicts.violated & ~found.refused
+            if self.problem.black_box:
+                columns["rho_again"] = found.rho.get("again", np.full(len(points), np.nan))
+            self.checks = self._confirmer.check_names or self.checks
+            refused, greatest = found.refuse()
+            claimed = verdicts.violated & ~refused
             # A search that took them for failures would stay with them.
-            objective = np.where(found.refused, found.greatest, objective)
-            verdicts = without_failure(verdicts, found.refused)
+            objective = np.where(refused, greatest, objective)
+            verdicts = without_failure(verdicts, refused)
         if self.steering.guide and verdicts.steering is not None:
             objective = self._guided(objective, verdicts.steering[:, 0])
         outcomes = self._outcomes(verdicts)
@@ -534,7 +536,7 @@ class Rounds:
             self.checkpoint |= part.checkpoint()
 
     @property
-    def _parts(self) -> list[Surrogate | MarkBook | Suggestions | RunClaims]:
+    def _parts(self) -> list[Surrogate | MarkBook | Suggestions | Confirmer]:
         """What has entries of its own in a checkpoint."""
-        each = (self._surrogate, self._marks, self.suggestions, self._claims)
+        each = (self._surrogate, self._marks, self.suggestions, self._confirmer)
         return [part for part in each if part is not None]

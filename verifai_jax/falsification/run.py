@@ -21,6 +21,7 @@ from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.seals import sealed
 from verifai_jax.core.sources import Change
 from verifai_jax.core.text import one_line
+from verifai_jax.evaluation.confirmations import describe_checks
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.checkpoint import (
     RECORD_CHECKSUM,
@@ -97,7 +98,7 @@ class Run(InNotebook):
     - `backend`: the engine that simulated; None for a system that has one only.
     - `notes`: decisions that were made without the user.
     - `confirm`: whether violations were replayed more finely before they were claimed.
-    - `checked`: the checks that a confirmed row has passed, in words; empty where none was made.
+    - `checks`: names of the checks that a confirmed row has passed; empty if none was made.
     - `first`: points of the unit cube that were simulated before the search began.
     - `guide`: the term that steered the search, as plain data; None without one.
     - `sources`: what the model was made of when the run began, and again where it went on with
@@ -139,13 +140,18 @@ class Run(InNotebook):
     confirm_seconds: float = 0.0
     search_seconds: float = 0.0
     simulate_seconds: float = 0.0
-    checked: str = ""
+    checks: Sequence[str] = ()
     first: Sequence[Sequence[float]] = ()
     guide: Mapping[str, Any] | None = None
     sources: Sequence[Mapping[str, Any]] = ()
     damage: str = ""
     origin: str = ""
     derived: Mapping[str, Any] | None = None
+
+    @property
+    def checked(self) -> str:
+        """The checks that a confirmed row has passed, as the end of a sentence; often empty."""
+        return describe_checks(self.checks)
 
     @property
     def simulations(self) -> int:

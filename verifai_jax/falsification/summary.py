@@ -9,7 +9,7 @@ failure rate 3.02 % (95 % interval 2.79 % to 3.27 %) as simulated
 import numpy as np
 
 from verifai_jax.core.text import format_features, format_percent, one_line, printable
-from verifai_jax.evaluation.confirmation_verdicts import UNDECIDED
+from verifai_jax.evaluation.confirmations import UNDECIDED
 from verifai_jax.evaluation.journal import count_unfinished
 from verifai_jax.falsification.no_rate import remedy, why_no_rate
 from verifai_jax.falsification.run import Run

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from verifai_jax.core.text import format_features
-from verifai_jax.evaluation.confirmation_verdicts import UNDECIDED
+from verifai_jax.evaluation.confirmations import UNDECIDED, describe_checks
 from verifai_jax.falsification.no_rate import why_no_rate
 from verifai_jax.falsification.record import RECORD
 from verifai_jax.falsification.run import Run
@@ -178,7 +178,7 @@ def run_claims(run: Run, studies: Studies) -> list[Claim]:
     texts: list[tuple[str, tuple[str, ...], tuple[str, ...]]] = []
     texts.append((headline(run).split(". ")[0].rstrip(".") + ".", (table_,), common))
     if confirmed := run.verdict_counts.get("confirmed"):
-        checked = run.checked.partition(";")[0]
+        checked = describe_checks(run.checks, of_step=False)
         sentence = f"{confirmed:,} of these failures were seen again {checked}."
         texts.append((sentence, (table_, "closer replays, column verdict"), common))
     if (undecided := sum(run.verdict_counts.get(v, 0) for v in UNDECIDED)) or run.verdict_counts:

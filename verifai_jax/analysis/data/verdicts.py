@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool
 
-from verifai_jax.evaluation.confirmation_verdicts import NOT_CLAIMED
+from verifai_jax.evaluation.confirmations import NOT_CLAIMED
 
 
 def verdicts(

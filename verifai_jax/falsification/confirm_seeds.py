@@ -1,7 +1,7 @@
 """Closer replays of what the seeds of `repeat` violate: which failures `falsify` would claim.
 
-    claims = SeedClaims(problem, "float32", seeds, thorough=False)
-    refused, greatest = claims(place, numbers, u, rho)      # of violating simulations, seed by seed
+    confirmer = SeedConfirmer(problem, "float32", seeds, thorough=False)
+    refused, greatest = confirmer(seed, numbers, u, rho)      # of violating simulations
 
 A replay costs as much as many simulations, so of each seed they are made in their order until one
 is claimed; of all seeds together, so that few programs make many of them.
@@ -13,12 +13,13 @@ from jaxtyping import Bool, Float, Int
 
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
-from verifai_jax.evaluation.confirmation import LIMIT, Confirmer
+from verifai_jax.evaluation.confirmer import LIMIT, Confirmer
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.problem.problem import Problem
 
 MORE = 4
-"""So many times as many rows of a seed are replayed next, after none of its last was claimed."""
+"""So many times as many rows of a seed are replayed next, after none of its last was claimed: few
+programs in few calls, and at most four times as many replays as are needed."""
 WITHOUT_BOUND = 2**31 - 1
 """A number of rows that no run has."""
 
@@ -26,7 +27,7 @@ DRAWS: Slot[str, bool] = Slot("randomness of the system")
 """Whether the system uses its random key, by precision."""
 
 
-class SeedClaims:
+class SeedConfirmer:
     """Verdicts of closer replays, by the rule that `falsify` has.
 
     Violations beyond the first `LIMIT` of a seed that were replayed count as claimed, as there.
@@ -49,7 +50,7 @@ class SeedClaims:
 
     def __call__(
         self,
-        place: Int[np.ndarray, " n"],
+        seed: Int[np.ndarray, " n"],
         numbers: Int[np.ndarray, " n"],
         u: Float[np.ndarray, "n d"],
         rho: Float[np.ndarray, " n"],
@@ -58,48 +59,47 @@ class SeedClaims:
 
         **Arguments:**
 
-        - `place`: of the seed of each, ascending.
+        - `seed`: index of the seed of each, ascending.
         - `numbers`: of the simulations in their runs, ascending for each seed.
         - `u`, `rho`: their points and the least formula's robustness.
 
         **Returns:** which of them are not claimed, and the greatest robustness of their replays, at
         least 1e-6, NaN where there was none.
         """
-        refused, greatest = np.zeros(len(place), bool), np.full(len(place), np.nan)
-        left, width = np.arange(len(place)), 1
+        refused, greatest = np.zeros(len(seed), bool), np.full(len(seed), np.nan)
+        left, width = np.arange(len(seed)), 1
         while len(left):
-            rank = _rank(place[left])
+            rank = _rank(seed[left])
             now = left if self.thorough else left[rank < width]
-            known = self._examined[place[now]] + _rank(place[now]) >= LIMIT
+            known = self._examined[seed[now]] + _rank(seed[now]) >= LIMIT
             taken = now[~known]
             if len(taken):
                 refused[taken], greatest[taken] = self._replayed(
-                    place[taken], numbers[taken], u[taken], rho[taken]
+                    seed[taken], numbers[taken], u[taken], rho[taken]
                 )
-                np.add.at(self._examined, place[taken], 1)
+                np.add.at(self._examined, seed[taken], 1)
             if self.thorough:
                 break
-            done = np.unique(place[now[~refused[now]]])
-            left = left[(rank >= width) & ~np.isin(place[left], done)]
+            done = np.unique(seed[now[~refused[now]]])
+            left = left[(rank >= width) & ~np.isin(seed[left], done)]
             width *= MORE
         return refused, greatest
 
     def _replayed(
         self,
-        place: Int[np.ndarray, " n"],
+        seed: Int[np.ndarray, " n"],
         numbers: Int[np.ndarray, " n"],
         u: Float[np.ndarray, "n d"],
         rho: Float[np.ndarray, " n"],
     ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         rows = self._rows(u) | {"rho": rho}
         # Without random numbers all seeds simulate the same.
-        whose = place if self._draws else np.zeros_like(place)
-        refused, greatest = np.zeros(len(place), bool), np.full(len(place), np.nan)
+        whose = seed if self._draws else np.zeros_like(seed)
+        refused, greatest = np.zeros(len(seed), bool), np.full(len(seed), np.nan)
         for one in np.unique(whose).tolist():
             own = np.flatnonzero(whose == one)
             columns = {name: column[own] for name, column in rows.items()}
-            checked = self._confirmer(one)(columns, numbers[own])
-            refused[own], greatest[own] = checked.refuse(rho[own])
+            refused[own], greatest[own] = self._confirmer(one)(columns, numbers[own]).refuse()
         return refused, greatest
 
     def _rows(self, u: Float[np.ndarray, "n d"]) -> dict[str, np.ndarray]:
@@ -112,12 +112,12 @@ class SeedClaims:
             columns = space.rows(jax.tree.map(np.asarray, features))
         return {name: column[: len(u)] for name, column in columns.items()}
 
-    def _confirmer(self, place: int) -> Confirmer:
-        if place not in self._confirmers:
-            self._confirmers[place] = Confirmer(
-                self.problem, self.precision, int(self.seeds[place]), most=WITHOUT_BOUND
+    def _confirmer(self, seed: int) -> Confirmer:
+        if seed not in self._confirmers:
+            self._confirmers[seed] = Confirmer(
+                self.problem, self.precision, int(self.seeds[seed]), most=WITHOUT_BOUND
             )
-        return self._confirmers[place]
+        return self._confirmers[seed]
 
     @property
     def _draws(self) -> bool:
@@ -128,6 +128,6 @@ class SeedClaims:
         return self.problem.programs.get(DRAWS, self.precision, trace)
 
 
-def _rank(place: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+def _rank(seed: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
     """Return the number of each row within those of its seed, from 0; seeds are ascending."""
-    return np.arange(len(place)) - np.searchsorted(place, place)
+    return np.arange(len(seed)) - np.searchsorted(seed, seed)

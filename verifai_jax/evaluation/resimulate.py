@@ -13,23 +13,27 @@ by JAX, and one program replays at every step.
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, Key, PyTree
+from jaxtyping import Array, Int, Key, PyTree, UInt32
 
 from verifai_jax.core.devices import enable_compile_cache
+from verifai_jax.core.executors import Executor, Shipment, check_executor, gather, ship
 from verifai_jax.core.keys import as_key, simulation_key
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.precision import in_precision, reproducible_settings
 from verifai_jax.core.programs import Slot
 from verifai_jax.core.progress import count_done
 from verifai_jax.core.text import format_error
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine
+from verifai_jax.evaluation.executor_engine import SHIPMENTS, TOGETHER, identity
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.inputs import TableRows
 from verifai_jax.evaluation.verdicts import Verdicts
+from verifai_jax.evaluation.worker import computing
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import System
 
@@ -56,7 +60,7 @@ class Refiner:
         return self._made[factor]
 
     def why_not(self, factors: Iterable[int]) -> str | None:
-        """Say why the step cannot be made smaller; None where it can."""
+        """Say why the step cannot be made smaller; None if it can."""
         if not self.system.can_refine:
             if self.system.exact_step:
                 return "the step belongs to the system"
@@ -136,10 +140,10 @@ class Replays:
         return verdicts.split(len(each))
 
     def begin_compiling(self, factor: int, count: int) -> None:
-        """Compile what replays so many rows in the background, beside whatever else is compiled."""
+        """Compile what replays so many rows, in the background."""
         engine = self._engine(factor, self._together(count))
         compiled = engine.compile_seconds
-        # What cannot be traced is told when it is replayed.
+        # An error in it is reported when rows are replayed.
         with suppress(Exception):
             engine.begin_compiling()
         self.compile_seconds += engine.compile_seconds - compiled
@@ -188,7 +192,16 @@ REPLAYS: Slot[tuple[str, int, int], Engine] = Slot("replays")
 
 
 class HostReplays:
-    """Replays of a problem that runs on the host; as `Replays`.
+    """Replays of a problem that runs on the host, in this process or by the workers of an executor.
+
+    A simulator that is only where the workers are cannot be started here, and a run that many
+    workers share would wait for one process.
+
+    **Arguments:**
+
+    - `problem`, `precision`, `key`: as of `Replays`.
+    - `executor`: with `submit`; this process simulates when left out.
+    - `target`: name of the problem, for an executor that cannot send it.
 
     `draws` is False: a black box gets an integer seed, the same in every precision.
     """
@@ -196,12 +209,27 @@ class HostReplays:
     draws = False
     compile_seconds = 0.0
 
-    def __init__(self, problem: Problem, precision: str, key: Key[Array, ""]) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        precision: str,
+        key: Key[Any, ""],
+        executor: Executor | None = None,
+        target: str | None = None,
+    ) -> None:
         self.problem, self.precision, self.key = problem, precision, key
         self.refiner = Refiner(problem.system)
         self._renewed: System | None = None
         enable_compile_cache()
         self._engine = HostEngine(problem, precision)
+        self._executor = executor
+        if executor is not None:
+            check_executor(executor)
+            self._shipment = problem.programs.get(
+                SHIPMENTS,
+                (type(executor).__module__ + type(executor).__name__, target),
+                lambda: ship(problem, executor, target, identity),
+            )
 
     def begin_compiling(self, factor: int, count: int) -> None:
         """Do nothing: a black box is not compiled."""
@@ -210,6 +238,8 @@ class HostReplays:
         self, factor: int, each: Sequence[PyTree], numbers: Int[np.ndarray, " n"]
     ) -> list[Verdicts]:
         """Simulate the rows of these numbers again, with a `factor` times smaller step."""
+        if self._executor is not None:
+            return [self._sent(features, numbers, factor, False) for features in each]
         return self._replay(self.refiner(factor), each, numbers)
 
     def anew(self, features: PyTree, numbers: Int[np.ndarray, " n"]) -> list[Verdicts]:
@@ -217,6 +247,8 @@ class HostReplays:
 
         That is the system itself, where it cannot be made anew.
         """
+        if self._executor is not None:
+            return [self._sent(features, numbers, 1, True)]
         if self._renewed is None:
             self._renewed = self.problem.system.renewed()
         return self._replay(self._renewed, [features], numbers)
@@ -241,6 +273,108 @@ class HostReplays:
             parts.append(engine.evaluate_features(features, seeds, keys)._replace(features=None))
             count_done(count)
         return parts
+
+    def _sent(
+        self, features: PyTree, numbers: Int[np.ndarray, " n"], factor: int, anew: bool
+    ) -> Verdicts:
+        executor, system = self._executor, self.problem.system
+        assert executor is not None
+        backend = system.backend if system.backends else None
+        words = np.asarray(jax.random.key_data(self.key))
+        step = TOGETHER if system.can_simulate_batch else 1
+        futures = []
+        for start in range(0, len(numbers), step):
+            block = slice(start, start + step)
+            leaves = [np.asarray(leaf)[block] for leaf in jax.tree.leaves(features)]
+            how = (backend, self.precision, factor, anew)
+            futures.append(
+                executor.submit(replay_block, self._shipment, how, words, leaves, numbers[block])
+            )
+        found: dict[int, Verdicts] = {}
+
+        def ended(index: int, result: dict[str, Any]) -> None:
+            found[index] = Verdicts(**result)
+            count_done(len(found[index].status))
+
+        gather(futures, ended)
+        return Verdicts.concatenate([found[index] for index in range(len(futures))])
+
+
+def finest_replays(
+    problem: Problem,
+    run: str,
+    key: Key[Any, ""],
+    executor: Executor | None = None,
+    target: str | None = None,
+) -> tuple[Replays | HostReplays | None, list[str], str]:
+    """Return replays of a problem's rows in the finest precision that it can be traced in.
+
+    **Arguments:**
+
+    - `run`: precision of the run.
+    - `key`, `executor`, `target`: as of `HostReplays`.
+
+    **Returns:** the replays, None if they cannot be traced; notes on what is left out; what raised
+    when it was traced, empty if nothing did.
+    """
+    if problem.black_box:
+        replays = HostReplays(problem, run, key, executor, target)
+        return replays, ["not checked in float64: a black box"], ""
+    note = "not checked in float64: in it the system would draw other random numbers"
+    if run != "float64" and problem.system.can_refine:
+        # It is traced in this precision in any case.
+        with suppress(Exception):
+            single = Replays(problem, run, key)
+            if single.draws:
+                return single, [note], ""
+    raised = ""
+    try:
+        replays = Replays(problem, "float64", key)
+        if not (replays.draws and run != "float64"):
+            return replays, [], ""
+    except Exception as error:
+        raised = f"the replay in float64 raised: {format_error(error)}"
+        note = f"not checked in float64: {format_error(error)}"
+        if run == "float64":
+            return None, [note], raised
+    try:
+        return Replays(problem, run, key), [note], raised
+    except Exception as error:
+        raised = raised or f"the replay raised: {format_error(error)}"
+        return None, [note, f"not simulated again: {format_error(error)}"], raised
+
+
+@reproducible_settings()
+def replay_block(
+    shipment: Shipment[Problem],
+    how: tuple[str | None, str, int, bool],
+    words: UInt32[np.ndarray, "2"],
+    leaves: Sequence[np.ndarray],
+    numbers: Int[np.ndarray, " n"],
+) -> dict[str, Any]:
+    """Simulate rows again; called by a worker.
+
+    **Arguments:**
+
+    - `shipment`: with the problem.
+    - `how`: backend, precision, by how much the step is smaller, and whether the system is to be
+      made anew.
+    - `words`: of the key of the run's simulations.
+    - `leaves`: of the features, `[n, ...]` each.
+    - `numbers`: of the rows.
+
+    **Returns:** `rho`, `status`, `violated` and `messages` of the rows.
+    """
+    backend, precision, factor, anew = how
+    problem = shipment.thing
+    if backend is not None:
+        problem = problem.on_backend(backend)
+    features = jax.tree.unflatten(jax.tree.structure(problem.space.feature_form), leaves)
+    replays = HostReplays(problem, precision, as_key(words))
+    with computing:
+        [found] = replays.anew(features, numbers) if anew else replays(factor, [features], numbers)
+    parts = ("rho", "status", "violated", "messages")
+    return {name: getattr(found, name) for name in parts}
 
 
 @jax.jit

@@ -1,0 +1,182 @@
+"""Rules that decide about counterexamples from their closer replays.
+
+found = decide(Confirmations.blank(name, numbers, rho), replayed, rho, ...)
+replayed["quarter_step"]                            # Verdicts of the rows, for each check
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.evaluation.confirmations import (
+    CHECK_TEXTS,
+    FINER,
+    NOT_CLAIMED,
+    RAISED,
+    SINGLE,
+    Confirmations,
+)
+from verifai_jax.evaluation.verdicts import Verdicts
+
+AMPLIFIED = 4.0
+"""Times by which a row must fail beyond what rounding has moved it: a chaotic system turns
+roundings into any of its outcomes, and two or three programs may agree by chance."""
+
+
+def decide(
+    found: Confirmations,
+    replayed: Mapping[str, Verdicts],
+    run: Float[np.ndarray, " n"] | None,
+    *,
+    untraceable: str,
+    may_refute: bool,
+    by_far: bool,
+    came_again: bool,
+) -> Confirmations:
+    """Decide about rows from their replays.
+
+    **Arguments:**
+
+    - `found`: the rows, all of verdict `raised`; completed in place.
+    - `replayed`: the verdicts of each check.
+    - `run`: robustness of the rows in the run, if that is known.
+    - `untraceable`: what raised when a check was traced; empty if nothing did.
+    - `may_refute`: whether a check simulates more finely than the run.
+    - `by_far`: whether rows have to fail by more than they moved.
+    - `came_again`: whether other rows could be simulated again, so that one that raises now has not
+      come again.
+    """
+    rho = {name: verdicts.least for name, verdicts in replayed.items()}
+    found.rho.update(rho)
+    base = next((name for name in ("float64", "again") if name in replayed), "")
+    finest = next((n for n in ("quarter_step", base, "simulator") if n in replayed), "")
+    step = rounding = np.zeros(len(found))
+    if "half_step" in replayed:
+        step = _moved(rho["half_step"], rho["quarter_step"])
+    for name in (SINGLE, "nudged"):
+        if name in replayed:
+            rounding = np.maximum(rounding, _moved(rho[name], rho[finest]))
+    if run is not None and base:
+        rounding = np.maximum(rounding, _moved(run, rho[base]))
+    found.band[:] = np.maximum(step, rounding)
+    if not replayed:
+        found.why[:] = untraceable
+        return found
+    deciding = [name for name in (*FINER, SINGLE) if name in replayed] or [base]
+    deciding = [name for name in (*deciding, "simulator") if name in replayed]
+    failing = {name: verdicts.violated for name, verdicts in replayed.items()}
+    holding = {name: v.proper & ~v.violated for name, v in replayed.items()}
+    raised = {name: np.isin(v.status, RAISED) for name, v in replayed.items()}
+    # Of a host system that is simulated once more, and fails each time, that it fails says all.
+    clear = (not by_far) | (np.abs(rho[finest]) >= np.maximum(step, AMPLIFIED * rounding))
+    fails = np.all(list(failing.values()), axis=0)
+    refuted = np.all([holding[name] for name in deciding], axis=0) & may_refute
+    refuted &= deciding[0] != "again"
+    lost = np.any(list(raised.values()), axis=0) | bool(untraceable)
+    lost &= np.all([failing[name] | raised[name] for name in replayed], axis=0) & (not came_again)
+    found.verdict[:] = np.select(
+        [lost, fails & clear, refuted], ["raised", "confirmed", "refuted"], "fragile"
+    )
+    for i in np.flatnonzero(found.verdict != "confirmed").tolist():
+        if found.verdict[i] == "raised" and untraceable:
+            found.why[i] = untraceable
+        else:
+            as_run = None if run is None else float(run[i])
+            at, band = float(rho[finest][i]), float(found.band[i])
+            found.why[i] = describe_disagreement(i, replayed, at, band, as_run)
+    return found
+
+
+def hold_to_run(
+    found: Confirmations,
+    replayed: Mapping[str, Verdicts],
+    rows: Mapping[str, np.ndarray],
+    only_repeats: bool,
+) -> None:
+    """Hold to the run's verdict on rows of a host system, where this time is no evidence against.
+
+    What did not come again in the run stays unconfirmed, whatever it does this time; and what fails
+    every time stays confirmed, by whatever it has moved.
+    """
+    fails = np.all([verdicts.violated for verdicts in replayed.values()], axis=0)
+    still = (rows["verdict"] == "confirmed") & fails & only_repeats
+    found.verdict[still], found.why[still] = "confirmed", ""
+    refused = np.isin(rows["verdict"], NOT_CLAIMED)
+    refused &= np.isin(found.verdict, ("confirmed", "raised"))
+    for i in np.flatnonzero(refused).tolist():
+        found.verdict[i] = "fragile"
+        again = float(rows["rho_again"][i]) if "rho_again" in rows else float("nan")
+        then = "" if np.isnan(again) else f", with robustness {again:z.4g}"
+        found.why[i] = f"it did not come again when the run simulated it again{then}"
+
+
+def least_failing(again: Verdicts, more: Verdicts, at: np.ndarray) -> Verdicts:
+    """Return the repetitions, those rows replaced that a further one shows to fail less.
+
+    **Arguments:**
+
+    - `again`: of all rows.
+    - `more`: a further repetition of the rows `at`.
+    """
+    with np.errstate(invalid="ignore"):
+        less = ~more.violated | ~(more.least <= again.least[at])
+    rho, status, violated = again.rho.copy(), again.status.copy(), again.violated.copy()
+    taken = at[less]
+    rho[taken], status[taken] = more.rho[less], more.status[less]
+    violated[taken] = more.violated[less]
+    messages = again.messages
+    if messages is not None and more.messages is not None:
+        messages = list(messages)
+        for i in np.flatnonzero(less).tolist():
+            messages[int(at[i])] = more.messages[i]
+    return again._replace(rho=rho, status=status, violated=violated, messages=messages)
+
+
+def describe_disagreement(
+    i: int,
+    found: Mapping[str, Verdicts],
+    rho: float,
+    band: float,
+    as_run: float | None = None,
+) -> str:
+    """Say why a row is not confirmed.
+
+    **Arguments:**
+
+    - `i`: index of the row.
+    - `found`: the replays of all rows, by check.
+    - `rho`: robustness of the row in the finest replay.
+    - `band`: how much it moved between replays.
+    - `as_run`: its robustness in the run, where that is known.
+    """
+    lost = [name for name in found if not found[name].proper[i]]
+    if lost:
+        raised = [name for name in lost if found[name].status[i] in RAISED]
+        if raised:
+            messages = [m[i] for name in raised if (m := found[name].messages)]
+            message = next(filter(None, messages), "out of time")
+            return f"the replay {_and(raised)} raised: {message}"
+        return f"the replay {_and(lost)} is not finite"
+    holds = [name for name, replayed in found.items() if not replayed.violated[i]]
+    if holds == ["again"]:
+        run = "" if as_run is None else f", and {as_run:z.4g} in the run"
+        return f"it holds when simulated again: robustness {found['again'].least[i]:z.4g}{run}"
+    if len(holds) == len(found):
+        return "it holds in every replay"
+    if holds:
+        fails = [name for name in found if name not in holds]
+        few = len(holds) <= len(fails)
+        return f"it holds {_and(holds)}" if few else f"it fails only {_and(fails)}"
+    return f"its robustness {rho:z.3g} moves by {band:z.2g} between replays"
+
+
+def _and(names: Sequence[str]) -> str:
+    words = [CHECK_TEXTS[name] for name in names]
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+def _moved(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return by how much a robustness moved: infinitely where one of the two is missing."""
+    with np.errstate(invalid="ignore"):
+        return np.nan_to_num(np.where(a == b, 0.0, np.abs(a - b)), nan=np.inf)

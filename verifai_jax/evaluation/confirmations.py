@@ -1,0 +1,360 @@
+"""What closer replays of counterexamples have shown: results, their verdicts, and their texts.
+
+found = confirmer(rows, numbers)                    # as `confirmer.py` makes it
+found.verdict                                       # [n]: "confirmed", "fragile", ...
+refused, learned = found.refuse()                   # which rows are not claimed
+describe_checks(found.checks)                       # "in double precision and at a half ..."
+"""
+
+from collections import Counter
+from collections.abc import Collection
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from verifai_jax.core.notebook import InNotebook
+from verifai_jax.core.trace import Status
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+VERDICTS = ("confirmed", "refuted", "fragile", "raised", "unexamined")
+"""Verdicts of closer replays; see `Confirmations`."""
+UNDECIDED = ("fragile", "raised", "unexamined")
+"""Verdicts that leave open whether the failure is the system's or the simulation's."""
+NOT_CLAIMED = ("fragile", "refuted")
+"""Verdicts of rows that violate the property as simulated, and do not when looked at closely."""
+MEANING = {
+    "confirmed": "it fails in every replay",
+    "refuted": "an artefact of the simulation",
+    "fragile": "replays disagree",
+    "raised": "it could not be replayed",
+    "unexamined": "it is unchecked, as it was not replayed",
+}
+"""Each verdict as people read it."""
+FINER = {"half_step": 2, "quarter_step": 4}
+"""Checks at a finer step, and how many times finer."""
+RAISED = (Status.ERROR, Status.TIMEOUT)
+"""Ends of a simulation that gave no trace."""
+SINGLE = "quarter_step_float32"
+"""Name of the check at the finest step in single precision."""
+CHECK_TEXTS = {
+    "float64": "in float64",
+    "again": "simulated again",
+    "half_step": "at half the step",
+    "quarter_step": "at a quarter of the step",
+    SINGLE: "at a quarter of the step in float32",
+    "nudged": "one rounding of the features away",
+    "simulator": "in the other simulator",
+}
+"""Each check as people read it."""
+EXACT_STEP = "exact_step"
+"""Stands among the names of checks for one that is not needed: the step belongs to the system."""
+ROUNDED = 1e-4
+"""Share of a robustness by which rounding may change it between two simulations, such as of
+threads that add up in any order, or of a batch of another size."""
+SMALLEST_KEPT = 1e-6
+"""Smallest robustness that a search learns of a row that is not claimed, positive since it holds;
+also the size below which two robustnesses of about zero are taken for equal."""
+SHOWN = 5
+"""Reasons of doubtful rows that are printed; the rest are counted, since `table` has them."""
+
+
+def describe_checks(checks: Collection[str], *, of_step: bool = True) -> str:
+    """Describe the checks that a confirmed row has passed.
+
+    **Arguments:**
+
+    - `checks`: their names, as in `Confirmations.checks`.
+    - `of_step`: whether to say why there was none at a finer step.
+
+    **Returns:** the end of a sentence, such as `in double precision and at a half and a quarter of
+    the step`; empty without a check.
+    """
+    parts = []
+    if "float64" in checks:
+        parts.append("in double precision")
+    elif "again" in checks:
+        parts.append("when simulated again")
+    if "quarter_step" in checks:
+        parts.append("at a half and a quarter of the step")
+    if "nudged" in checks:
+        parts.append("one rounding of the features away")
+    if "simulator" in checks:
+        parts.append("in the other simulator")
+    text = " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
+    if text and of_step and "quarter_step" not in checks:
+        exact = EXACT_STEP in checks
+        text += "; the step belongs to the system" if exact else "; no finer step could be tried"
+    return text
+
+
+@dataclass(frozen=True, repr=False)
+class Confirmation(InNotebook):
+    """The verdict of finer replays on one counterexample.
+
+    **Fields:**
+
+    - `name`: of the problem.
+    - `row`: its number in the table; None for features without one.
+    - `verdict`: `"confirmed"`, `"refuted"`, `"fragile"` or `"raised"`.
+    - `rho`: robustness `as_run`, NaN if it is unknown, and of each check by name.
+    - `band`: how far the robustness moved between the replays.
+    - `why`: the reason of the verdict, as a sentence.
+    - `notes`: checks that could not be made, and why.
+    - `precision`: of the run.
+    - `changed`, `finding`: as in `Replay`, of the row simulated again in the run's precision; the
+      second is looked for if the model has changed or the verdict is not `"confirmed"`.
+    """
+
+    name: str
+    row: int | None
+    verdict: str
+    rho: dict[str, float]
+    band: float
+    why: str
+    notes: tuple[str, ...]
+    precision: str = "float32"
+    changed: str = ""
+    finding: str = ""
+
+    @property
+    def confirmed(self) -> bool:
+        """True if the counterexample failed in every replay."""
+        return self.verdict == "confirmed"
+
+    def __str__(self) -> str:
+        which = f"row {self.row} of {self.name}" if self.row is not None else f"{self.name}"
+        text = f"{which}: {self.verdict}, {MEANING[self.verdict]}"
+        if self.why and self.why not in self.notes:
+            text += f": {self.why}"
+        words = {"as_run": f"as run ({self.precision})", **CHECK_TEXTS}
+        values = [f"{rho:z.4g} {words[n]}" for n, rho in self.rho.items() if not np.isnan(rho)]
+        text += f". Robustness {', '.join(values)}" if values else ""
+        text = ". ".join([text, *(note[0].upper() + note[1:] for note in self.notes)]) + "."
+        return "\n".join([*(each for each in (self.changed, self.finding) if each), text])
+
+    __repr__ = __str__
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Confirmations(InNotebook):
+    """The verdicts of finer replays on `n` counterexamples.
+
+    **Fields:**
+
+    - `name`: of the problem.
+    - `numbers`: `[n]`, of the rows in the table.
+    - `run_rho`: `[n]`, the robustness as the run computed it; NaN if it is unknown.
+    - `verdict`: `[n]`: `confirmed`: it fails in every check, and by more than replays move it (if
+      all that can be done is to simulate it once more, and no row of the run held then, it is
+      enough that it fails again); `refuted`: none of the finer checks fails (half and quarter of
+      the step and the other simulator, or double precision if the step cannot be refined);
+      `fragile`: the checks disagree, one of them gave no robustness, the row fails by less than
+      that, or it did not fail when it was simulated again; `raised`: a check raised, and the others
+      fail; `unexamined`: left out, see `Confirmer`; empty for a row that was not to be checked.
+    - `rho`: for each check made, by name, the robustness `[n]` of the worst formula; NaN without
+      one. Names are `float64` (or `again`, in the precision of the run), `half_step`,
+      `quarter_step`, `quarter_step_float32`, `nudged` (at the finest step, with features one
+      rounding of float32 away) and `simulator`.
+    - `band`: `[n]`, how much the robustness moved: between half and quarter of the step, which is
+      what a method of order 1 is still off at the quarter (Richardson's extrapolation), or by
+      rounding: between two precisions, two neighbouring features, or the run and its replay if
+      `run_rho` is known. A row is confirmed if it fails by more than the first and by four times
+      the second.
+    - `why`: `[n]`, the reason as a sentence; empty if confirmed.
+    - `notes`: checks that could not be made, and why.
+    - `checks`: names of the checks that were made, for `describe_checks`.
+    - `changed`, `finding`: as in `Confirmation`, of the worst row that is not confirmed, or the
+      worst of all.
+    - `wavering`: a note if a host system did not give the numbers of the run again; then it is the
+      first of `notes`, too.
+    """
+
+    _internal = frozenset(("put", "refuse", "blank"))
+
+    name: str
+    numbers: Int[np.ndarray, " n"]
+    run_rho: Float[np.ndarray, " n"]
+    verdict: np.ndarray
+    rho: dict[str, Float[np.ndarray, " n"]]
+    band: Float[np.ndarray, " n"]
+    why: np.ndarray
+    notes: tuple[str, ...] = ()
+    checks: tuple[str, ...] = ()
+    changed: str = ""
+    finding: str = ""
+    wavering: tuple[str, ...] = ()
+
+    @classmethod
+    def blank(
+        cls,
+        name: str,
+        numbers: Int[np.ndarray, " n"],
+        run_rho: Float[np.ndarray, " n"] | None,
+        verdict: str = "unexamined",
+    ) -> "Confirmations":
+        """Return rows of one verdict before any was replayed; see `put`."""
+        missing = np.full(len(numbers), np.nan)
+        known = missing if run_rho is None else np.asarray(run_rho, np.float64)
+        texts = np.full(len(numbers), "", object)
+        verdicts = np.full(len(numbers), verdict, object)
+        return cls(name, np.asarray(numbers), known, verdicts, {}, missing.copy(), texts)
+
+    def put(self, rows: Int[np.ndarray, " some"], part: "Confirmations") -> None:
+        """Take over, in place, what replays of some of these rows have shown."""
+        self.verdict[rows], self.band[rows], self.why[rows] = part.verdict, part.band, part.why
+        for name, values in part.rho.items():
+            self.rho.setdefault(name, np.full(len(self), np.nan))[rows] = values
+
+    def refuse(self) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Return which rows are not claimed, and the robustness that a search learns of them.
+
+        That is the greatest one of the run and its replays, and positive, so that a search does not
+        stay with what is no failure; NaN if no replay was made.
+        """
+        refused = np.isin(self.verdict, NOT_CLAIMED)
+        if not self.rho:
+            return refused, np.full(len(refused), np.nan)
+        greatest = np.fmax.reduce(np.stack([*self.rho.values(), self.run_rho]), axis=0)
+        return refused, np.maximum(greatest, SMALLEST_KEPT)
+
+    @cached_property
+    def table(self) -> "pd.DataFrame":
+        """A row each, by row number: `verdict`, `rho` as run, `rho.CHECK`, `band`, `why`."""
+        import pandas as pd
+
+        return pd.DataFrame(
+            {
+                "verdict": self.verdict,
+                "rho": self.run_rho,
+                **{f"rho.{name}": values for name, values in self.rho.items()},
+                "band": self.band,
+                "why": self.why,
+            },
+            index=pd.Index(self.numbers, name="row"),
+        )
+
+    @property
+    def checked(self) -> str:
+        """The checks that a confirmed row has passed, as the end of a sentence."""
+        return describe_checks(self.checks)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of rows with each verdict that occurs."""
+        counted = Counter(self.verdict.tolist())
+        return {verdict: counted[verdict] for verdict in VERDICTS if counted[verdict]}
+
+    @property
+    def confirmed(self) -> "pd.DataFrame":
+        """The rows that fail in every replay."""
+        return self.table.loc[self.table["verdict"] == "confirmed"]
+
+    def __len__(self) -> int:
+        return len(self.verdict)
+
+    def __str__(self) -> str:
+        warnings = [text for text in (self.changed, self.finding) if text]
+        if not len(self):
+            return "\n".join([*warnings, f"{self.name}: no counterexample to confirm"])
+        counts = ", ".join(
+            f"{count} {verdict}{f' {self.checked}' if verdict == 'confirmed' else ''}"
+            for verdict, count in self.counts.items()
+        )
+        counted = "1 counterexample" if len(self) == 1 else f"{len(self)} counterexamples"
+        lines = [*warnings, f"{self.name}: of {counted}, {counts}"]
+        doubtful = self.table.loc[~self.table["verdict"].isin(["confirmed", "unexamined"])]
+        reasons = [
+            (rows.index, str(verdict), str(why))
+            for (verdict, why), rows in doubtful.groupby(["verdict", "why"], sort=False)  # pyright: ignore[reportGeneralTypeIssues]
+        ]
+        for rows, verdict, why in reasons[:SHOWN]:
+            more = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
+            lines.append(f"  row {rows[0]}{more} {verdict}: {why}")
+        if len(reasons) > SHOWN:
+            rest = sum(len(rows) for rows, _, _ in reasons[SHOWN:])
+            lines.append(f"  and {rest} more: see .table")
+        lines += [f"  note: {note}" for note in self.notes]
+        if len(self.confirmed):
+            worst = self.confirmed["rho"].idxmin()
+            lines.append(
+                f"  the worst confirmed is row {worst}, robustness "
+                f"{self.confirmed.loc[worst, 'rho']:z.4g}: run.replay({worst}) shows it"
+            )
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+
+@dataclass(frozen=True)
+class Repetitions:
+    """Counts of how a host system gave its rows again, with the same features and key.
+
+    - `rows`: violating rows that were simulated again.
+    - `moved`: those with another robustness, beyond rounding, or none.
+    - `rounded`: those whose last digits alone differ.
+    - `lost`: those that did not fail again.
+    - `most`: how far a robustness moved.
+    """
+
+    rows: int = 0
+    moved: int = 0
+    rounded: int = 0
+    lost: int = 0
+    most: float = 0.0
+
+    @classmethod
+    def count(
+        cls, rho: Float[np.ndarray, " n"], again: Float[np.ndarray, " n"], verdict: np.ndarray
+    ) -> "Repetitions":
+        """Count over violating rows: robustness in the run and in the repetition, and verdicts."""
+        rho, again = np.asarray(rho, np.float64), np.asarray(again, np.float64)
+        known = ~np.isnan(again)
+        lost = (verdict == "fragile") & ~(again < 0)
+        moved = lost | (known & came_otherwise(rho, again))
+        differs = known & (again != rho)
+        return cls(
+            int(np.sum(known | lost)),
+            int(np.sum(moved)),
+            int(np.sum(differs & ~moved)),
+            int(np.sum(lost)),
+            float(np.max(np.abs(rho - again)[differs], initial=0.0)),
+        )
+
+    def joined(self, other: "Repetitions") -> "Repetitions":
+        """Return the counts over the rows of both."""
+        return Repetitions(
+            self.rows + other.rows,
+            self.moved + other.moved,
+            self.rounded + other.rounded,
+            self.lost + other.lost,
+            max(self.most, other.most),
+        )
+
+    def __str__(self) -> str:
+        """Say what that means of the system; empty where all rows came again bit for bit."""
+        plural = "s" * (self.rows != 1)
+        of = f"of {self.rows} violating row{plural} simulated again with the same features and seed"
+        if self.moved:
+            by = f" (by up to {self.most:z.2g})" if self.most else ""
+            return (
+                f"the system has memory or chance of its own: {of}, {self.moved} gave another "
+                f"robustness{by}, and {self.lost} did not fail"
+            )
+        if self.rounded:
+            return f"{of}, {self.rounded} have other last digits, by up to {self.most:z.2g}"
+        return ""
+
+
+def came_otherwise(
+    rho: Float[np.ndarray, " n"], again: Float[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
+    """Return which robustnesses differ by more than rounding explains; not those without one."""
+    rho, again = np.asarray(rho, np.float64), np.asarray(again, np.float64)
+    with np.errstate(invalid="ignore"):
+        scale = np.maximum(np.abs(rho), np.abs(again))
+        return (rho != again) & (np.abs(rho - again) > ROUNDED * scale + SMALLEST_KEPT)

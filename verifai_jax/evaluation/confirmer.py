@@ -1,0 +1,439 @@
+"""Confirmation of counterexamples: each is replayed more finely than it was found.
+
+    confirmer = Confirmer(problem, precision="float32", seed=0)
+    found = confirmer(rows, numbers)                    # columns [n] of the table, row numbers [n]
+    found.verdict                                       # [n]: "confirmed", "fragile", ...
+    found.rho["quarter_step"]                           # [n], robustness at a quarter of the step
+
+A search simulates in single precision at the model's step; both may break a property that the
+model keeps. A counterexample is claimed only if it fails in double precision, at half and at a
+quarter of the step, there in single precision too, and with features that are one rounding away;
+and if it fails by more than the finer step has moved it, and by far more than rounding has.
+What runs on the host and has no finer step is simulated once more, with the same features and the
+same key: what fails then too is confirmed, and what does not is fragile, since the system remembers
+earlier simulations or draws numbers that do not come from its key.
+`confirmation_rules.py` decides from the replays, `confirmations.py` has the results.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any, TypeAlias
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from verifai_jax.core.errors import check_names
+from verifai_jax.core.executors import Executor
+from verifai_jax.core.keys import run_keys
+from verifai_jax.core.precision import in_precision
+from verifai_jax.core.trace import Trace
+from verifai_jax.evaluation.confirmation_rules import decide, hold_to_run, least_failing
+from verifai_jax.evaluation.confirmations import (
+    EXACT_STEP,
+    FINER,
+    RAISED,
+    SINGLE,
+    Confirmations,
+    came_otherwise,
+)
+from verifai_jax.evaluation.resimulate import (
+    ONE_BY_ONE,
+    HostReplays,
+    Replays,
+    finest_replays,
+)
+from verifai_jax.evaluation.verdicts import Verdicts
+from verifai_jax.problem.problem import Problem
+from verifai_jax.systems.base import System
+
+ROWS = 256
+"""Rows that are examined in any case, ..."""
+COST = 4096
+"""... or as many as cost so many simulations, where these are more: 15 a row with finer steps."""
+LIMIT = 1024
+"""Rows that a falsification examines at most, ..."""
+SHARE = 128
+"""... or one for so many simulations, where that is more."""
+REPEATED = 32
+"""Rows that a falsification of a host system without finer steps simulates again at most, ..."""
+SHARE_REPEATED = 25
+"""... or one for so many simulations, where that is more: 4 % of the budget, which leaves another
+hundredth for rows that are worse than all before. `LIMIT` and `SHARE` hold once a row came again
+otherwise."""
+MORE = 3
+"""Further repetitions of rows that fail again, once another row of the run did not: a system that
+fails at every seventh call fails in the first repetition of every seventh row, too."""
+SAFE = 10.0
+"""Further rows stay unexamined if they are so many times farther from zero than replays have moved
+any row."""
+BLOCK = 512
+"""Rows examined between two looks at whether the rest may stay unexamined."""
+WITH_WORST = ONE_BY_ONE
+"""Rows examined together with one that is worse than all examined before, so that no other program
+is compiled for it."""
+CHECKPOINT = "confirmer"
+"""Entry of a checkpoint: rows examined, how far replays moved one, the worst row, whether one came
+again otherwise, and whether one did not fail again."""
+
+Check: TypeAlias = tuple[Replays | HostReplays, int]
+"""One kind of replay: in the precision of these replays, with a so many times smaller step."""
+
+
+class Confirmer:
+    """Checks rows of a run's table; what it compiles is kept with the problem.
+
+    **Arguments:**
+
+    - `problem`: on the backend that it ran on.
+    - `precision`: of the run.
+    - `seed`: of the run; a simulation gets the random key that it had.
+    - `simulator`: another system for the same features and signals, or a problem with one, that
+      has to agree.
+    - `most`: how many rows are examined whatever comes; by default 256, and more where a row takes
+      few replays: 2048 where the step stays. Of more, those nearest to zero are, and
+      further ones until the rest is ten times farther from zero than any replay has moved a row;
+      these stay `unexamined`. Only where rows have a column `rho`. A row that is worse than all
+      examined before is examined whatever else was.
+    - `executor`, `target`: whose workers simulate a host system again, and how they find the
+      problem; this process when left out.
+
+    Once rows were examined, `check_names` names the checks that a confirmed row has passed, and
+    `raised` has a note on the first replay that raised, if any did. `wavers` is whether a row gave
+    another robustness when a host system simulated it again, and `flips` whether one did not fail
+    again.
+
+    **Raises:** what `Problem.check` does, for a simulator that does not fit.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        precision: str = "float32",
+        seed: int = 0,
+        *,
+        simulator: System | Callable[..., Trace] | Problem | str | None = None,
+        most: int | None = None,
+        executor: Executor | None = None,
+        target: str | None = None,
+    ) -> None:
+        if most is not None and (
+            isinstance(most, bool) or not isinstance(most, int | np.integer) or most < 1
+        ):
+            raise ValueError(f"most must be a positive integer; got {most!r}")
+        in_precision(precision)
+        self.problem, self.precision, self.seed, self.most = problem, precision, seed, most
+        self.executor, self.target = executor, target
+        self.other = None if simulator is None else _other(problem, simulator)
+        self.examined, self.band, self.worst = 0, 0.0, np.inf
+        self.wavers = self.flips = self._came_again = False
+        self.check_names: tuple[str, ...] = ()
+        self.raised: tuple[str, ...] = ()
+        self._checks: dict[str, Check] = {}
+        self._notes: tuple[str, ...] = ()
+        self._untraceable = ""
+        self._planned = False
+
+    def prepare(self) -> None:
+        """Trace what replays a row before there is one, while something else compiles.
+
+        An error in it is reported once there are rows.
+        """
+        if self.problem.black_box or self.other is not None:
+            return
+        with suppress(Exception):
+            self._plan()
+
+    def __call__(
+        self,
+        rows: Mapping[str, Any],
+        numbers: Sequence[int] | np.ndarray,
+        limit: int | None = None,
+    ) -> Confirmations:
+        """Check these rows of the table.
+
+        **Arguments:**
+
+        - `rows`: columns `[n]` by name, as the table has them: those of the features, and `rho`.
+        - `numbers`: `[n]`, of the rows, which decide on their random keys.
+        - `limit`: rows that are examined in all calls together; no limit when left out. Of more,
+          the worst row and those nearest to zero are. A worse row than all before, together with
+          some others, is examined beyond the limit, which is 1024 at least where the system wavers.
+
+        **Raises:** as `FeatureSpace.from_row`, for columns that are no rows of this problem.
+        """
+        numbers = np.asarray(numbers, int)
+        rows = {name: np.asarray(column) for name, column in rows.items()}
+        run = np.asarray(rows["rho"], np.float64) if "rho" in rows else None
+        found = Confirmations.blank(self.problem.name, numbers, run)
+        if not len(numbers):
+            return found
+        self._plan()
+        self.check_names = tuple(self._checks)
+        if self.problem.system.exact_step:
+            self.check_names += (EXACT_STEP,)
+        found.rho.update({name: np.full(len(numbers), np.nan) for name in self._checks})
+        most = self.most
+        if most is None:
+            cost = max(1, sum(factor for _, factor in self._checks.values()))
+            most = max(ROWS, COST // cost)
+        rest = np.arange(len(numbers)) if run is None else _order(run)
+        while len(rest):
+            size = self._block_size(rest, run, most, limit)
+            if not size:
+                break
+            block, rest = np.split(rest, [size])
+            taken = {name: column[block] for name, column in rows.items()}
+            found.put(block, self._examine(taken, numbers[block]))
+            if self.wavers and limit is not None:
+                limit = max(limit, LIMIT)
+        notes = list(self._notes)
+        if len(rest):
+            notes.append(self._left_out(rest, found))
+            found.why[rest] = notes[-1]
+        return replace(found, notes=tuple(notes), checks=self.check_names)
+
+    def check_round(self, columns: Mapping[str, np.ndarray], first: int) -> Confirmations:
+        """Check the violating ones of a run's new rows, as many as `limit` says.
+
+        **Arguments:**
+
+        - `columns`: of all new rows, as the table will have them.
+        - `first`: number of the first one in the run.
+
+        **Returns:** of all these rows; the verdict of those that violate nothing is empty.
+        """
+        violating = np.flatnonzero(columns["violated"])
+        count = len(columns["rho"])
+        found = Confirmations.blank(
+            self.problem.name, first + np.arange(count), columns["rho"], verdict=""
+        )
+        if len(violating):
+            taken = {name: column[violating] for name, column in columns.items()}
+            found.put(violating, self(taken, first + violating, self.limit(first + count)))
+        return found
+
+    @property
+    def compile_seconds(self) -> float:
+        """Seconds that its replays have spent compiling."""
+        replays = {id(each): each for each, _ in self._checks.values()}
+        return sum(each.compile_seconds for each in replays.values())
+
+    def limit(self, simulations: int) -> int:
+        """Return how many rows a falsification of so many simulations examines at most.
+
+        To simulate a black box again takes as long as to simulate it: 4 % of the simulations, or 32
+        of them, unless a row did not come again, or the simulator has finer steps of its own.
+        """
+        if self.problem.black_box and not self.wavers:
+            self._plan()
+            if self._only_repeats:
+                return max(REPEATED, simulations // SHARE_REPEATED)
+        return max(LIMIT, simulations // SHARE)
+
+    def far(self, rho: float) -> bool:
+        """Return whether a robustness is so far from zero that no replay will have another sign.
+
+        That is ten times as far as any replay has moved a row so far.
+        """
+        return bool(abs(rho) > SAFE * self.band)
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Return what decides which rows are examined next, as an entry of a checkpoint."""
+        numbers = [self.examined, self.band, self.worst, self.wavers, self.flips]
+        return {CHECKPOINT: np.array(numbers, np.float64)}
+
+    def restore(self, checkpoint: Mapping[str, Any]) -> None:
+        """Go on from a checkpoint."""
+        if CHECKPOINT in checkpoint:
+            examined, band, worst, wavers, flips = checkpoint[CHECKPOINT]
+            self.examined, self.band, self.worst = int(examined), float(band), float(worst)
+            self.wavers, self.flips = bool(wavers), bool(flips)
+
+    def _plan(self) -> None:
+        """Choose the checks that can be made, once; trace what they simulate."""
+        if self._planned:
+            return
+        problem, run = self.problem, self.precision
+        checks: dict[str, Check] = {}
+        key = run_keys(self.seed)[1]
+        base, notes, raised = finest_replays(problem, run, key, self.executor, self.target)
+        if base is not None:
+            checks["float64" if base.precision == "float64" else "again"] = base, 1
+            reason = base.refiner.why_not(FINER.values())
+            if reason is None:
+                checks |= {name: (base, factor) for name, factor in FINER.items()}
+                if base.precision != run:
+                    checks[SINGLE] = Replays(problem, run, base.key), FINER["quarter_step"]
+            else:
+                notes.append(f"not checked at a finer step: {reason}")
+            if not problem.black_box:
+                checks["nudged"] = base, FINER["quarter_step"] if reason is None else 1
+        if self.other is not None:
+            other, of_other, raised_too = finest_replays(self.other, run, key)
+            notes += [f"the other simulator: {note}" for note in of_other]
+            raised = raised or (raised_too and f"the other simulator: {raised_too}")
+            if other is not None:
+                checks["simulator"] = other, 1
+        self._checks, self._notes, self._untraceable = checks, tuple(notes), raised
+        self._planned = True
+
+    @property
+    def _only_repeats(self) -> bool:
+        """Whether all that is done is to simulate a host system once more."""
+        return self.problem.black_box and set(self._checks) == {"again"}
+
+    @property
+    def _is_finer(self) -> bool:
+        """Whether a check simulates more finely than the run, so that it may refute a row."""
+        checks = self._checks
+        more_precise = "float64" in checks and self.precision != "float64"
+        return more_precise or "quarter_step" in checks or "simulator" in checks
+
+    def _block_size(
+        self,
+        rest: Int[np.ndarray, " rest"],
+        run: Float[np.ndarray, " n"] | None,
+        most: int,
+        limit: int | None,
+    ) -> int:
+        """Return how many of the rows that are left are examined next; 0 to leave them."""
+        if run is None:
+            size = len(rest)
+        elif self.examined < most:
+            size = most - self.examined
+        else:
+            size = 0 if self.far(float(np.min(np.abs(run[rest])))) else BLOCK
+        if limit is not None:
+            size = min(size, limit - self.examined)
+        if size > 0:
+            return size
+        if run is None or run[rest[0]] >= self.worst:
+            return 0
+        return 1 if self.problem.black_box else 1 + WITH_WORST
+
+    def _examine(
+        self,
+        rows: Mapping[str, np.ndarray],
+        numbers: Int[np.ndarray, " n"],
+    ) -> Confirmations:
+        """Replay rows by all checks, decide, and note how far the replays have moved them."""
+        run = rows.get("rho")
+        replayed = self._replay(rows, numbers, run)
+        found = decide(
+            Confirmations.blank(self.problem.name, numbers, run, "raised"),
+            replayed,
+            run,
+            untraceable=self._untraceable,
+            may_refute=self._is_finer,
+            by_far=not self._only_repeats or self.flips,
+            came_again=self._only_repeats and self._came_again,
+        )
+        if self.problem.black_box and "verdict" in rows:
+            hold_to_run(found, replayed, rows, self._only_repeats)
+        self.examined += len(numbers)
+        if run is not None:
+            self.worst = min(self.worst, float(np.min(run)))
+        lost = np.flatnonzero(found.verdict == "raised")
+        if len(lost) and not self.raised:
+            self.raised = (f"not confirmed: {found.why[lost[0]]}",)
+        self.band = max(self.band, float(np.max(found.band)))
+        return found
+
+    def _replay(
+        self,
+        rows: Mapping[str, np.ndarray],
+        numbers: Int[np.ndarray, " n"],
+        run: Float[np.ndarray, " n"] | None,
+    ) -> dict[str, Verdicts]:
+        """Simulate rows again by each check."""
+        space = self.problem.space
+        features: dict[str, Any] = {}
+        together: dict[tuple[int, int], list[str]] = {}
+        for name, (replays, factor) in self._checks.items():
+            replays.begin_compiling(factor, len(numbers))
+            if replays.precision not in features:
+                features[replays.precision] = space.features_of(rows, replays.precision)
+            # What one program replays at one step fills its lanes.
+            together.setdefault((id(replays), factor), []).append(name)
+        replayed: dict[str, Verdicts] = {}
+        for names in together.values():
+            replays, factor = self._checks[names[0]]
+            values = features[replays.precision]
+            each = [space.nudged(values) if n == "nudged" else values for n in names]
+            replayed |= dict(zip(names, replays(factor, each, numbers), strict=True))
+        again = self._checks.get("again")
+        if again is not None and isinstance(again[0], HostReplays):
+            values = features[again[0].precision]
+            replayed["again"] = self._insist(again[0], values, numbers, replayed["again"], run)
+            self._came_again = self._came_again or bool(np.any(replayed["again"].proper))
+        # In the order of the plan, in which messages name them.
+        return {name: replayed[name] for name in self._checks}
+
+    def _insist(
+        self,
+        replays: HostReplays,
+        features: Any,
+        numbers: Int[np.ndarray, " n"],
+        again: Verdicts,
+        run: Float[np.ndarray, " n"] | None,
+    ) -> Verdicts:
+        """Simulate rows that fail again more often, where the system is known to waver.
+
+        **Returns:** of each row the repetition of greatest robustness.
+        """
+
+        def notice(rows: np.ndarray, seen: Verdicts) -> None:
+            held = bool(np.any(~seen.violated & ~np.isin(seen.status, RAISED)))
+            self.flips = self.flips or held
+            moved = run is not None and np.any(came_otherwise(run[rows], seen.least))
+            self.wavers = self.wavers or held or bool(moved)
+
+        notice(np.arange(len(numbers)), again)
+        for _ in range(MORE if self.wavers else 0):
+            left = np.flatnonzero(again.violated)
+            if not len(left):
+                break
+            own = jax.tree.map(lambda leaf, left=left: leaf[left], features)
+            [more] = replays.anew(own, numbers[left])
+            notice(left, more)
+            again = least_failing(again, more, left)
+        return again
+
+    def _left_out(self, rest: Int[np.ndarray, " rest"], found: Confirmations) -> str:
+        """Say why rows were not replayed."""
+        nearest = float(np.min(np.abs(found.run_rho[rest])))
+        note = f"{len(rest)} of {len(found)} were not replayed"
+        if self.far(nearest):
+            return (
+                f"{note}: {nearest:z.3g} or more from zero, where none of {self.examined} replays "
+                f"moved a row by more than {self.band:z.2g}"
+            )
+        return f"{note}, as {self.examined} rows of this run were before"
+
+
+def _order(run: Float[np.ndarray, " n"]) -> np.ndarray:
+    """Return the rows in the order in which they are examined: the worst one, then from zero on."""
+    order = np.argsort(np.abs(run), kind="stable")
+    worst = int(np.argmin(run))
+    return np.concatenate([[worst], order[order != worst]])
+
+
+def _other(problem: Problem, simulator: System | Callable[..., Trace] | Problem | str) -> Problem:
+    """Return the problem with another system."""
+    if isinstance(simulator, str):
+        if not problem.system.backends:
+            raise ValueError(
+                f"the system of problem {problem.name!r} has no backends; simulator must be a "
+                f"system or a Problem, got {simulator!r}"
+            )
+        other = problem.on_backend(simulator)
+    else:
+        system: Any = simulator.system if isinstance(simulator, Problem) else simulator
+        if isinstance(simulator, Problem):
+            check_names("feature of the simulator", simulator.space.columns, problem.space.columns)
+            check_names("feature", problem.space.columns, simulator.space.columns)
+        other = replace(problem, system=system)
+    other.check()
+    return other
