@@ -4,8 +4,8 @@
     frameworks/bin/pip install torch stable-baselines3 onnx onnxruntime onnxscript safetensors
     frameworks/bin/python tests/policies/make_fixtures.py
 
-For each file `NAME.*` there is an `NAME.expected.npz` with `observations` and `actions`; of those that
-remember, of one episode after the other, `[episode, time, ...]`.
+For each file `NAME.*` there is an `NAME.expected.npz` with `observations` and `actions`; of those
+that remember, of one episode after the other, `[episode, time, ...]`.
 """
 
 from pathlib import Path

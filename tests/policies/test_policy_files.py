@@ -1,4 +1,4 @@
-"""Files of other frameworks give what those frameworks gave, by `tests/policies/make_fixtures.py`."""
+"""Files of other frameworks give what those gave: `tests/policies/make_fixtures.py`."""
 
 from pathlib import Path
 

@@ -57,15 +57,16 @@ def policy(
       - `.zip`: a model of Stable-Baselines3 (PPO, A2C, SAC, TD3, DDPG, DQN), with its spaces, its
         squashing and its bounds;
       - `.onnx`: a graph; recurrent ones remember what they feed back;
-      - `.safetensors`, or `.pt` and `.pth` of `torch.save(module.state_dict())`: weights of an MLP by
-        `activation=`, or of a `network=` of your own;
+      - `.safetensors`, or `.pt` and `.pth` of `torch.save(module.state_dict())`: weights of an MLP
+        by `activation=`, or of a `network=` of your own;
       - `.npz` of `rl.save_policy`;
       - a folder: a checkpoint of Brax' or Playground's PPO;
-      - a model of Stable-Baselines3; a module of PyTorch with `observation=`; one of equinox or flax
-        (nnx); `(module, variables)` of flax (linen); an inference function of Brax; any function of the
-        observation. What JAX cannot trace runs in Python, and the log says what a call costs.
-    - `observation`: an example of an observation, to translate a module of PyTorch, and for the size
-      of one with `stack=`.
+      - a model of Stable-Baselines3; a module of PyTorch with `observation=`; one of equinox or
+        flax (nnx); `(module, variables)` of flax (linen); an inference function of Brax; any
+        function of the observation. What JAX cannot trace runs in Python, and the log says what a
+        call costs.
+    - `observation`: an example of an observation, to translate a module of PyTorch, and for the
+      size of one with `stack=`.
     - `normalise`: how observations are scaled first: the file of `VecNormalize.save`, or
       `(mean, scale)`.
     - `action`: what the outputs mean, where the file does not say it: `"argmax"`; `"clip"`,
@@ -75,15 +76,16 @@ def policy(
     - `network(weights, observation) -> outputs`: of other weights; `weights` by their names.
     - `layers`: names of the layers of an MLP, in order; otherwise in the order of their names.
     - `output`: of an ONNX graph with several outputs, the one that is the action.
-    - `memory`: of an ONNX graph, `{input: output}` of what it remembers; found by its shapes where None.
+    - `memory`: of an ONNX graph, `{input: output}` of what it remembers; found by its shapes where
+      None.
     - `stack`: observations that the policy sees at once, the newest last.
     - `batched`: a Python function takes a batch of observations.
 
-    **Returns:** a `Policy`, which any system takes as its policy or controller (`policy.act`), or the
-    `rl.Policy` of an `.npz`.
+    **Returns:** a `Policy`, which any system takes as its policy or controller (`policy.act`), or
+    the `rl.Policy` of an `.npz`.
 
-    **Raises:** `FileNotFoundError`; `PolicyError` for a file that is damaged or not supported, and for
-    options that it does not need. Nothing of a file is executed.
+    **Raises:** `FileNotFoundError`; `PolicyError` for a file that is damaged or not supported, and
+    for options that it does not need. Nothing of a file is executed.
     """
     check_count("stack", stack)
     if isinstance(source, Policy | OwnPolicy):
@@ -132,7 +134,8 @@ def _of_file(
         raise PolicyError(f"{path} has to be one of {', '.join(FORMATS)}, or a folder of Brax")
     if path.stat().st_size > MAX_BYTES:
         raise PolicyError(
-            f"{path} has {path.stat().st_size / 1e6:z.0f} MB; a policy may have {MAX_BYTES / 1e6:z.0f} MB"
+            f"{path} has {path.stat().st_size / 1e6:z.0f} MB, and a policy may have "
+            f"{MAX_BYTES / 1e6:z.0f} MB"
         )
     weights_alone = kind in (".safetensors", ".pt", ".pth")
     if not weights_alone and (activation or network or layers):

@@ -88,9 +88,9 @@ def _count(function: Callable[..., Any]) -> int | None:
 
 
 class RandomPolicy(Policy):
-    """A policy that draws: a function of `(observation, key)`, as Brax's inference functions are."""
+    """A policy that draws: a function of `(observation, key)`, such as those of Brax."""
 
-    def act(self, observation: PyTree, key: Key[Array, ""]) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def act(self, observation: PyTree, key: Key[Array, ""]) -> Any:
         """Return an action drawn with the random key of the step."""
         return self.actions(_Function.first(self.compute.function(observation, key)))  # pyright: ignore
 

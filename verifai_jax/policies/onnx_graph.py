@@ -160,7 +160,7 @@ def read_onnx(
 def _nodes(
     graph: Any, opset: int, known: set[str], path: Path | None, what: str
 ) -> tuple[Node, ...]:
-    """Return the nodes of a graph, checked: operators that exist, inputs that were computed before."""
+    """Return the nodes of a graph, whose operators exist and whose inputs are computed before."""
     missing = sorted({n.op_type for n in graph.node} - {*OPERATORS, "If"})
     if missing:
         first = next(n for n in graph.node if n.op_type == missing[0])
@@ -178,8 +178,8 @@ def _nodes(
         absent = [name for name in node.input if name and name not in known]
         if absent:
             raise PolicyError(
-                f"{what} is damaged: node {node.name or node.op_type!r} reads {absent[0]!r}, which no "
-                "node before it computes"
+                f"{what} is damaged: node {node.name or node.op_type!r} reads {absent[0]!r}, "
+                "which no node before it computes"
             )
         attributes = {a.name: _attribute(a, opset, known, path, what) for a in node.attribute}
         name = node.name or (node.output[0] if node.output else "")

@@ -3,8 +3,8 @@
     data = read_pickle(bytes)
     data["obs_rms"].state["mean"]
 
-Checkpoints of PyTorch and files of Stable-Baselines3 hold pickles, whose format is a program that may
-call any function. This reader follows the program and writes down what it would call.
+Checkpoints of PyTorch and files of Stable-Baselines3 hold pickles, whose format is a program that
+may call any function. This reader follows the program and writes down what it would call.
 Source: Python's `pickletools`, which names and describes the operations.
 """
 
@@ -73,8 +73,8 @@ def read_pickle(data: bytes, what: str) -> Any:
     - `data`: the bytes.
     - `what`: where they are from, for errors.
 
-    **Returns:** numbers, texts, bytes, tuples, lists and dictionaries as they are; a `Name` for a class
-    or function, a `Record` for an object, a `Persistent` for data outside.
+    **Returns:** numbers, texts, bytes, tuples, lists and dictionaries as they are; a `Name` for a
+    class or function, a `Record` for an object, a `Persistent` for data outside.
 
     **Raises:** `PolicyError` for bytes that are no pickle.
     """
@@ -221,8 +221,8 @@ _METHODS: dict[str, Callable[[_Reader, Any], None]] = {
 def array_of(record: object) -> np.ndarray | None:
     """Return the array that a record of NumPy's describes; None for anything else.
 
-    Arrays are pickled as `_reconstruct` with a state `(version, shape, dtype, fortran, bytes)`, scalars
-    as `scalar(dtype, bytes)`.
+    Arrays are pickled as `_reconstruct` with a state `(version, shape, dtype, fortran, bytes)`,
+    scalars as `scalar(dtype, bytes)`.
     """
     if not isinstance(record, Record) or not isinstance(record.function, Name):
         return None

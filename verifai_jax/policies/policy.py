@@ -2,7 +2,8 @@
 
 policy = vj.policy("ppo.zip")
 policy.act(observation)                                  # an action of its environment
-action, memory = policy.act(observation, memory)         # one that remembers, from initial_memory on
+action, memory = policy.act(observation, memory)         # one that remembers, from initial_memory
+on
 """
 
 import dataclasses
@@ -40,8 +41,8 @@ class Actions:
     - `low`, `high`: bounds of each entry of the action; for `clip`, `scale` and `tanh`.
     - `counts`: of several choices the number of each, in the order of the outputs; for `argmax`.
 
-    **Raises:** `UnknownNameError` for another kind; `PolicyError` for bounds that are missing or do not
-    fit.
+    **Raises:** `UnknownNameError` for another kind; `PolicyError` for bounds that are missing or
+    do not fit.
     """
 
     kind: str = "outputs"
@@ -108,8 +109,8 @@ class Normaliser:
 class Policy:
     """A network of any framework in JAX, with the meaning of its inputs and outputs.
 
-    It is a pytree: its weights are batched, differentiated and computed in double precision as those
-    of `rl.Policy` are.
+    It is a pytree: its weights are batched, differentiated and computed in double precision as
+    those of `rl.Policy` are.
 
     - `weights`: pytree of arrays.
     - `compute(weights, observation, memory) -> (outputs, memory)`: a pure function; the memory is

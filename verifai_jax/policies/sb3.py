@@ -1,8 +1,9 @@
 """Policies of Stable-Baselines3 from their files, without it and without unpickling.
 
 A model's `.zip` has the settings as JSON (`data`), among them pickled spaces, and the weights
-(`policy.pth`). `VecNormalize.save` writes one pickle. Source: Stable-Baselines3 2.7, `common/policies.py`,
-`common/torch_layers.py`, `sac/policies.py`, `td3/policies.py`, `dqn/policies.py`, `vec_normalize.py`.
+(`policy.pth`). `VecNormalize.save` writes one pickle. Source: Stable-Baselines3 2.7,
+`common/policies.py`, `common/torch_layers.py`, `sac/policies.py`, `td3/policies.py`,
+`dqn/policies.py`, `vec_normalize.py`.
 """
 
 import base64
@@ -22,7 +23,8 @@ from verifai_jax.policies.torch_archive import open_archive, read_member, read_s
 Weights = Mapping[str, np.ndarray]
 
 _KINDS = (
-    # What is there, the hidden layers, the last layer (None: the last of the hidden ones), the features.
+    # What is there, the hidden layers, the last layer (None: the last of the hidden ones), the
+    # features.
     ("action_net.weight", "mlp_extractor.policy_net.", "action_net", ""),
     ("actor.latent_pi.0.weight", "actor.latent_pi.", "actor.mu", "actor."),
     ("actor.mu.weight", "actor.latent_pi.", "actor.mu", "actor."),
@@ -42,21 +44,20 @@ def read_sb3(data: bytes, what: str) -> Policy:
     archive = open_archive(data, what)
     if "data" not in archive.namelist() or "policy.pth" not in archive.namelist():
         raise PolicyError(
-            f"{what} is no model of Stable-Baselines3: it has no data and policy.pth. Of an archive of "
-            "torch.save give network= or activation=, too"
+            f"{what} is no model of Stable-Baselines3: it has no data and policy.pth. Name an "
+            "archive of torch.save .pt"
         )
     try:
         settings = json.loads(read_member(archive, "data", what))
-        spaces = [
-            _space(settings[f"{name}_space"], name, what) for name in ("observation", "action")
-        ]
+        observed = _space(settings["observation_space"], "observation", what)
+        acts = _space(settings["action_space"], "action", what)
         options = _options(settings.get("policy_kwargs", {}), what)
     except PolicyError:
         raise
     except Exception as error:
         raise PolicyError(f"the settings of {what} are damaged: {error!r}") from error
     weights = read_state(read_member(archive, "policy.pth", what), f"policy.pth of {what}")
-    return _policy(weights, *spaces, options, what)
+    return _policy(weights, observed, acts, options, what)
 
 
 def read_normaliser(data: bytes, what: str) -> Normaliser:
@@ -201,7 +202,7 @@ def _actions(acts: tuple[str, dict[str, Any]], squashed: bool, what: str) -> Act
         return Actions("argmax", counts=tuple(int(n) for n in np.ravel(space["nvec"])))
     if kind == "MultiBinary":
         return Actions("positive")
-    if kind != "Box" or np.ndim(space.get("low")) != 1:
+    if kind != "Box" or np.ndim(space.get("low", 0)) != 1:
         raise PolicyError(f"{what} has actions of {kind} of a form that is not supported")
     low, high = (tuple(np.ravel(space[name]).astype(float).tolist()) for name in ("low", "high"))
     return Actions("tanh" if squashed else "clip", low, high)

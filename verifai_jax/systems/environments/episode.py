@@ -301,8 +301,9 @@ def policy_function(policy: object, memory: PyTree = None) -> Decide:
         if memory is None:
             action = function(observation, *last, **options)
             # Policies of Brax return what they drew with, too.
-            extras = isinstance(action, tuple) and len(action) == 2 and isinstance(action[1], dict)
-            return action[0] if extras else action, remembered
+            if isinstance(action, tuple) and len(action) == 2 and isinstance(action[1], dict):
+                action = action[0]
+            return action, remembered
         decided = function(observation, remembered, *last, **options)
         if not (isinstance(decided, tuple) and len(decided) == 2):
             raise ValueError(f"policy must return (action, memory); got {outline(decided)}")
