@@ -13,7 +13,7 @@ LAYERS = (
     {"core", "statistics", "_version"},
     {"features", "mtl", "systems", "search", "clusters"},
     {"rl", "problem", "perception", "events", "scenes", "blocks"},
-    {"evaluation"},
+    {"evaluation", "policies"},
     {"falsification"},
     {
         "comparison",

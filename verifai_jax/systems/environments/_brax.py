@@ -57,6 +57,7 @@ from verifai_jax.systems.environments.episode import (
     check_features,
     check_signals_option,
     features_at,
+    first_memory,
     fold,
     has_waveforms,
     policy_function,
@@ -346,6 +347,7 @@ def brax(
     check_called_with("configure", configure, ("sys", "features"))
     if not isinstance(initial, Mapping):
         check_called_with("initial", initial, ("env", "features", "key"))
+    policy_memory = first_memory(policy, policy_memory)
     policy_function(policy, policy_memory)
     bindings = features if isinstance(features, Mapping) else {path: path for path in features}
     places = {feature: system_place(env, path, name) for feature, path in bindings.items()}

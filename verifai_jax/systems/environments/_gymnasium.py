@@ -33,6 +33,7 @@ from verifai_jax.systems.environments.episode import (
     check_features,
     check_signals_option,
     features_at,
+    first_memory,
     policy_that_sees,
     read_signals,
     sampling_period,
@@ -89,6 +90,7 @@ class EpisodeFunction:
         # Pictures by sample, of the samples that are wanted; none is drawn without.
         self._drawn: dict[int, Any] | None = None
         self._wanted: Collection[int] = ()
+        self._memory: Any = None
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_env": None, "_decide": None}
@@ -140,6 +142,7 @@ class EpisodeFunction:
         observation = self._start(env, features, seed)
         if callable(getattr(self.policy, "reset", None)):
             self.policy.reset()
+        self._memory = first_memory(self.policy, None)
         changes = any(is_waveform(features[name]) for name in self.features)
         reward, over, rows, overshoots = 0.0, False, [], 0
         wait, lag = (self._delay(d, features) for d in (self.observation_delay, self.action_delay))
@@ -312,7 +315,10 @@ class EpisodeFunction:
             self._decide = _policy_function(self.policy)
         sees = policy_that_sees(self.policy) is not None
         options = {"features": features_at(features, time)} if sees else {}
-        action = self._decide(observation, **options)
+        if self._memory is None:
+            action = self._decide(observation, **options)
+        else:
+            action, self._memory = self._decide(observation, self._memory, **options)
         try:
             return fit(env.action_space, action, self.clip)
         except Misfit as misfit:

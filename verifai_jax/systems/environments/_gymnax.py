@@ -43,6 +43,7 @@ from verifai_jax.systems.environments.episode import (
     check_features,
     check_signals_option,
     features_at,
+    first_memory,
     fold,
     has_waveforms,
     policy_function,
@@ -319,6 +320,7 @@ def gymnax(
     check_called_with("configure", configure, ("params", "features"))
     if not isinstance(initial, Mapping):
         check_called_with("initial", initial, ("state", "features", "key"))
+    policy_memory = first_memory(policy, policy_memory)
     policy_function(policy, policy_memory)
     _check_choices(policy, env.action_space(params), env.name)
     if isinstance(initial, Mapping):

@@ -238,13 +238,22 @@ def policy_function(policy: object, memory: PyTree = None) -> Decide:
         last = (key,) if random else ()
         options = {"features": features} if sees else {}
         if memory is None:
-            return function(observation, *last, **options), remembered
+            action = function(observation, *last, **options)
+            # Policies of Brax return what they drew with, too.
+            if isinstance(action, tuple) and len(action) == 2 and isinstance(action[1], dict):
+                action = action[0]
+            return action, remembered
         decided = function(observation, remembered, *last, **options)
         if not (isinstance(decided, tuple) and len(decided) == 2):
             raise ValueError(f"policy must return (action, memory); got {outline(decided)}")
         return decided
 
     return decide
+
+
+def first_memory(policy: object, memory: PyTree) -> PyTree:
+    """Return what a policy remembers at first: what is stated, or what the policy says itself."""
+    return getattr(policy, "initial_memory", None) if memory is None else memory
 
 
 def policy_that_sees(policy: object) -> Callable[..., Any] | None:

@@ -1,0 +1,268 @@
+"""Policies of objects: models and functions of other frameworks, in JAX where they can be.
+
+policy = from_object(model, observation=np.zeros(8))
+"""
+
+import inspect
+import io
+import logging
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Key, PyTree
+
+from verifai_jax.core.errors import require
+from verifai_jax.core.text import format_seconds, one_line
+from verifai_jax.core.user_errors import defined_at
+from verifai_jax.policies.errors import PolicyError
+from verifai_jax.policies.onnx_graph import read_onnx
+from verifai_jax.policies.policy import Policy
+from verifai_jax.policies.sb3 import read_sb3
+
+log = logging.getLogger("verifai_jax.policies")
+
+
+def from_object(source: Any, observation: Any, batched: bool) -> Policy:
+    """Return the policy of a model or function.
+
+    **Arguments:**
+
+    - `source`: see `policy`.
+    - `observation`: an example, where the object cannot be translated without one.
+    - `batched`: a Python function takes a batch of observations.
+
+    **Raises:** `PolicyError` for something that is no policy.
+    """
+    root = type(source).__module__.partition(".")[0]
+    if root in ("stable_baselines3", "sb3_contrib"):
+        return _of_sb3(source)
+    if _is_a(source, "torch.nn.modules.module", "Module"):
+        return _of_torch(source, observation)
+    if (
+        isinstance(source, tuple)
+        and len(source) == 2
+        and callable(getattr(source[0], "apply", None))
+    ):
+        module, variables = source
+        return Policy(variables, _Applied(module))
+    if _is_a(source, "flax.nnx.module", "Module"):
+        graph, state = require("flax.nnx", extra="policies").split(source)
+        return Policy(state, _Merged(graph))
+    if not callable(source):
+        raise PolicyError(
+            "a policy is a file, a model or a function of the observation; got "
+            f"{type(source).__name__}. Of a flax module give (module, variables)"
+        )
+    leaves, structure = jax.tree.flatten(source)
+    if leaves and leaves != [source]:
+        arrays = [leaf if isinstance(leaf, jax.Array | np.ndarray) else None for leaf in leaves]
+        rest = tuple(
+            None if a is not None else leaf for a, leaf in zip(arrays, leaves, strict=True)
+        )
+        return Policy(arrays, _Rebuilt(structure, rest))
+    if _count(source) == 2:
+        return RandomPolicy((), _Function(source, batched))
+    return Policy((), _Function(source, batched))
+
+
+def _is_a(source: object, module: str, name: str) -> bool:
+    """Return whether an object's class descends from one of a library that may not be installed."""
+    return any((c.__module__, c.__name__) == (module, name) for c in type(source).__mro__)
+
+
+def _count(function: Callable[..., Any]) -> int | None:
+    """Count the arguments without a default."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        return None
+    plain = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return sum(p.kind in plain and p.default is p.empty for p in parameters)
+
+
+class RandomPolicy(Policy):
+    """A policy that draws: a function of `(observation, key)`, such as those of Brax."""
+
+    def act(self, observation: PyTree, key: Key[Array, ""]) -> Any:
+        """Return an action drawn with the random key of the step."""
+        return self.actions(_Function.first(self.compute.function(observation, key)))  # pyright: ignore
+
+
+jax.tree_util.register_dataclass(
+    RandomPolicy,
+    ["weights", "initial_memory", "normaliser"],
+    ["compute", "actions"],
+)
+
+
+@dataclass(frozen=True)
+class _Applied:
+    """The function of a flax module of the linen kind."""
+
+    module: Any
+
+    def __call__(self, weights: PyTree, observation: Any, memory: None) -> tuple[Any, None]:
+        return _Function.first(self.module.apply(weights, observation)), None
+
+
+@dataclass(frozen=True)
+class _Merged:
+    """The function of a flax module of the nnx kind."""
+
+    graph: Any
+
+    def __call__(self, weights: PyTree, observation: Any, memory: None) -> tuple[Any, None]:
+        nnx = require("flax.nnx", extra="policies")
+        return _Function.first(nnx.merge(self.graph, weights)(observation)), None
+
+
+@dataclass(frozen=True, eq=False)
+class _Rebuilt:
+    """The function of a callable pytree, such as a module of equinox."""
+
+    structure: Any
+    rest: tuple[Any, ...]
+
+    def __call__(self, weights: PyTree, observation: Any, memory: None) -> tuple[Any, None]:
+        leaves = [r if w is None else w for w, r in zip(weights, self.rest, strict=True)]
+        return _Function.first(jax.tree.unflatten(self.structure, leaves)(observation)), None
+
+
+@dataclass(frozen=True, eq=False)
+class _Function:
+    """A Python function: traced by JAX where it can be, otherwise called on the host.
+
+    - `batched`: on the host it takes a batch of observations at a time.
+    """
+
+    function: Callable[..., Any]
+    batched: bool = False
+
+    @staticmethod
+    def first(result: Any) -> Any:
+        """Return the action of `(action, extras)`, which Brax's policies return."""
+        pair = isinstance(result, tuple) and len(result) == 2
+        return result[0] if pair and isinstance(result[1], Mapping) else result
+
+    @cached_property
+    def forms(self) -> dict[Any, Any]:
+        """Shapes of observations that the host computes, with the form of the action."""
+        return {}
+
+    def __call__(self, weights: PyTree, observation: Any, memory: None) -> tuple[Any, None]:
+        shapes = jax.tree.map(lambda o: (jnp.shape(o), str(jnp.result_type(o))), observation)
+        key = str(shapes)
+        if key not in self.forms:
+            try:
+                traced = self.first(self.function(observation))
+                return jax.tree.map(jnp.asarray, traced), None
+            except Exception as error:
+                self.forms[key] = self._form(observation, error)
+        if (form := self.forms[key]) is None:
+            return self.first(self.function(observation)), None
+        action = jax.pure_callback(
+            self._on_host,
+            form,
+            observation,
+            vmap_method="broadcast_all" if self.batched else "sequential",
+        )
+        return action, None
+
+    def _on_host(self, observation: Any) -> Any:
+        seen = jax.tree.map(np.asarray, observation)
+        return jax.tree.map(_plain, self.first(self.function(seen)))
+
+    def _form(self, observation: Any, error: Exception) -> Any:
+        """Return the form of the action on the host, and say what it costs.
+
+        **Raises:** what the function raises there.
+        """
+        zeros = jax.tree.map(lambda o: np.zeros(jnp.shape(o), jnp.result_type(o)), observation)
+        begun = time.perf_counter()
+        action = self._on_host(zeros)
+        took = time.perf_counter() - begun
+        log.warning(
+            "the policy%s runs in Python, %s a call, because JAX cannot trace it: %s",
+            defined_at(self.function),
+            format_seconds(took, 2),
+            one_line(str(error))[:200],
+        )
+        return jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), action)
+
+
+def _plain(value: Any) -> np.ndarray:
+    """Return a number or array of any framework as one of NumPy that JAX takes."""
+    value = value.detach().cpu().numpy() if hasattr(value, "detach") else value
+    array = np.asarray(value)
+    return array.astype(jax.dtypes.canonicalize_dtype(array.dtype))
+
+
+def _of_sb3(model: Any) -> Policy:
+    file = io.BytesIO()
+    model.save(file)
+    try:
+        return read_sb3(file.getvalue(), f"the model {type(model).__name__}")
+    except PolicyError as error:
+        log.warning("%s; it runs in Python until then", error)
+        return Policy((), _Function(lambda seen: model.predict(seen, deterministic=True)[0], True))
+
+
+def _of_torch(module: Any, observation: Any) -> Policy:
+    """Return a module of PyTorch, by way of ONNX."""
+    if observation is None:
+        raise PolicyError("of a torch module give observation=, an example of what it takes, too")
+    torch = require("torch", extra="policies")
+    example = torch.as_tensor(np.asarray(observation, np.float32))
+    file = io.BytesIO()
+    module = module.eval()
+    require("onnx", extra="policies")
+    try:
+        torch.onnx.export(module, (example[None],), file, dynamo=False, input_names=["observation"])
+        graph, weights, memory = read_onnx(
+            None, file.getvalue(), "the torch module", output=None, memory=None
+        )
+        return Policy(weights, graph, memory)
+    except Exception as error:
+        log.warning(
+            "the torch module runs in Python, because it cannot be translated: %s",
+            one_line(str(error))[:300],
+        )
+        call = lambda seen: module(torch.as_tensor(np.array(seen, np.float32)))  # noqa: E731
+        return Policy((), _Function(call, batched=True))
+
+
+def read_brax(folder: Path) -> Policy:
+    """Return the deterministic policy of a checkpoint of Brax' or Playground's PPO.
+
+    **Raises:** `PolicyError` for a folder that holds none.
+    """
+    checkpoint = require("brax.training.agents.ppo.checkpoint", extra="brax")
+    networks = require("brax.training.agents.ppo.networks", extra="brax")
+    try:
+        config = checkpoint.load_config(folder)
+        weights = checkpoint.load(folder)
+        made = checkpoint._get_ppo_network(config, networks.make_ppo_networks)
+        infer = networks.make_inference_fn(made)
+    except Exception as error:
+        raise PolicyError(
+            f"{folder} holds no checkpoint of Brax' PPO: {one_line(str(error))}"
+        ) from error
+    return Policy(weights, _Inference(infer))
+
+
+@dataclass(frozen=True, eq=False)
+class _Inference:
+    """The function of a policy of Brax: `make(weights, deterministic)` gives its inference."""
+
+    make: Callable[..., Any]
+
+    def __call__(self, weights: PyTree, observation: Any, memory: None) -> tuple[Any, None]:
+        action, _ = self.make(weights, deterministic=True)(observation, jax.random.key(0))
+        return action, None
