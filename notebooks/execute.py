@@ -11,6 +11,7 @@ import copy
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from importlib.metadata import version
 from pathlib import Path
 
 import nbformat
@@ -43,6 +44,7 @@ def execute(path: Path, update: bool) -> bool:
         print(f"{path.name}: a cell FAILED\n{error}", file=sys.stderr)
         return False
     print(f"{path.name}: {time.perf_counter() - started:.0f} s", flush=True)
+    notebook.metadata["verifai_jax"] = {"jax": version("jax")}
     if update:
         for cell in notebook.cells:
             # When a cell ran and on which kernel is noise in a diff.

@@ -4,7 +4,9 @@ differences(stored, executed)       # ["cell 11 ...: differs ...", ...]; empty w
 
 Two outputs agree where their words agree, integers are equal, and other numbers differ by less than
 a thousandth. Durations and speeds are left out, and pictures have no text. A cell with the tag
-`machine-dependent`, such as one that trains a network, needs only the same kinds of output.
+`machine-dependent`, such as one that trains a network, needs only the same kinds of output. Where
+another JAX computed the stored outputs, only words are compared: compilers round differently, and a
+search that learns of other roundings simulates other points.
 """
 
 import difflib
@@ -21,6 +23,9 @@ RELATIVE, ABSOLUTE = 1e-3, 1e-6
 
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?", re.IGNORECASE)
 """A number, perhaps with commas between its thousands."""
+
+NOT_A_NUMBER = re.compile(r"-?\b(?:nan|inf)\b", re.IGNORECASE)
+"""Entries of a table that are no finite numbers."""
 
 SPENT = re.compile(
     r"[\d.,]+ (?:ms|s|min|h)(?= to compile| to search| to simulate| to confirm| to run| of a core)"
@@ -59,9 +64,17 @@ def texts(cell: Any) -> dict[str, str]:
     return shown
 
 
-def agree(stored: str, new: str) -> bool:
-    """Check that two texts agree: words and integers exactly, other numbers nearly."""
+def agree(stored: str, new: str, same_compiler: bool = True) -> bool:
+    """Check that two texts agree: words and integers exactly, other numbers nearly.
+
+    **Arguments:**
+
+    - `stored`, `new`: the texts.
+    - `same_compiler`: one version of JAX computed both; otherwise numbers are not compared.
+    """
     stored, new = (SPENT.sub("TIME ", REST.sub("", text)) for text in (stored, new))
+    if not same_compiler:
+        return _words(NOT_A_NUMBER.sub("0", stored)) == _words(NOT_A_NUMBER.sub("0", new))
     numbers, new_numbers = NUMBER.findall(stored), NUMBER.findall(new)
     return (
         _words(stored) == _words(new)
@@ -83,6 +96,11 @@ def _same_number(before: str, after: str) -> bool:
     return math.isclose(one, other, rel_tol=RELATIVE, abs_tol=ABSOLUTE)
 
 
+def jax_version(notebook: Any) -> str | None:
+    """Return the version of JAX that computed a notebook's outputs; None if it is not recorded."""
+    return notebook.get("metadata", {}).get("verifai_jax", {}).get("jax")
+
+
 def differences(stored: Any, executed: Any) -> list[str]:
     """List the cells whose outputs differ, each with its difference.
 
@@ -93,15 +111,16 @@ def differences(stored: Any, executed: Any) -> list[str]:
 
     **Returns:** a text for each cell that differs.
     """
+    same = jax_version(stored) == jax_version(executed)
     return [
         f"cell {number}, {_first_line(cell)}\n{difference}"
         for number, (cell, new) in enumerate(zip(stored["cells"], executed["cells"], strict=True))
         if cell["cell_type"] == "code"
-        for difference in _difference(cell, new)
+        for difference in _difference(cell, new, same)
     ]
 
 
-def _difference(cell: Any, new_cell: Any) -> Iterator[str]:
+def _difference(cell: Any, new_cell: Any, same_compiler: bool) -> Iterator[str]:
     before, after = texts(cell), texts(new_cell)
     if list(before) != list(after):
         yield f"  stored outputs: {', '.join(before) or 'none'}; new: {', '.join(after) or 'none'}"
@@ -109,7 +128,7 @@ def _difference(cell: Any, new_cell: Any) -> Iterator[str]:
     if TAG in cell.get("metadata", {}).get("tags", []):
         return
     for kind, text in before.items():
-        if not agree(text, after[kind]):
+        if not agree(text, after[kind], same_compiler):
             lines = difflib.unified_diff(
                 text.splitlines(), after[kind].splitlines(), "stored", "new", n=0, lineterm=""
             )

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from notebooks.outputs import TAG, agree, differences, texts
+from notebooks.outputs import TAG, agree, differences, jax_version, texts
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 
@@ -104,3 +104,18 @@ def test_stored_notebooks_agree_with_themselves(path):
     stored = json.loads(path.read_text())
     assert differences(stored, stored) == []
     assert any(texts(cell) for cell in stored["cells"] if cell["cell_type"] == "code")
+
+
+def test_another_compiler_may_give_other_numbers_and_no_other_words():
+    stored, new = "1  1.85  20000  3  1.86\nnearest row 5", "1  1.85  20000  0  NaN\nnearest row 7"
+    assert agree(stored, new, same_compiler=False)
+    assert not agree(stored, new.replace("nearest", "worst"), same_compiler=False)
+    before, after = notebook(stream(stored)), notebook(stream(new))
+    assert differences(before, after)
+    after["metadata"] = {"verifai_jax": {"jax": "0.12"}}
+    assert not differences(before, after)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_every_notebook_says_which_jax_computed_it(path):
+    assert jax_version(json.loads(path.read_text()))

@@ -1,4 +1,4 @@
-"""The table of claims: each is a sentence of the README or of its continuation, and can be checked."""
+"""The table of claims: each is a sentence of README.md or docs/overview.md, and can be checked."""
 
 import re
 from pathlib import Path

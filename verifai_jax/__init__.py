@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from verifai_jax import events as events
     from verifai_jax import mtl as mtl
     from verifai_jax import perception as perception
+    from verifai_jax import policies as policies
     from verifai_jax import rl as rl
     from verifai_jax import search as search
     from verifai_jax.augmentation import Augmentation as Augmentation
@@ -82,6 +83,7 @@ if TYPE_CHECKING:
     from verifai_jax.mtl import robustness as robustness
     from verifai_jax.mtl import signal as signal
     from verifai_jax.mtl import until as until
+    from verifai_jax.policies import policy as policy
     from verifai_jax.problem import Behaviour as Behaviour
     from verifai_jax.problem import Guide as Guide
     from verifai_jax.problem import Problem as Problem

@@ -3,8 +3,8 @@
     verifai-jax falsify specs/arch/steam_condenser.py:sc_instance1 --search gradient
 
 From 30 s to 35 s the pressure stays between 87 and 87.5 kPa. Instance 2 (`sc`): the flow of steam
-is constant for 1.75 s, 20 pieces; most likely it cannot be broken, see docs/arch_comp.md. Instance 1
-(`sc_instance1`): 200 pieces of 0.175 s, of which some break it, all by less than 0.003 kPa.
+is constant for 1.75 s, 20 pieces; most likely it cannot be broken, see docs/arch_comp.md.
+Instance 1 (`sc_instance1`): 200 pieces of 0.175 s, of which some break it, by less than 0.003 kPa.
 """
 
 import verifai_jax as vj
