@@ -1,6 +1,7 @@
 """Models and functions of other frameworks as policies, in the systems that take one."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import equinox
@@ -168,3 +169,25 @@ def test_own_policies_and_refusals():
         policy(3)
     with pytest.raises(PolicyError, match="stack= needs observation="):
         policy(lambda x: x, stack=2)
+
+
+@pytest.mark.thorough
+def test_a_checkpoint_of_brax_with_its_normaliser(tmp_path):
+    checkpoint = pytest.importorskip("brax.training.agents.ppo.checkpoint")
+    from brax.training.acme import running_statistics, specs
+    from brax.training.agents.ppo import networks
+
+    make = partial(networks.make_ppo_networks, policy_hidden_layer_sizes=(8, 8))
+    made = make(5, 2, preprocess_observations_fn=running_statistics.normalize)
+    scale = running_statistics.init_state(specs.Array((5,), np.dtype("float32")))
+    scale = scale.replace(mean=jnp.arange(5.0), std=1 + jnp.arange(5.0))
+    key = jax.random.key(0)
+    weights = (scale, made.policy_network.init(key), made.value_network.init(key))
+    config = checkpoint.network_config(5, 2, True, make)
+    checkpoint.save(tmp_path, 7, weights, config)
+    loaded = policy(tmp_path / "000000000007")
+    infer = networks.make_inference_fn(made)(weights, deterministic=True)
+    check_same(loaded, lambda x: infer(x, key)[0], size=5)
+    (tmp_path / "000000000007" / "ppo_network_config.json").write_text("{}")
+    with pytest.raises(PolicyError, match="holds no checkpoint of Brax' PPO"):
+        policy(tmp_path / "000000000007")

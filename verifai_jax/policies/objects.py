@@ -3,10 +3,13 @@
 policy = from_object(model, observation=np.zeros(8))
 """
 
+import contextlib
 import inspect
 import io
+import json
 import logging
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -44,7 +47,7 @@ def from_object(source: Any, observation: Any, batched: bool) -> Policy:
     if root in ("stable_baselines3", "sb3_contrib"):
         return _of_sb3(source)
     if _is_a(source, "torch.nn.modules.module", "Module"):
-        return _of_torch(source, observation)
+        return _of_torch(source, observation, batched)
     if (
         isinstance(source, tuple)
         and len(source) == 2
@@ -214,28 +217,54 @@ def _of_sb3(model: Any) -> Policy:
         return Policy((), _Function(lambda seen: model.predict(seen, deterministic=True)[0], True))
 
 
-def _of_torch(module: Any, observation: Any) -> Policy:
-    """Return a module of PyTorch, by way of ONNX."""
+def _of_torch(module: Any, observation: Any, batched: bool) -> Policy:
+    """Return a module of PyTorch by way of ONNX, or as a function of the host."""
     if observation is None:
         raise PolicyError("of a torch module give observation=, an example of what it takes, too")
     torch = require("torch", extra="policies")
-    example = torch.as_tensor(np.asarray(observation, np.float32))
-    file = io.BytesIO()
-    module = module.eval()
     require("onnx", extra="policies")
+    example = np.asarray(observation, np.float32)
+    module = module.eval()
+
+    def on_host(seen: Any) -> Any:
+        batch = torch.as_tensor(np.array(seen, np.float32)).reshape(-1, *example.shape)
+        with torch.no_grad():
+            made = module(batch)
+        return made[0] if np.ndim(seen) == example.ndim else made
+
     try:
-        torch.onnx.export(module, (example[None],), file, dynamo=False, input_names=["observation"])
-        graph, weights, memory = read_onnx(
-            None, file.getvalue(), "the torch module", output=None, memory=None
-        )
-        return Policy(weights, graph, memory)
+        return _translated(torch, module, example, on_host)
     except Exception as error:
         log.warning(
             "the torch module runs in Python, because it cannot be translated: %s",
             one_line(str(error))[:300],
         )
-        call = lambda seen: module(torch.as_tensor(np.array(seen, np.float32)))  # noqa: E731
-        return Policy((), _Function(call, batched=True))
+        return Policy((), _Function(on_host, batched))
+
+
+def _translated(torch: Any, module: Any, example: np.ndarray, on_host: Any) -> Policy:
+    """Return a module of PyTorch in JAX, compared with itself.
+
+    **Raises:** `ValueError` where they differ: an exporter follows one branch of each decision.
+    """
+    file = io.BytesIO()
+    # It prints the whole graph where it fails.
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")
+        inputs = (torch.as_tensor(example)[None],)
+        torch.onnx.export(module, inputs, file, dynamo=False, input_names=["observation"])
+    graph, weights, memory = read_onnx(
+        None, file.getvalue(), "the torch module", output=None, memory=None
+    )
+    policy = Policy(weights, graph, memory)
+    if memory is None:
+        draws = np.random.default_rng(0).normal(size=(32, *example.shape)).astype(np.float32)
+        scales = np.array([0.1, 1.0, 10.0, 1.0], np.float32)
+        for seen, scale in zip(draws, np.resize(scales, len(draws)), strict=True):
+            one, other = np.asarray(policy.act(seen * scale)), _plain(on_host(seen * scale))
+            if one.shape != other.shape or not np.allclose(one, other, rtol=1e-3, atol=1e-4):
+                raise ValueError("its translation gives other actions, as one that decides does")
+    return policy
 
 
 def read_brax(folder: Path) -> Policy:
@@ -243,18 +272,31 @@ def read_brax(folder: Path) -> Policy:
 
     **Raises:** `PolicyError` for a folder that holds none.
     """
-    checkpoint = require("brax.training.agents.ppo.checkpoint", extra="brax")
     networks = require("brax.training.agents.ppo.networks", extra="brax")
+    known = require("brax.training.networks", extra="brax").ACTIVATION
+    statistics = require("brax.training.acme.running_statistics", extra="brax")
     try:
-        config = checkpoint.load_config(folder)
-        weights = checkpoint.load(folder)
-        made = checkpoint._get_ppo_network(config, networks.make_ppo_networks)
-        infer = networks.make_inference_fn(made)
+        config = json.loads((folder / "ppo_network_config.json").read_text())
+        # Brax 0.14.2 refuses a checkpoint of its own whose initialisers are not named; a trained
+        # network needs none.
+        options = {
+            name: value
+            for name, value in config["network_factory_kwargs"].items()
+            if value is not None and "kernel_init" not in name
+        }
+        if "activation" in options:
+            options["activation"] = known[options["activation"]]
+        if config["normalize_observations"]:
+            options["preprocess_observations_fn"] = statistics.normalize
+        made = networks.make_ppo_networks(
+            config["observation_size"], config["action_size"], **options
+        )
+        weights = require("brax.training.checkpoint", extra="brax").load(folder)
     except Exception as error:
         raise PolicyError(
-            f"{folder} holds no checkpoint of Brax' PPO: {one_line(str(error))}"
+            f"{folder} holds no checkpoint of Brax' PPO: {one_line(str(error))[:300]}"
         ) from error
-    return Policy(weights, _Inference(infer))
+    return Policy(weights, _Inference(networks.make_inference_fn(made)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,12 +52,12 @@ def read_sb3(data: bytes, what: str) -> Policy:
         observed = _space(settings["observation_space"], "observation", what)
         acts = _space(settings["action_space"], "action", what)
         options = _options(settings.get("policy_kwargs", {}), what)
+        weights = read_state(read_member(archive, "policy.pth", what), f"policy.pth of {what}")
+        return _policy(weights, observed, acts, options, what)
     except PolicyError:
         raise
     except Exception as error:
         raise PolicyError(f"the settings of {what} are damaged: {error!r}") from error
-    weights = read_state(read_member(archive, "policy.pth", what), f"policy.pth of {what}")
-    return _policy(weights, observed, acts, options, what)
 
 
 def read_normaliser(data: bytes, what: str) -> Normaliser:
@@ -177,7 +177,7 @@ def _network(
             weights, names, what
         )
     convolutions = [f"{extractor}cnn.{i}" for i in (0, 2, 4)]
-    image = len(space.get("_shape", ())) == 3 and options.get("normalize_images", True) is True
+    image = len(space.get("_shape") or ()) == 3 and options.get("normalize_images", True) is True
     if kind != "Box" or not image or not all(f"{n}.weight" in weights for n in convolutions):
         raise PolicyError(
             f"{what} reads observations of {kind} by a features extractor that is not supported: "
