@@ -564,7 +564,7 @@ def _run_rounds(
     if place is not None:
         with writing(place):
             rounds.record_checksum = write_record(run("running"), place)
-    known = place is None
+    known = False
     stopped, cause = None, None
     try:
         with SimulationProgress(problem.name, ends.budget, progress) as bar:
@@ -600,7 +600,7 @@ def _run_rounds(
                     stopped = ends.reached(rounds)
                     if stopped is None and rounds.hopeless is not None and not keep_going:
                         stopped = RAISES
-                    if not known:
+                    if place is not None and not known:
                         # A run that is killed knows what its first simulations read, too.
                         known, models = True, settled()
                         write_record(run("running"), place)
