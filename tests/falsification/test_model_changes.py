@@ -1,8 +1,10 @@
 """Runs whose model changes: what goes on, what is refused, and rows that give other numbers."""
 
 import json
+import sqlite3
 import sys
 from dataclasses import replace
+from importlib.machinery import EXTENSION_SUFFIXES
 
 import numpy as np
 import pytest
@@ -253,3 +255,78 @@ def test_a_counterexample_that_gives_another_number_of_itself(tmp_path):
     (one,) = vj.replay_counterexamples(problem, tmp_path / "corpus").replayed
     assert not one.changed
     assert "it does not give its number again, though no file of its model has changed" in one.note
+
+
+DYNAMIC = """
+import importlib, importlib.util, sqlite3
+from pathlib import Path
+import numpy as np
+import verifai_jax as vj
+
+HERE = Path(__file__).parent
+
+def late_gain():
+    return importlib.import_module("late_" + "gain").GAIN
+
+def placed_gain():
+    spec = importlib.util.spec_from_file_location("placed", HERE / ("placed_gain" + ".py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.GAIN
+
+def stored_gain():
+    with sqlite3.connect(HERE / ("gain" + ".db")) as base:
+        return base.execute("SELECT value FROM gain").fetchone()[0]
+
+def problem(gain):
+    def simulate(features):
+        return vj.Trace({"x": np.full(3, gain() * features["a"])}, dt=0.1)
+    return vj.Problem(gain.__name__, {"a": vj.Box(0.0, 1.0)}, vj.blackbox(simulate), "always x < 3")
+
+late, placed, stored = map(problem, (late_gain, placed_gain, stored_gain))
+"""
+
+
+def store_gain(file, value):
+    with sqlite3.connect(file) as base:
+        base.execute("CREATE TABLE IF NOT EXISTS gain (value REAL)")
+        base.execute("DELETE FROM gain")
+        base.execute("INSERT INTO gain VALUES (?)", (value,))
+
+
+@pytest.mark.parametrize("name", ["late", "placed", "stored"])
+def test_what_is_found_while_it_runs_is_part_of_the_model(project, monkeypatch, name):
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    (project / "dynamic.py").write_text(DYNAMIC)
+    for gain in (1.0, 2.0):
+        sys.modules.pop("late_gain", None)
+        for module in ("late_gain.py", "placed_gain.py"):
+            (project / module).write_text(f"GAIN = {gain}\n")
+        store_gain(project / "gain.db", gain)
+        problem = load_target(f"dynamic.py:{name}", vj.Problem)
+        if gain == 1.0:
+            run = falsified(problem)
+    sys.modules.pop("late_gain", None)
+    file = {"late": "late_gain.py", "placed": "placed_gain.py", "stored": "gain.db"}[name]
+    assert [change.name for change in replace(run, problem=problem).changes()] == [file]
+
+
+def test_a_compiled_module_is_part_of_the_model(project):
+    (project / f"plant{EXTENSION_SUFFIXES[0]}").write_bytes(b"\0as built\0")
+    problem = slope("try:\n    import plant\nexcept ImportError:\n    pass\n" + SPEC)
+    assert f"plant{EXTENSION_SUFFIXES[0]}" in [name for name, *_ in problem.sources().files]
+
+
+def test_a_run_that_is_killed_knows_what_its_simulations_read(project):
+    (project / "gain.txt").write_text("1.0")
+    records = []
+
+    def look(rows, numbers):
+        records.append((project / "run" / "run.json").read_text())
+
+    problem = load_target("counting.py:table", vj.Problem)
+    falsified(problem, 12, folder=project / "run", callbacks=[look])
+    # After its first round, of which there are three.
+    named = [[name for name, *_ in json.loads(each)["sources"][0]["files"]] for each in records]
+    assert "gain.txt" not in named[0]
+    assert "gain.txt" in named[1]

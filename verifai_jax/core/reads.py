@@ -1,19 +1,21 @@
-"""The data files that a user's modules have opened in this process, by module.
+"""The data files that a user's modules have opened in this process, and the modules, by module.
 
     watch()                                             # once, before they are imported
     files_read_by("/home/me/specs/car.py")              # {"/home/me/specs/gains.csv"}
+    modules_loaded_by("/home/me/specs/car.py")          # {"/home/me/specs/plant.py"}
 
 Python tells its audit hooks of every file that it opens. A file counts as read by the innermost
 module of the user's that stands on the stack, and does not count where this package opens it for
 itself: its runs, caches and reports are no part of a model. What a library opens in C is not seen.
 """
 
+import importlib.util
 import os
 import sys
 from contextlib import suppress
 from types import FrameType
 
-from verifai_jax.core.user_files import PACKAGE, is_user_file
+from verifai_jax.core.user_files import PACKAGE, is_user_file, library_prefixes
 
 MAX_FILES = 200
 """Files of one module at most."""
@@ -25,8 +27,11 @@ _OF_THE_MACHINE = ("/sys/", "/proc/", "/dev/", "/etc/", "/usr/", "/run/")
 """Beginnings of paths that are no data of a model."""
 _CODE = (".py", ".pyc", ".so", ".pyd", ".pth")
 """Endings of files that are imported; those have records of their own."""
+_OPENS = ("open", "sqlite3.connect", "ctypes.dlopen")
+"""Events of Python by which a file is opened."""
 
 _read: dict[str, set[str]] = {}
+_loaded: dict[str, set[str]] = {}
 _watching = False
 
 
@@ -48,18 +53,32 @@ def files_read_by(module: str) -> set[str]:
     return _read.get(module, set())
 
 
+def modules_loaded_by(module: str) -> set[str]:
+    """Return the files of modules that a module was the first to import, by whatever name.
+
+    **Arguments:**
+
+    - `module`: path of its file.
+    """
+    return _loaded.get(module, set())
+
+
 def _note(event: str, arguments: tuple[object, ...]) -> None:
     # It is called for every event of every kind, and whatever it raises would reach the user.
-    if event == "open":
+    if event in _OPENS:
         with suppress(Exception):
-            _note_open(*arguments)
+            _note_open(event, *arguments)
 
 
-def _note_open(path: object, mode: object, flags: object) -> None:
+def _note_open(event: str, path: object, mode: object = None, flags: object = 0) -> None:
     if not isinstance(path, str | bytes | os.PathLike):
         return
     text = os.fsdecode(path)
-    if text.endswith(_CODE) or _writes(mode, flags):
+    if event == "open" and text.endswith(_CODE):
+        if not text.startswith(library_prefixes()):
+            _note_import(text)
+        return
+    if _writes(mode, flags):
         return
     module = _reader(sys._getframe(2))
     if module is None:
@@ -69,6 +88,24 @@ def _note_open(path: object, mode: object, flags: object) -> None:
     hidden = f"{os.sep}." in place or place.startswith(_OF_THE_MACHINE)
     if not hidden and os.path.isfile(place) and is_user_file(place):
         files = _read.setdefault(module, set())
+        if len(files) < MAX_FILES:
+            files.add(place)
+
+
+def _note_import(text: str) -> None:
+    """Note the module that a file is of, for the module whose statement imports it."""
+    frame, importing = sys._getframe(3), False
+    while frame is not None and not is_user_file(frame.f_code.co_filename):
+        importing |= frame.f_code.co_filename.startswith("<frozen importlib")
+        if not importing or frame.f_code.co_filename.startswith(str(PACKAGE)):
+            return
+        frame = frame.f_back
+    if frame is None:
+        return
+    place = importlib.util.source_from_cache(text) if text.endswith(".pyc") else text
+    place = os.path.abspath(place)
+    if os.path.isfile(place) and is_user_file(place):
+        files = _loaded.setdefault(os.path.abspath(frame.f_code.co_filename), set())
         if len(files) < MAX_FILES:
             files.add(place)
 

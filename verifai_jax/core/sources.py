@@ -21,7 +21,7 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from verifai_jax.core.reads import files_read_by
+from verifai_jax.core.reads import files_read_by, modules_loaded_by
 from verifai_jax.core.source_objects import Function, Module, OwnFiles, parts_of
 from verifai_jax.core.source_scan import MAX_FILES, Import, files_of_model, scan
 from verifai_jax.core.user_files import is_notebook_cell, is_user_file
@@ -135,28 +135,32 @@ class Sources:
         """Return it at the end of the work that it is the record of.
 
         Files of data that have been written since the work began are what came of it, such as the
-        state of a simulator, and no part of the model; files that were read by then are.
+        state of a simulator, and no part of the model. Files that were read by then are, and
+        modules that were imported by then.
 
         **Arguments:**
 
         - `begun`: seconds since the epoch.
         """
-        modules = [f for f in self.files if f.role in (PROBLEM, IMPORTED)]
-        read = [files_read_by(os.path.join(self.root, file.name)) for file in modules]
-        files = list(self.files)
-        for path in sorted(set().union(*read)):
-            if os.path.isfile(path) and _shown(path) not in {file.name for file in files}:
-                files.append(Source(_shown(path), READ, file_hash(Path(path))))
+        files = {file.name: file for file in self.files}
+        waiting = [file.name for file in self.files if file.role in (PROBLEM, IMPORTED)]
+        while waiting:
+            module = os.path.join(self.root, waiting.pop())
+            opened = ((modules_loaded_by(module), IMPORTED), (files_read_by(module), READ))
+            for path, role in ((path, role) for paths, role in opened for path in sorted(paths)):
+                if os.path.isfile(path) and (name := _shown(path)) not in files:
+                    files[name] = Source(name, role, file_hash(Path(path)))
+                    waiting += [name] * (role == IMPORTED)
         written = {
             file.name
-            for file in files
+            for file in files.values()
             if file.role in (READ, NAMED) and not self._is_older(file.name, begun)
         }
         without = [f"{name} was written in the meantime, and is not recorded" for name in written]
         return replace(
             self,
-            files=tuple(file for file in files if file.name not in written),
-            without_file=(*self.without_file, *sorted(without)),
+            files=tuple(file for name, file in files.items() if name not in written),
+            without_file=tuple(dict.fromkeys((*self.without_file, *sorted(without)))),
         )
 
     def _is_older(self, name: str, moment: float) -> bool:
@@ -349,11 +353,11 @@ class _Collector:
                 found = scan(Path(file).read_bytes())
             except OSError:
                 continue
-            for each in found.imports:
-                for imported in _imported(each, file):
-                    if imported not in self.modules:
-                        self.add_module(imported, self._hash_of_module(imported), IMPORTED)
-                        waiting.append(imported)
+            imports = [name for each in found.imports for name in _imported(each, file)]
+            for imported in (*imports, *sorted(modules_loaded_by(file))):
+                if imported not in self.modules:
+                    self.add_module(imported, self._hash_of_module(imported), IMPORTED)
+                    waiting.append(imported)
             for read in files_read_by(file):
                 if os.path.isfile(read):
                     self.add_data(read, READ)
@@ -436,7 +440,9 @@ def _found_below(name: str, folders: Sequence[Path], program: str) -> Iterator[s
     for folder in folders:
         for count in range(1, len(parts) + 1):
             path = folder.joinpath(*parts[:count])
-            for file in (path.with_name(f"{path.name}.py"), path / "__init__.py"):
+            endings = (".py", *importlib.machinery.EXTENSION_SUFFIXES)
+            files = [path.with_name(f"{path.name}{ending}") for ending in endings]
+            for file in (*files, path / "__init__.py"):
                 text = os.path.abspath(file)
                 if text != program and os.path.isfile(text) and is_user_file(text):
                     yield text

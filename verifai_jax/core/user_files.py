@@ -36,6 +36,12 @@ def is_user_file(file: str) -> bool:
 
 
 @cache
+def library_prefixes() -> tuple[str, ...]:
+    """Return the beginnings of paths of Python's files and of most that are installed."""
+    return tuple(f"{folder}{os.sep}" for folder in _libraries())
+
+
+@cache
 def _libraries() -> tuple[Path, ...]:
     """Return the folders of this package, of Python and of what is installed."""
     names = ("stdlib", "platstdlib", "purelib", "platlib")

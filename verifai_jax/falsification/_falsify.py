@@ -555,9 +555,16 @@ def _run_rounds(
             notes=(*chosen, *notes, *rounds.notes),
         )
 
+    def settled() -> Sequence[Mapping[str, Any]]:
+        return tuple(
+            Sources.from_json(each).settled(begun).to_json() if each is models[-1] else each
+            for each in models
+        )
+
     if place is not None:
         with writing(place):
             rounds.record_checksum = write_record(run("running"), place)
+    known = False
     stopped, cause = None, None
     try:
         with SimulationProgress(problem.name, ends.budget, progress) as bar:
@@ -593,6 +600,10 @@ def _run_rounds(
                     stopped = ends.reached(rounds)
                     if stopped is None and rounds.hopeless is not None and not keep_going:
                         stopped = RAISES
+                    if place is not None and not known:
+                        # A run that is killed knows what its first simulations read, too.
+                        known, models = True, settled()
+                        write_record(run("running"), place)
                     if stopped is None:
                         rounds.save(seldom=True)
     except KeyboardInterrupt:
@@ -600,9 +611,7 @@ def _run_rounds(
     except Exception as error:
         stopped, cause = format_user_error(error), error
     rounds.close()
-    if models:
-        last = Sources.from_json(models[-1]).settled(begun)
-        models = (*models[:-1], last.to_json())
+    models = settled()
     result = run(stopped)
     after = notes_after(rounds.table, result.formulas, search, warm)
     if not rounds.exhausted:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from verifai_jax.core.lifting import is_lifting, lifted
 from verifai_jax.features.domain import (
@@ -135,7 +135,7 @@ class Box(Domain):
             u = replace_where(replace_where(u, value == first, 0.0), value == last, 1.0)
         return jnp.ravel(u)
 
-    def coerce(self, value: Numbers) -> Float[Array, "*shape"]:
+    def coerce(self, value: PyTree) -> Float[Array, "*shape"]:
         return on_device(self.rounded(real_numbers(value)))
 
     def rounded(self, value: Reals) -> Reals:
@@ -277,7 +277,7 @@ class DiscreteBox(Domain):
         low, count = self._limits()
         return jnp.ravel((as_real(jnp.asarray(value) - low) + 0.5) / count)
 
-    def coerce(self, value: Numbers) -> Int[Array, "*shape"]:
+    def coerce(self, value: PyTree) -> Int[Array, "*shape"]:
         return jnp.asarray(without_objects(value), jnp.int32)
 
     def check(self, value: object, name: str) -> None:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtri
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from verifai_jax.core.precision import in_precision
 from verifai_jax.features.domain import (
@@ -108,7 +108,7 @@ class Continuous(Domain):
             u = replace_where(replace_where(u, value == first, 0.0), value == last, 1.0)
         return u[None]
 
-    def coerce(self, value: Numbers) -> Float[Array, "*shape"]:
+    def coerce(self, value: PyTree) -> Float[Array, "*shape"]:
         return on_device(self.rounded(real_numbers(value)))
 
     def rounded(self, value: Reals) -> Reals:

@@ -47,7 +47,7 @@ LEAST_REAL = float(np.finfo(np.float32).tiny)
 MOST_REAL = float(np.finfo(np.float32).max)
 """Largest float32 number."""
 
-Numbers: TypeAlias = float | Decimal | Fraction | Sequence | np.generic | np.ndarray | jax.Array
+Numbers: TypeAlias = float | Sequence | np.generic | np.ndarray | jax.Array
 """A number or an array of them, as a person, a table or a system writes it."""
 
 Value = TypeVar("Value")
@@ -327,12 +327,12 @@ def centre(index: Numbers, count: int) -> Float[Array, "1"]:
     return jnp.reshape((as_real(index) + 0.5) / count, (1,))
 
 
-def as_real(value: Numbers) -> Float[Array, "*shape"]:
+def as_real(value: Any) -> Float[Array, "*shape"]:
     """Convert to an array of real numbers; integers and lists get JAX's default precision."""
     return on_device(real_numbers(value))
 
 
-def real_numbers(value: Numbers) -> Any:
+def real_numbers(value: Any) -> Any:
     """Convert as `as_real`, to an array of NumPy where the value is not of JAX."""
     value = without_objects(value)
     plain = float | int | np.ndarray | np.number

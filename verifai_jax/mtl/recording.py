@@ -20,6 +20,11 @@ from verifai_jax.mtl.resampling import Method, check_increasing, resample
 if TYPE_CHECKING:
     import pandas as pd
 
+DECIMAL_COMMAS = r"^\s*[-+]?\d*(,\d*)?([eE][-+]?\d+)?\s*$"
+"""Numbers with a decimal comma, `1,5`, and those without decimals."""
+THOUSANDS = r"^\s*[-+]?(\d{1,3}|[1-9]\d{0,2},\d{3})\s*$"
+"""Numbers in which a comma, where there is one, may stand between thousands, `1,500`."""
+
 
 class TimeColumnError(ValueError):
     """A recording without the column of its sample times.
@@ -165,9 +170,17 @@ def _read_csv(path: Path) -> Any:
     parsed = csv.ParseOptions(delimiter=separator)
     table = csv.read_csv(path, parse_options=parsed)
     named = list(zip(table.column_names, table.columns, strict=True))
-    commas = [name for name, column in named if _decimal_commas(column)]
+    commas = [name for name, column in named if _all_match(column, DECIMAL_COMMAS)]
     if not commas:
         return table
+    # Semicolons between the columns are there because commas are those of decimals.
+    unclear = [name for name in commas if _all_match(table.column(name), THOUSANDS)]
+    if unclear and separator != ";":
+        cell = next(cell for cell in table.column(unclear[0]).to_pylist() if cell and "," in cell)
+        raise ValueError(
+            f"{path} has {cell.strip()!r} in column {unclear[0]!r}, which may have a decimal comma "
+            "or one between thousands: write it without, or put semicolons between the columns"
+        )
     again = csv.read_csv(
         path, parse_options=parsed, convert_options=csv.ConvertOptions(decimal_point=",")
     )
@@ -180,13 +193,12 @@ def _read_csv(path: Path) -> Any:
     return again
 
 
-def _decimal_commas(column: Any) -> bool:
-    """Return whether a column of text holds numbers such as `1,5`, and nothing else."""
+def _all_match(column: Any, number: str) -> bool:
+    """Return whether a column of text holds numbers of a form, and nothing else."""
     from pyarrow import compute, types
 
     if not types.is_string(column.type) or column.null_count == len(column):
         return False
-    number = r"^\s*[-+]?\d*(,\d*)?([eE][-+]?\d+)?\s*$"
     fits = compute.match_substring_regex(column, number)  # pyright: ignore[reportAttributeAccessIssue]
     return bool(compute.all(fits, skip_nulls=True).as_py())  # pyright: ignore[reportAttributeAccessIssue]
 
