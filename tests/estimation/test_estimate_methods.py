@@ -167,6 +167,27 @@ def test_interruption_keeps_what_is_finished():
     assert answer.low < 0.01 < answer.high
 
 
+def test_few_slow_simulations_are_lost_when_somebody_interrupts(monkeypatch):
+    from verifai_jax.estimation import normal_space
+
+    robustness, calls, clock = half_space(2, 1e-2), [], [0.0]
+    monkeypatch.setattr(normal_space.time, "perf_counter", lambda: clock[0])
+
+    def evaluate(u):
+        calls.append(len(u))
+        clock[0] += 0.25 * len(u)
+        if sum(calls) > 40:
+            raise KeyboardInterrupt
+        rho = robustness(u)
+        return rho, rho < 0, np.ones(len(u), bool)
+
+    limit_state = normal_space.LimitState(evaluate, 2, 50_000, batch=1000, one_by_one=True)
+    plan = Plan(0.95, 32, np.zeros(2, bool))
+    answer = estimate_by_monte_carlo(limit_state, np.random.default_rng(0), plan)
+    assert calls[:5] == [16, 8, 4, 2, 4]
+    assert answer.prior.simulations == sum(calls[:-1]) > 30
+
+
 @pytest.mark.parametrize(
     ("splitting", "reached", "tail", "widened"),
     [

@@ -19,7 +19,7 @@ from verifai_jax.cli.arguments import (
     load_problem,
     on_cluster,
 )
-from verifai_jax.cli.exit_codes import BROKEN, CommandError
+from verifai_jax.cli.exit_codes import BROKEN, INTERRUPTED, CommandError
 from verifai_jax.cli.gates import RATE, Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, show_result
 
@@ -71,6 +71,8 @@ def estimate(
     if report is not None:
         path = found.report(report, problem=problem)
         click.echo(f"  report       {path}")
+    if not found.simulations:
+        raise CommandError("interrupted before a batch was finished", INTERRUPTED)
     if found.prior_no_verdict == found.prior_simulations and not found.failures:
         raise CommandError(
             f"no simulation had a verdict, of {found.prior_simulations:,}: nothing is known of the "

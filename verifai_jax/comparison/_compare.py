@@ -168,6 +168,8 @@ def _compare(
     except KeyboardInterrupt:
         stopped = "interrupted"
     if not any(tally.pairs for tally in tallies.values()):
+        if stopped == "interrupted":
+            raise KeyboardInterrupt
         raise ProblemError("no pair was simulated, so that nothing can be compared")
     return Comparison(
         target or baseline.name,

@@ -125,6 +125,7 @@ def estimate(
             gradient=simulated.gradient if _differentiates(choice.problem) else None,
             uniform=simulated.uniform,
             draws=depends_on_key(choice.problem),
+            one_by_one=choice.problem.black_box and executor is None,
         )
         plan = Plan(confidence, chains, simulated.clamped)
         try:

@@ -58,8 +58,9 @@ def sample_prior(limit_state: LimitState, rng: np.random.Generator, simulations:
     try:
         while total.simulations < simulations:
             z = limit_state.sample_prior(rng, min(size, simulations - total.simulations))
-            for start in range(0, len(z), limit_state.step):
-                scores = limit_state(z[start : start + limit_state.step])
+            while len(z):
+                some, z = np.split(z, [limit_state.step])
+                scores = limit_state(some)
                 part = Counts(
                     len(scores.score), int(scores.failing.sum()), int((~scores.proper).sum())
                 )

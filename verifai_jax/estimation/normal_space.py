@@ -65,6 +65,12 @@ class Linearized(NamedTuple):
     gradient: Float[np.ndarray, "n d"]
 
 
+FIRST = 16
+"""Simulations that are asked for at first, where they take their time one after another."""
+SECONDS = 1.0
+"""Seconds after which fewer of these are asked for at a time."""
+
+
 class Ended(Exception):
     """Time is over, or the user has interrupted; finished simulations count."""
 
@@ -82,6 +88,8 @@ class LimitState:
     - `deadline`: on the clock of `time.perf_counter`, after which `Ended` is raised.
     - `report`: called after each batch with simulations, failures and the least robustness so far.
     - `together`: batches that are simulated at a time, where there are several workers.
+    - `one_by_one`: whether simulations take their time one after another, so that fewer are asked
+      for at a time where they take long: whoever interrupts loses no more than these.
     - `gradient`: as `evaluate`, with the gradient by the coordinates of the cube; none when left
       out. A simulation with its gradient counts 2.
     - `uniform`: True at coordinates `[dim]` of uniform features; none of them when left out.
@@ -105,8 +113,12 @@ class LimitState:
         gradient: Differentiate | None = None,
         uniform: Bool[np.ndarray, " dim"] | None = None,
         draws: bool = False,
+        one_by_one: bool = False,
     ) -> None:
-        self.step = batch * together
+        self.most = self.step = batch * together
+        self.one_by_one = one_by_one
+        if one_by_one:
+            self.step = min(FIRST, self.most)
         self.evaluate, self.dim, self.budget, self.batch = evaluate, dim, budget, batch
         self.constraint, self.deadline, self.report = constraint, deadline, report
         self.gradient, self.draws = gradient, draws
@@ -181,16 +193,21 @@ class LimitState:
     def _in_batches(
         self, part_of: Callable[[np.ndarray], tuple[np.ndarray, ...]], z: Float[np.ndarray, "n d"]
     ) -> list[np.ndarray]:
-        parts = []
-        for start in range(0, len(z), self.step):
+        parts, start = [], 0
+        while start < len(z):
             if self.ended or (self.deadline is not None and time.perf_counter() > self.deadline):
                 self.ended = self.ended or "max_seconds"
                 raise Ended
+            began, stop = time.perf_counter(), start + self.step
             try:
-                parts.append(part_of(z[start : start + self.step]))
+                parts.append(part_of(z[start:stop]))
             except KeyboardInterrupt:
                 self.ended = "interrupted"
                 raise Ended from None
+            start = stop
+            if self.one_by_one:
+                quick = time.perf_counter() - began < SECONDS
+                self.step = min(2 * self.step, self.most) if quick else max(1, self.step // 2)
         return [np.concatenate(column) for column in zip(*parts, strict=True)]
 
     def _linearize(self, z: Float[np.ndarray, "n d"]) -> Linearized:

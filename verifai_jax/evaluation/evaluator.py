@@ -86,6 +86,9 @@ class Evaluator:
             self.engine = engine_for(
                 problem, batch, gradient, precision, clauses, steering, self.given
             )
+        if ends_raising and isinstance(self.engine, HostEngine):
+            # Features of few points are those of a whole batch, bit for bit.
+            self.engine.least = 1 << (batch - 1).bit_length()
         self.key: Key[Array, ""] = run_keys(seed)[1]
         self.simulations = 0
 
@@ -169,16 +172,12 @@ class Evaluator:
         engine = self.engine
         if not isinstance(engine, HostEngine) or engine.system.can_simulate_batch:
             return most
-        # Their features are those of the whole batch, bit for bit.
-        engine.least = 1 << (most - 1).bit_length()
         return min(most, ALIKE)
 
     def _check_raising(self, verdicts: Verdicts) -> None:
         if self._raising is not None:
             self._raising.add(verdicts.status, verdicts.messages)
             self._raising.check(self.problem.name)
-            if isinstance(self.engine, HostEngine):
-                self.engine.least = 1
 
     def _with_values(self, u: Float[Any, "n d"]) -> Float[Any, "n row"]:
         """Return points as rows without given numbers, where the engine takes such rows."""

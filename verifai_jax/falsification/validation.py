@@ -412,4 +412,10 @@ def _check_empty(place: Path) -> None:
     # A process that dies before its first record leaves a part of one.
     leftover = {f"{RECORD}.part", LOCK}
     if place.exists() and (not place.is_dir() or {p.name for p in place.iterdir()} - leftover):
+        if (place / RECORD).is_file():
+            raise ValueError(
+                f"folder {str(place)!r} exists and is not empty: it holds a run, with which "
+                f"vj.resume, or verifai-jax falsify --resume {place}, goes on; a new one needs "
+                "another folder"
+            )
         raise ValueError(f"folder {str(place)!r} exists and is not empty; a run needs a new one")
