@@ -17,6 +17,7 @@ from verifai_jax.search.bandit import Bandit as Bandit
 from verifai_jax.search.base import Observations as Observations
 from verifai_jax.search.base import Plan as Plan
 from verifai_jax.search.base import Search as Search
+from verifai_jax.search.base import Wants as Wants
 from verifai_jax.search.bayes import Bayes as Bayes
 from verifai_jax.search.ce_compat import CECompat as CECompat
 from verifai_jax.search.cmaes import CMAES as CMAES
@@ -38,6 +39,7 @@ from verifai_jax.search.suggested import Suggested as Suggested
 from verifai_jax.search.trace_surrogate import TraceSurrogate as TraceSurrogate
 from verifai_jax.search.turbo import TuRBO as TuRBO
 from verifai_jax.search.uniform import Uniform as Uniform
+from verifai_jax.search.wrapper import Wrapper as Wrapper
 
 __all__ = [
     "CMAES",
@@ -66,6 +68,8 @@ __all__ = [
     "TraceSurrogate",
     "TuRBO",
     "Uniform",
+    "Wants",
+    "Wrapper",
     "distinct",
     "from_json",
     "named",
