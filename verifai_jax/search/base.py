@@ -325,10 +325,39 @@ def nearest_to_failing(
     - `offered`, `near`: earlier points and their robustness, infinite where there is none.
     """
     usable = observations.usable & (observations.rho >= 0)
-    rho = jnp.concatenate([jnp.where(usable, observations.rho, jnp.inf), near])
-    points = jnp.concatenate([jnp.where(usable[:, None], observations.u, 0.5), offered])
-    _, nearest = jax.lax.top_k(-rho, len(near))
-    return points[nearest], rho[nearest]
+    return keep_best(observations.u, jnp.where(usable, observations.rho, jnp.inf), offered, near)
+
+
+def newest_first(
+    u: Float[Array, "n d"],
+    new: Float[Array, " n"],
+    points: Float[Array, "k d"],
+    score: Float[Array, " k"],
+) -> tuple[Float[Array, "n+k d"], Float[Array, " n+k"]]:
+    """Return the points of a round before those of a memory, with their scores.
+
+    **Arguments:**
+
+    - `u`, `new`: of the round; a score is infinite where there is nothing to learn.
+    - `points`, `score`: of the memory; a score is infinite where there is no point.
+    """
+    u = jnp.where(jnp.isinf(new)[:, None], 0.5, u)
+    return jnp.concatenate([u, points]), jnp.concatenate([new, score])
+
+
+def keep_best(
+    u: Float[Array, "n d"],
+    new: Float[Array, " n"],
+    points: Float[Array, "k d"],
+    score: Float[Array, " k"],
+) -> tuple[Float[Array, "k d"], Float[Array, " k"]]:
+    """Return the best points of a round and a memory, sorted; of equal ones the newest.
+
+    **Arguments:** as of `newest_first`.
+    """
+    points, scores = newest_first(u, new, points, score)
+    _, best = jax.lax.top_k(-scores, len(score))
+    return points[best], scores[best]
 
 
 def draw_uniform(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "*shape"]:
@@ -339,6 +368,14 @@ def draw_uniform(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "*
     """
     flat = jax.random.uniform(key, (math.prod(shape),), jnp.float32)
     return jax.lax.optimization_barrier(flat).reshape(shape)
+
+
+def draw_columns(
+    key: Key[Array, ""], rows: int, *widths: int
+) -> tuple[Float[Array, "rows width"], ...]:
+    """Draw blocks of uniform numbers in `[0, 1)` in one call, as each takes a while to compile."""
+    whole = draw_uniform(key, (rows, sum(widths)))
+    return tuple(jnp.split(whole, np.cumsum(widths[:-1]), axis=1))
 
 
 def standard_normal(uniform: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
