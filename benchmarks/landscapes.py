@@ -103,8 +103,8 @@ LANDSCAPES = {
 
 def tell_of(search, state, cube, u, rho, slope):
     """Return the observations of points of one clause, as far as the search asks for them."""
-    told = Observations(u, rho, jnp.ones(len(u), bool), slope if search.wants_gradient else None)
-    if not search.wants_clauses:
+    told = Observations(u, rho, jnp.ones(len(u), bool), slope if search.wants.gradient else None)
+    if not search.wants.clauses:
         return told
     plan = search.plan(state, cube, len(u))
     gradients = jnp.zeros((len(u), CLAUSES, u.shape[1])).at[:, 0].set(slope)

@@ -32,7 +32,7 @@ def rounds(search, batch, warm, count):
         started = time.perf_counter()
         u, state = jax.block_until_ready(ask(state, CUBE, batch))
         ask_seconds = time.perf_counter() - started
-        gradient = 2 * (u - 0.3) if search.wants_gradient else None
+        gradient = 2 * (u - 0.3) if search.wants.gradient else None
         observations = Observations(u, rho(u), jnp.ones(batch, bool), gradient)
         observations = jax.block_until_ready(observations)
         started = time.perf_counter()

@@ -59,8 +59,8 @@ def advance(search, rho, cube, batch, rounds, state):
         u, state = search.ask(state, cube, batch)
         value, gradient = jax.vmap(jax.value_and_grad(rho))(u)
         observations = tell_of(search, state, cube, u, value, gradient)
-        differentiates = search.wants_gradient
-        if search.wants_clauses:
+        differentiates = search.wants.gradient
+        if search.wants.clauses:
             differentiates = search.plan(state, cube, batch).differentiate
         cost = jnp.where(observations.valid, jnp.where(differentiates, 2, 1), 0)
         value = jnp.where(cost > 0, value, jnp.inf)
@@ -111,7 +111,7 @@ def on_landscapes(options):
                 row.append(f"{median:>8.0f} {expected[landscape] / median:>6.1f}x")
         seconds = time.perf_counter() - started
         print(f"{name:<19}" + "".join(cells) + f"   batch {batch}, {seconds:.0f} s", flush=True)
-        if search.wants_gradient or search.wants_clauses:
+        if search.wants.gradient or search.wants.clauses:
             print(f"{name + ' (as 2)':<19}" + "".join(doubled), flush=True)
 
 
@@ -153,9 +153,9 @@ def on_cartpole(options):
         uniform = uniform or median
         low, high = np.percentile(counts, [25, 75])
         doubled = ""
-        if search.wants_gradient:
+        if search.wants.gradient:
             doubled = f"{uniform / (2 * median):.1f}x"
-        elif search.wants_clauses:
+        elif search.wants.clauses:
             doubled = f"{uniform / median_cost(problem, search, batch, options):.1f}x"
         print(
             f"{name:<17}{batch:>6}{sum(f for _, f in results):>5}/{options.seeds}"

@@ -142,6 +142,57 @@ def test_every_room_stands_in_a_layer():
     assert rooms == set().union(*LAYERS)
 
 
+KINDS = {"search": "Search"}
+"""Rooms of many classes of one kind, and the base class, which is all that other rooms know."""
+
+
+def classes_of(room: str, base: str) -> set[str]:
+    """Return the names of the classes of a room that derive from its base class."""
+    parents = {}
+    for file in (PACKAGE / room).rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ClassDef):
+                bases = [b.value if isinstance(b, ast.Subscript) else b for b in node.bases]
+                parents[node.name] = {ast.unparse(b) for b in bases}
+    found = {base}
+    while more := {name for name, bases in parents.items() if bases & found} - found:
+        found |= more
+    return found - {base}
+
+
+def asked_classes(source: str) -> set[str]:
+    """Return the names of the classes that a file asks for: isinstance, issubclass, type(x) is."""
+    asked = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in ("isinstance", "issubclass"):
+            asked += node.args[1:]
+        elif isinstance(node, ast.Compare) and "type(" in ast.unparse(node.left):
+            asked += node.comparators
+        elif isinstance(node, ast.MatchClass):
+            asked.append(node.cls)
+    parts = [part for each in asked for part in ast.walk(each)]
+    names = {part.id for part in parts if isinstance(part, ast.Name)}
+    return names | {part.attr for part in parts if isinstance(part, ast.Attribute)}
+
+
+def test_other_rooms_ask_for_no_class_of_a_kind():
+    """Whoever adds a search changes no other room: what it wants says what it needs of them."""
+    for room, base in KINDS.items():
+        kinds = classes_of(room, base)
+        assert len(kinds) > 5
+        wrong = {
+            name: found
+            for name, file in FILES.items()
+            if room_of(name) != room and (found := asked_classes(file.read_text()) & kinds)
+        }
+        assert wrong == {}
+
+
+def test_asked_classes_are_noticed():
+    source = "isinstance(a, (s.B, C))\ntype(a) is D\nmatch a:\n    case E(): pass\nF(isinstance)"
+    assert asked_classes(source) == {"s", "B", "C", "D", "E"}
+
+
 def test_few_files_at_the_root():
     assert len(list(PACKAGE.glob("*.py"))) <= 5
 

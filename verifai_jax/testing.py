@@ -141,7 +141,7 @@ def check_search(
             )
             assert u.dtype == jnp.float32, f"ask must give float32; got {u.dtype}"
             assert bool(jnp.all((u >= 0) & (u <= 1))), "points must stay in [0, 1]"
-            if search.wants_gradient:
+            if search.wants.gradient:
                 tau = search.temperature(pending)
                 assert tau.shape == (), f"temperature must be a scalar; got shape {tau.shape}"
                 assert bool(tau > 0), f"temperature must be positive; got {tau}"
@@ -400,19 +400,19 @@ def _evaluate(u: Array, search: Search, pending: PyTree, cube: Cube) -> Observat
     offset = u - 0.3
     rho, gradient = jnp.sum(offset**2, axis=1) - 0.01, 2 * offset
     valid = jnp.ones(len(u), bool)
-    observations = Observations(u, rho, valid, gradient if search.wants_gradient else None)
-    if search.wants_marks:
+    observations = Observations(u, rho, valid, gradient if search.wants.gradient else None)
+    if search.wants.marks:
         # What is covered depends on the first coordinate, and some rows cover less.
         first = (u[:, :1] * 5).astype(jnp.int32) if cube.dim else jnp.zeros((len(u), 1), jnp.int32)
         marks = jnp.concatenate([first, jnp.where(rho[:, None] < 0, 7, -1)], axis=1)
         observations = observations._replace(marks=marks)
-    if search.wants_outcomes:
+    if search.wants.outcomes:
         # One of two predicates decides, and the shape follows the first coordinate.
         first = u[:, :1] if cube.dim else jnp.zeros((len(u), 1), jnp.float32)
         shape = jnp.broadcast_to(first, (len(u), OUTCOME - 2))
         outcomes = jnp.concatenate([jnp.round(first), 0.5 * first, shape], axis=1)
         observations = observations._replace(outcomes=outcomes)
-    if not search.wants_clauses:
+    if not search.wants.clauses:
         return observations
     plan = search.plan(pending, cube, len(u))
     assert plan.temperature.shape == (len(u),), (
@@ -420,6 +420,9 @@ def _evaluate(u: Array, search: Search, pending: PyTree, cube: Cube) -> Observat
     )
     assert 1 <= int(plan.rows) <= len(u), (
         f"the plan must be for 1 to {len(u)} rows; got {plan.rows}"
+    )
+    assert search.wants.clause_gradients or not bool(plan.differentiate), (
+        "a plan may differentiate only where the search wants clause_gradients"
     )
     clauses = jnp.full((len(u), CLAUSES), ABSENT).at[:, 0].set(rho)
     gradients = jnp.zeros((len(u), CLAUSES, cube.dim)).at[:, 0].set(gradient)

@@ -86,7 +86,7 @@ def test_completion_shows_what_is_for_users(problem, run):
         (problem.formulas["low"], {"horizon", "until", "signals"}, {"below", "children"}),
         (run, {"replay", "table", "best", "plot"}, {"checkpoint", "damage", "space_data"}),
         (run.table, {"all", "counterexamples", "safe"}, {"append", "digest", "count_rows"}),
-        (vj.search.Uniform(), {"ask", "tell"}, {"wants_marks", "most_at_once"}),
+        (vj.search.Uniform(), {"ask", "tell"}, {"wants", "fallback"}),
     ):
         assert wanted <= names(thing), thing
         assert not internal & names(thing), thing

@@ -134,7 +134,7 @@ def test_where_no_traces_come_it_is_turbo():
     run = vj.falsify(ranked, SMALL, 8, batch=8, progress=False)
     assert run.search.startswith("TuRBO(")
     assert "search turbo: trace_surrogate knows no priority" in run.notes
-    assert isinstance(SMALL.without_traces, TuRBO)
+    assert isinstance(SMALL.fallback, TuRBO)
 
 
 def test_one_of_six_proposals_is_the_guess_of_the_model_whatever_the_batch(monkeypatch):

@@ -148,7 +148,7 @@ def test_useless_batches_leave_a_search_alive(search, spoil):
     for _ in range(3):
         u, state = ask(state, cube, 8)
         assert np.all(np.isfinite(u))
-        planned = int(search.plan(state, cube, 8).rows) if search.wants_clauses else 8
+        planned = int(search.plan(state, cube, 8).rows) if search.wants.clauses else 8
         assert len(np.unique(np.asarray(u[:planned, 0]))) == planned
         rho = jnp.full(8, jnp.nan) if spoil == "invalid" else jnp.ones(8)
         told = tell_of(search, state, cube, u, rho, jnp.full((8, 3), jnp.nan))

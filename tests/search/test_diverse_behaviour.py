@@ -104,8 +104,8 @@ def test_contract_and_record():
     search = Diverse(CrossEntropy(), capacity=8, by="behaviour")
     check_search(search, Cube((0, 3)))
     assert from_json(to_json(search)) == search
-    assert search.wants_outcomes
-    assert not Diverse(CrossEntropy()).wants_outcomes
+    assert search.wants.outcomes
+    assert not Diverse(CrossEntropy()).wants.outcomes
     with unchecked(), pytest.raises(ValueError, match="unknown way of being diverse 'behavior'"):
         Diverse(CrossEntropy(), by="behavior")
 

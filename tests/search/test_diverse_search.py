@@ -10,7 +10,7 @@ import pytest
 from checked_types import unchecked
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search import CrossEntropy, Gradient, Observations, Search, Uniform
+from verifai_jax.search import CrossEntropy, Gradient, Observations, Search, Uniform, Wants
 from verifai_jax.search.diverse import Diverse, apart, distinct
 from verifai_jax.testing import check_search
 
@@ -36,7 +36,7 @@ def test_contract(search, cube):
 class Descent(Search):
     """The plainest search with gradients."""
 
-    wants_gradient = True
+    wants = Wants(gradient=True)
 
     def init(self, key, cube, batch):
         return key, jax.random.uniform(key, (batch, cube.dim))
@@ -61,9 +61,9 @@ def test_contract_with_gradients():
 
 
 def test_it_is_what_the_search_inside_is():
-    assert Diverse(Descent()).wants_gradient
-    assert not Diverse(CrossEntropy()).wants_gradient
-    assert Diverse(Gradient()).wants_clauses == Gradient().wants_clauses
+    assert Diverse(Descent()).wants.gradient
+    assert not Diverse(CrossEntropy()).wants.gradient
+    assert Diverse(Gradient()).wants.clauses == Gradient().wants.clauses
     assert Diverse(Uniform()).samples_prior
     assert Diverse(Uniform()).learns
 

@@ -48,10 +48,10 @@ def test_rounds_of_many_points_begin_without_descents():
     assert Portfolio().stage(None, CUBE, many) == PLAIN
     state = begin(4)  # What decides is the same for all batches.
     assert Portfolio().stage(state, CUBE, many) == PLAIN
-    assert not PLAIN.differentiates
+    assert not PLAIN.wants.clause_gradients
     rare = state._replace(barren=jnp.int32(PATIENT * many))
     assert Portfolio().stage(rare, CUBE, many) == DESCENDS
-    assert DESCENDS.differentiates
+    assert DESCENDS.wants.clause_gradients
 
 
 def test_descents_into_the_interior_come_last():

@@ -55,13 +55,13 @@ def test_every_search(name):
     small |= {"capacity": 64} if name == "trace_surrogate" else {}
     search = named(name, **small)
     proposals = Proposals(search, SPACE.cube, 16, KEY, SPACE.constraint)
-    points = play(proposals, 8, search.wants_gradient)
+    points = play(proposals, 8, search.wants.gradient)
     features = jax.vmap(SPACE.unflatten)(jnp.asarray(points))
     assert np.all(jax.vmap(below)(features))
     # Differentiated rounds have few rows.
-    assert len(points) >= (16 if search.wants_clauses else 64)
+    assert len(points) >= (16 if search.wants.clauses else 64)
     assert proposals.accepted == len(points) <= proposals.proposed
-    again = play(Proposals(search, SPACE.cube, 16, KEY, SPACE.constraint), 8, search.wants_gradient)
+    again = play(Proposals(search, SPACE.cube, 16, KEY, SPACE.constraint), 8, search.wants.gradient)
     np.testing.assert_array_equal(points, again)
 
 

@@ -78,8 +78,8 @@ def test_parts_learn_from_their_own_coordinates():
 
 
 def test_what_the_whole_is():
-    assert split({"x": "gradient"}).wants_clauses
-    assert not split({"x": "halton"}).wants_clauses
+    assert split({"x": "gradient"}).wants.clauses
+    assert not split({"x": "halton"}).wants.clauses
     assert split({"x": "uniform"}).samples_prior
     assert not split({"x": "halton"}).samples_prior
     assert split({"x": "cross_entropy"}).learns

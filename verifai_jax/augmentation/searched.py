@@ -10,9 +10,8 @@ from jaxtyping import Array, Key
 from verifai_jax.augmentation.examples import Workshop
 from verifai_jax.augmentation.task import MARGIN, Features, SupervisedTask, Weights
 from verifai_jax.core.trace import Trace
-from verifai_jax.falsification.validation import needs_gradient
 from verifai_jax.problem.problem import Problem
-from verifai_jax.search import Portfolio, Search
+from verifai_jax.search import Search
 from verifai_jax.systems.base import System
 
 
@@ -24,8 +23,7 @@ def searched_problem(
     Without gradients one program serves the networks of all seeds, with their weights as arguments;
     with gradients each network has its own.
     """
-    slopes = needs_gradient(search) or isinstance(search, Portfolio)
-    if workshop is None or (slopes and not task.black_box):
+    if workshop is None or (search.wants.derivatives and not task.black_box):
         return task.problem(weights)
     return Problem(task.name, task.space, _Judged(workshop, weights), f"{MARGIN} >= 0")
 

@@ -70,18 +70,13 @@ def check_attack(problem: Problem, search: str | Search) -> Search:
     follows gradients; `TypeError` for what is no search.
     """
     found = searches.named(search) if isinstance(search, str) else search
-    if isinstance(found, Search) and (found.wants_gradient or found.wants_clauses):
-        known = (name for name in searches.names() if not _needs_gradients(name))
+    if isinstance(found, Search) and found.wants.derivatives:
+        known = (name for name in searches.names() if not searches.named(name).wants.derivatives)
         raise ValueError(
             f"attack {search!r} follows gradients, which are not computed for many policies at "
             f"once; use one of {', '.join(known)}"
         )
     return check_search(problem, found)
-
-
-def _needs_gradients(name: str) -> bool:
-    found = searches.named(name)
-    return found.wants_gradient or found.wants_clauses
 
 
 def attack_policies(

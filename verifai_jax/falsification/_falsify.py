@@ -66,7 +66,6 @@ from verifai_jax.falsification.validation import (
     check_search,
     earlier_rows,
     locked,
-    needs_gradient,
     new_folder,
     points_of,
     recorded_search,
@@ -74,11 +73,11 @@ from verifai_jax.falsification.validation import (
     slow_search,
     space_as_data,
     usual_batch,
-    without_suggestions,
     writing,
 )
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
+from verifai_jax.search.suggested import without_suggestions
 from verifai_jax.statistics.stopping import StoppingRule
 
 if TYPE_CHECKING:
@@ -201,7 +200,7 @@ def falsify(
     usual = min(16, budget) if diverse else usual
     own_batch, batch = batch, min(usual if batch is None else batch, budget)
     choice = resolved(
-        problem, gradient=needs_gradient(search), batch=batch, budget=budget, precision=precision,
+        problem, gradient=search.needs_derivatives, batch=batch, budget=budget, precision=precision,
         wanted=backend,
     )  # fmt: skip
     problem = choice.problem
@@ -568,7 +567,7 @@ def _run_rounds(
     stopped, cause = None, None
     try:
         with SimulationProgress(problem.name, ends.budget, progress) as bar:
-            slow = problem.system.why_slow_to_compile(search.wants_gradient or search.wants_clauses)
+            slow = problem.system.why_slow_to_compile(search.wants.derivatives)
             if slow and bar.bar.show:
                 bar.note(slow)
             elif slow and progress is not False:

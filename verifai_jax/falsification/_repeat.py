@@ -39,7 +39,7 @@ from verifai_jax.falsification.validation import (
     usual_batch,
 )
 from verifai_jax.problem.problem import Problem
-from verifai_jax.search import Observations, Search, TraceSurrogate
+from verifai_jax.search import Observations, Search
 
 SIMULATIONS_A_CALL = 512
 """Of each seed between two looks at who has found a failure."""
@@ -198,7 +198,7 @@ def repeat(
                 f"problem {problem.name!r} has {what}, which is dealt with between rounds; use "
                 "falsify with one seed after the other"
             )
-    if isinstance(search, TraceSurrogate):
+    if search.wants.traces is not None:
         raise ValueError(
             f"search {search!r} learns from traces between rounds; use falsify with one seed after "
             "the other"
@@ -210,7 +210,7 @@ def repeat(
     batch = min(usual_batch(search, budget) if batch is None else batch, budget)
     sources = problem.sources().to_json()
     claims = SeedConfirmer(traced, precision, every, not stop_early) if confirm else None
-    if search.wants_clauses:
+    if search.wants.clauses:
         # The search is in single precision whatever the simulations are, as in `falsify`.
         with in_precision("float32"):
             found = lockstep(traced, search, every, budget, batch, precision, stop_early, claims)
@@ -260,7 +260,7 @@ class _WholeRounds:
     ) -> None:
         self.problem, self.search, self.batch, self.rounds = problem, search, batch, rounds
         self.precision = precision
-        self.engine = Engine(problem, batch, search.wants_gradient, precision=precision)
+        self.engine = Engine(problem, batch, search.wants.gradient, precision=precision)
         cube = problem.space.cube
         self._start = jax.jit(jax.vmap(lambda key: search.init(key, cube, batch)))
         self._programs: dict[int, jax.stages.Compiled] = {}
@@ -362,7 +362,7 @@ class _WholeRounds:
             u, state = search.ask(state, cube, batch)
             rows = first + i * batch + jnp.arange(batch, dtype=jnp.int32)
             keys = jax.vmap(partial(simulation_key, key))(rows)
-            temperature = search.temperature(state) if search.wants_gradient else 1.0
+            temperature = search.temperature(state) if search.wants.gradient else 1.0
             simulate = jax.vmap(self.engine.row, in_axes=(0, 0, None))
             row = simulate(u, keys, jnp.float32(temperature))
             least = jnp.min(row.rho, axis=-1)

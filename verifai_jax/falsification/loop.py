@@ -35,7 +35,7 @@ from verifai_jax.falsification.surrogates import Surrogate
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Objective
-from verifai_jax.search import Diverse, Search, TraceSurrogate
+from verifai_jax.search import Search
 from verifai_jax.search.proposals import Proposals, compiled_search
 
 if TYPE_CHECKING:
@@ -79,13 +79,12 @@ class Rounds:
         self.first = np.zeros((0, problem.space.dim), np.float32) if first is None else first
         self.problem, self.search, self.batch, self.table = problem, search, batch, table
         guided = problem.guide is not None and search.learns
-        self.steering = Steering(guide=guided, outcome=search.wants_outcomes)
+        self.steering = Steering(guide=guided, outcome=search.wants.outcomes)
         self.precision, self.folder = precision, folder
         self.search_key = run_keys(seed)[0]
         self._surrogate: Surrogate | None = None
         self._journal = Journal(folder) if folder is not None and problem.black_box else None
-        if isinstance(search, TraceSurrogate):
-            self._learn_traces(search)
+        self._learn_traces(search)
         self._simulations = Simulations(
             problem,
             search,
@@ -99,7 +98,7 @@ class Rounds:
             keep_traces=self._surrogate is not None,
             given=suggests or self.first.shape[1] > problem.space.dim,
         )
-        self._marks = MarkBook(problem) if search.wants_marks else None
+        self._marks = MarkBook(problem) if search.wants.marks else None
         self.found = self.violating = self.without_verdict = 0
         self.best = float("nan")
         self.watch = Stopwatch(COMPILE)
@@ -128,7 +127,7 @@ class Rounds:
         space, marks = self.problem.space, 0 if self._marks is None else self._marks.width
         while_compiling(import_tables, after=0.0)
         stage = self.search.stage(None, space.cube, self.batch)
-        differentiates = stage.differentiates and not resumed
+        differentiates = stage.wants.clause_gradients and not resumed
         if differentiates:
             # They take longest to load: first, where nothing of them is to be traced.
             self._simulations.begin_if_recalled()
@@ -156,8 +155,11 @@ class Rounds:
         )
         self._keep()
 
-    def _learn_traces(self, search: TraceSurrogate) -> None:
-        self._surrogate = Surrogate(self.problem, search, self.search_key)
+    def _learn_traces(self, search: Search) -> None:
+        """Model the traces for a search that wants it."""
+        if search.wants.traces is None:
+            return
+        self._surrogate = Surrogate(self.problem, search.wants.traces, self.search_key)
         # Rows of a journal have no traces; those of a batch that is cut off are simulated again.
         if self._journal is not None:
             self._journal.settle(len(self.table) + MEASURED)
@@ -203,8 +205,7 @@ class Rounds:
             self.first = np.asarray(self._pending)[: self._simulations.measured]
         self._pending = None
         self.search, self.batch, self._chosen = search, batch, (note,)
-        if isinstance(search, TraceSurrogate):
-            self._learn_traces(search)
+        self._learn_traces(search)
         self._simulations.regroup(batch, keep_traces=self._surrogate is not None)
         self._propose()
 
@@ -221,9 +222,8 @@ class Rounds:
     @property
     def distinct(self) -> int:
         """Counterexamples found, of a search for diverse ones those far from each other."""
-        if isinstance(self.search, Diverse):
-            return self._proposals.distinct
-        return self.found
+        distinct = self._proposals.distinct
+        return self.found if distinct is None else distinct
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -310,7 +310,7 @@ class Rounds:
         points: Float[Any, "n d"],
         verdicts: Verdicts,
         first: int,
-        given: Float[Any, "given d"],
+        given: Float[Any, "given row"],
         suggested: bool = False,
         *,
         learns: bool = True,
@@ -395,7 +395,7 @@ class Rounds:
         with self.watch.on(COMPILE):
             if not self._proposals.begin_stage():
                 return
-            if self._proposals.stage.differentiates:
+            if self._proposals.stage.wants.clause_gradients:
                 self._simulations.begin_derivatives()
             self._proposals.wait()
 

@@ -5,12 +5,11 @@ origin_of(search, first=0)         "prior", "first", "given", "sequence", "cover
 
 from typing import Literal, get_args
 
-from verifai_jax.search import PointList, Search
+from verifai_jax.search import Search
 
 Origin = Literal["prior", "first", "given", "sequence", "coverage", "learned"]
-"""Where rows come from: independent samples of the prior; such samples after rows that were given;
-given rows alone; a sequence that is fixed from the start; a search guided by coverage; a search
-guided by robustness."""
+"""Where rows come from: as the points of a search (`search/base.py`), and `"first"` for samples of
+the prior after rows that were given."""
 ORIGINS: tuple[Origin, ...] = get_args(Origin)
 
 
@@ -22,10 +21,4 @@ def origin_of(search: Search, first: int) -> Origin:
     - `search`: of the run.
     - `first`: number of rows that were given before the search proposed any.
     """
-    if search.samples_prior:
-        return "first" if first else "prior"
-    if isinstance(search, PointList):
-        return "given"
-    if not search.learns:
-        return "sequence"
-    return "coverage" if search.wants_marks else "learned"
+    return "first" if first and search.samples_prior else search.origin

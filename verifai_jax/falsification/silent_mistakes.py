@@ -18,11 +18,10 @@ from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.falsification.table import ErrorTable
-from verifai_jax.falsification.validation import needs_gradient
 from verifai_jax.problem.dependence import has_gradient
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.silent_mistakes import is_quick, silent_mistakes, traced_by_default
-from verifai_jax.search import Grid, PointList, Search
+from verifai_jax.search import Search
 
 ENOUGH = 32
 """Simulations with a verdict from which on what all of them have in common is worth a note."""
@@ -39,12 +38,12 @@ def notes_before(problem: Problem, search: Search) -> tuple[str, ...]:
 
     Given features are simulated as they are, without a word.
     """
-    if isinstance(search, PointList):
+    if search.origin == "given":
         return ()
     # What a system finds out while it is traced is among them.
     notes = silent_mistakes(problem)
     notes = (*problem.system.notes, *notes)
-    if needs_gradient(search) and traced_by_default(problem.system) and not has_gradient(problem):
+    if search.needs_derivatives and traced_by_default(problem.system) and not has_gradient(problem):
         notes += (
             f"search {search!r} follows gradients and there are none: the robustness is constant "
             "between jumps; use 'cross_entropy' or another search without gradients",
@@ -65,7 +64,7 @@ def nominal_note(problem: Problem, evaluate: Evaluator, search: Search) -> tuple
     - `evaluate`: the run's own, compiled.
     - `search`: of the run.
     """
-    if problem.nominal is None or problem.system.backends or isinstance(search, PointList):
+    if problem.nominal is None or problem.system.backends or search.origin == "given":
         return ()
     precision = evaluate.engine.precision
     return problem.programs.get(NOMINAL, precision, lambda: _nominal_note(problem, evaluate))
@@ -120,7 +119,7 @@ def notes_after(
     - `warm`: whether the search began where an earlier run had ended.
     """
     count = len(table) - table.counts.without_verdict
-    if count < ENOUGH or isinstance(search, PointList):
+    if count < ENOUGH or search.origin == "given":
         return ()
     if table.counts.violating == count:
         if warm:
@@ -146,11 +145,9 @@ def cut_short_note(search: Search, total: int | None, simulated: int) -> tuple[s
     - `total`: points of the whole search; None where it never ends.
     - `simulated`: points of it that were simulated.
     """
-    if total is None or isinstance(search, PointList) or simulated >= total:
+    if total is None or search.origin == "given" or simulated >= total:
         return ()
-    which, order = "search", "in its order"
-    if isinstance(search, Grid):
-        which, order = "grid", "in a random order over the whole of it"
+    which, order = search.sequence
     return (
         f"{which} cut short: {simulated} of its {total} points were simulated "
         f"({100 * simulated / total:z.2g} %), {order}; budget={total} simulates all",

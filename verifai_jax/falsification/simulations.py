@@ -78,15 +78,15 @@ class Simulations:
         )
         self.evaluate = evaluator(
             batch,
-            gradient=search.wants_gradient,
+            gradient=search.wants.gradient,
             # Of goals that have one each, that is the robustness, which costs less.
-            clauses=search.wants_clauses and goals_of(problem.formulas.values()).most > 1,
+            clauses=search.wants.clauses and goals_of(problem.formulas.values()).most > 1,
             journal=journal,
             keep_traces=keep_traces,
             given=given,
         )
         self._differentiate: Evaluator | None = None
-        if search.wants_clauses:
+        if search.wants.clauses:
             most = min(batch, MOST_DIFFERENTIATED)
             self._differentiate = evaluator(most, gradient=True, clauses=True)
         self._measured: Verdicts | None = None

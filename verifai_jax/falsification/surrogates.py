@@ -1,6 +1,6 @@
 """A model of the traces of a run, monitored in place of the system: proposals of `TraceSurrogate`.
 
-    surrogate = Surrogate(problem, search, key)
+    surrogate = Surrogate(problem, search.wants.traces, key)
     surrogate.learn(u, verdicts)                        # the rows of a round, with their traces
     points = surrogate.improve(points)                  # some of a round's points replaced
 
@@ -28,9 +28,8 @@ from verifai_jax.mtl.clauses import goals_of
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.semantics import Semantics
 from verifai_jax.problem.problem import Problem
-from verifai_jax.search import TraceSurrogate
 from verifai_jax.search import trace_model as models
-from verifai_jax.search.base import draw_uniform, standard_normal
+from verifai_jax.search.base import TraceOptions, draw_uniform, standard_normal
 from verifai_jax.search.process_data import snap
 
 POOL = 512
@@ -67,12 +66,12 @@ class Surrogate:
     **Arguments:**
 
     - `problem`: of the run; its monitored signals are modelled.
-    - `search`: with the options.
+    - `options`: of the model and the descents on it.
     - `key`: of its random numbers.
     """
 
-    def __init__(self, problem: Problem, search: TraceSurrogate, key: Key[Array, ""]) -> None:
-        self.problem, self.search = problem, search
+    def __init__(self, problem: Problem, options: TraceOptions, key: Key[Array, ""]) -> None:
+        self.problem, self.options = problem, options
         self.cube = problem.space.cube
         self.key = jax.random.fold_in(key, 0x7ACE)
         self.form: TraceForm | None = None
@@ -81,7 +80,7 @@ class Surrogate:
         self.rho = np.zeros(0, np.float32)
         self.round = self.fitted = 0
         self.hyper = models.first_hyper(_width(self.cube))
-        self._programs = problem.programs.get(DESCENTS, search, lambda: Descents(problem, search))
+        self._programs = problem.programs.get(DESCENTS, options, lambda: Descents(problem, options))
 
     def learn(self, u: Float[Any, "n d"], verdicts: Verdicts) -> None:
         """Keep the rows that have a verdict and a trace like that of the others."""
@@ -113,12 +112,12 @@ class Surrogate:
     def improve(self, points: Float[Any, "batch d"]) -> Float[Any, "batch d"]:
         """Replace the model's share of the points that the search proposes."""
         before, after = (
-            round(self.search.share * number * len(points))
+            round(self.options.share * number * len(points))
             for number in (self.round, self.round + 1)
         )
         self.round += 1
         count, guess = after - before, after // MEANS > before // MEANS
-        enough = len(self.rho) >= self.search.initial and self.cube.dim > 0
+        enough = len(self.rho) >= self.options.initial and self.cube.dim > 0
         if not enough or count == 0 or np.ptp(self.traces, axis=0).max() == 0:
             return points
         proposed = self._proposals(count, guess)
@@ -179,10 +178,10 @@ class Surrogate:
 
     def _forget(self) -> None:
         """Keep no more rows than the capacity: the best half, and the last ones."""
-        extra = len(self.rho) - self.search.capacity
+        extra = len(self.rho) - self.options.capacity
         if extra <= 0:
             return
-        best = np.argsort(self.rho, kind="stable")[: self.search.capacity // 2]
+        best = np.argsort(self.rho, kind="stable")[: self.options.capacity // 2]
         spare = np.setdiff1d(np.arange(len(self.rho)), best)[:extra]
         kept = np.setdiff1d(np.arange(len(self.rho)), spare)
         self.u, self.traces, self.rho = self.u[kept], self.traces[kept], self.rho[kept]
@@ -200,7 +199,7 @@ class Surrogate:
         scale = np.repeat(np.where(scale > 0, scale, 1.0), len(form.places)).astype(np.float32)
         mean, components = models.principal_components(self.traces / scale)
         coefficients = ((self.traces / scale - mean) @ components.T).astype(np.float32)
-        size = _padded(len(self.rho), self.search.capacity)
+        size = _padded(len(self.rho), self.options.capacity)
         missing = size - len(self.rho)
         coefficients = np.pad(coefficients, ((0, missing), (0, 0)))
         u = np.pad(self.u, ((0, missing), (0, 0)), constant_values=0.5)
@@ -244,9 +243,9 @@ class Surrogate:
 class Descents:
     """Programs of a problem: the fit, and descents on simulators drawn from the model."""
 
-    def __init__(self, problem: Problem, search: TraceSurrogate) -> None:
+    def __init__(self, problem: Problem, options: TraceOptions) -> None:
         self.end: End = problem.end
-        self.search, self.cube = search, problem.space.cube
+        self.options, self.cube = options, problem.space.cube
         self.goals = goals_of(problem.formulas.values())
         # Rows become what the model takes inside of the programs: outside each operation would
         # compile a program for each number of rows.
@@ -291,7 +290,7 @@ class Descents:
             return jnp.where(jnp.isfinite(gradient), gradient, 0.0)
 
         def one(weights: Float[Array, "terms c"]) -> tuple[Array, Array]:
-            least, place = jax.lax.top_k(-_number(values(pool, weights, hard)), self.search.starts)
+            least, place = jax.lax.top_k(-_number(values(pool, weights, hard)), self.options.starts)
             start = pool[place]
 
             def step(carry: tuple, part: Array) -> tuple:
@@ -310,7 +309,7 @@ class Descents:
                 return (u, first, second, best, jnp.where(better, value, least)), None
 
             zero = jnp.zeros_like(start)
-            parts = jnp.linspace(0.0, 1.0, self.search.steps)
+            parts = jnp.linspace(0.0, 1.0, self.options.steps)
             (_, _, _, best, value), _ = jax.lax.scan(
                 step, (start, zero, zero, start, -least), parts
             )
@@ -324,8 +323,8 @@ class Descents:
         return jnp.min(jnp.max(clauses, axis=1))
 
 
-DESCENTS: Slot[TraceSurrogate, Descents] = Slot("descents on a model of the traces")
-"""The programs of a problem for its surrogates, by their search."""
+DESCENTS: Slot[TraceOptions, Descents] = Slot("descents on a model of the traces")
+"""The programs of a problem for its surrogates, by their options."""
 
 
 def _spread(rho: Float[np.ndarray, " n"], number: int, dim: int) -> float:

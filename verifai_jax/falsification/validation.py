@@ -63,14 +63,18 @@ def usual_batch(
       rounds, where these are not too large.
     """
     if not search.learns and stop_after is not None:
-        few = 1 << (min(search.most_at_once, 16 * stop_after).bit_length() - 1)
+        few = 1 << (min(search.wants.max_batch, 16 * stop_after).bit_length() - 1)
         return max(
-            few, min(search.most_at_once, 1 << (max(int(budget) // 512, 1).bit_length() - 1))
+            few, min(search.wants.max_batch, 1 << (max(int(budget) // 512, 1).bit_length() - 1))
         )
     if not search.learns:
         eighth = 1 << max(0, (int(budget) // 8).bit_length() - 1)
-        return max(search.most_at_once, min(MOST_AT_ONCE, eighth) if whole else 0)
-    most = search.most_at_once if stop_after is None else min(search.most_at_once, 16 * stop_after)
+        return max(search.wants.max_batch, min(MOST_AT_ONCE, eighth) if whole else 0)
+    most = (
+        search.wants.max_batch
+        if stop_after is None
+        else min(search.wants.max_batch, 16 * stop_after)
+    )
     return min(1 << (most.bit_length() - 1), 1 << max(3, (int(budget) // 20).bit_length() - 1))
 
 
@@ -110,13 +114,6 @@ def check_search(problem: object, search: object) -> Search:
     return search
 
 
-def without_suggestions(search: object) -> tuple[searches.Suggested | None, Any]:
-    """Return a search that asks for suggestions, None where there is none, and the one inside."""
-    if isinstance(search, searches.Suggested):
-        return search, search.search
-    return None, search
-
-
 def _why_not_traced(system: System) -> str:
     """Return why a system with several backends has none that JAX can trace; often empty."""
     if not system.backends or "mjx" in system.backends:
@@ -124,24 +121,18 @@ def _why_not_traced(system: System) -> str:
     return f". It does not run on mjx: {system.why_not('mjx')}"
 
 
-def needs_gradient(search: Search) -> bool:
-    """Return whether this search can do nothing without derivatives; a portfolio can."""
-    clauses = search.wants_clauses and not isinstance(search, searches.Portfolio)
-    return search.wants_gradient or clauses
-
-
 def check_gradient(problem: Problem, search: Search) -> None:
     """Refuse a search that needs gradients of a system that has none.
 
     **Raises:** `ValueError`.
     """
-    wants = needs_gradient(search)
-    if wants and problem.rulebook is not None and search.wants_clauses:
+    needs = search.needs_derivatives
+    if needs and problem.rulebook is not None and search.wants.clauses:
         raise ValueError(
             f"search {search!r} descends on clauses, which have no order; problem "
             f"{problem.name!r} has a priority. Use 'portfolio' or 'cross_entropy'"
         )
-    if problem.black_box and wants:
+    if problem.black_box and needs:
         why = _why_not_traced(problem.system)
         raise ValueError(
             f"the system of problem {problem.name!r} is a black box, which has no gradient, and "
@@ -154,7 +145,7 @@ def check_guide(problem: Problem, search: Search) -> None:
 
     **Raises:** `ValueError`.
     """
-    if problem.guide is None or search.learns or isinstance(search, searches.PointList):
+    if problem.guide is None or search.learns or search.origin == "given":
         return
     raise ValueError(
         f"problem {problem.name!r} has a guide, which steers searches that learn, and search "
@@ -183,40 +174,48 @@ def _guide_text(guide: Mapping[str, Any] | None) -> str:
 def adapt_search(
     problem: Problem, search: Search, executor: Executor | None = None
 ) -> tuple[Search, tuple[str, ...]]:
-    """Return the search as it can work on this problem, and notes on what it does without.
-
-    A portfolio does without gradients where there are none, a model of traces without traces.
+    """Return the search, or its fallback where the problem lacks what it wants, and a note on that.
 
     **Raises:** `ValueError` for a search that needs gradients, and a system with a step that has no
     derivative.
     """
-    lacking = without_derivative(problem) if needs_gradient(search) else None
+    lacking = without_derivative(problem) if search.needs_derivatives else None
     if lacking is not None:
         raise ValueError(
             f"search {search!r} follows gradients, and the system of problem {problem.name!r} has "
             f"none: {lacking} has no derivative. Use a search that needs none, such as 'portfolio' "
             "or 'cross_entropy', or give the operation a derivative by jax.custom_jvp"
         )
-    if isinstance(search, searches.TraceSurrogate):
+    fallback = search.fallback
+    if fallback is None:
+        return search, ()
+    if search.wants.traces is not None:
         why = _why_no_traces(problem, executor)
-        if why is None:
-            return search, ()
-        return search.without_traces, (f"search turbo: {why}",)
-    if not isinstance(search, searches.Portfolio) or not search.gradients:
+        return (search, ()) if why is None else (fallback, (f"search {_label(fallback)}: {why}",))
+    why = _why_no_derivatives(problem)
+    if why is None:
         return search, ()
+    return fallback, (f"{_label(search)} without gradients: {why}",)
+
+
+def _label(search: Search) -> str:
+    """Return the name of a search, or its text where it has none."""
+    return str((searches.to_json(search) or {}).get("name", search))
+
+
+def _why_no_derivatives(problem: Problem) -> str | None:
+    """Return why a search cannot follow derivatives on this problem; None where it can."""
     if problem.black_box:
-        why = "the system is a black box"
-    elif problem.rulebook is not None:
-        why = "a priority has no gradient"
-    elif not len(problem.space.cube.continuous):
-        why = "all features are discrete"
-    elif (lacking := without_derivative(problem)) is not None:
-        why = f"{lacking} has no derivative"
-    elif problem.guide is None and not has_gradient(problem):
-        why = "the robustness is constant almost everywhere"
-    else:
-        return search, ()
-    return search.without_gradients(), (f"portfolio without gradients: {why}",)
+        return "the system is a black box"
+    if problem.rulebook is not None:
+        return "a priority has no gradient"
+    if not len(problem.space.cube.continuous):
+        return "all features are discrete"
+    if (lacking := without_derivative(problem)) is not None:
+        return f"{lacking} has no derivative"
+    if problem.guide is None and not has_gradient(problem):
+        return "the robustness is constant almost everywhere"
+    return None
 
 
 def _why_no_traces(problem: Problem, executor: Executor | None) -> str | None:

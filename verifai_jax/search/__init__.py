@@ -14,7 +14,7 @@ from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.search._split import Split
 from verifai_jax.search.annealing import Annealing
 from verifai_jax.search.bandit import Bandit
-from verifai_jax.search.base import Observations, Plan, Search
+from verifai_jax.search.base import Observations, Plan, Search, Wants
 from verifai_jax.search.bayes import Bayes
 from verifai_jax.search.ce_compat import CECompat
 from verifai_jax.search.cmaes import CMAES
@@ -34,12 +34,14 @@ from verifai_jax.search.suggested import Absent, Suggested
 from verifai_jax.search.trace_surrogate import TraceSurrogate
 from verifai_jax.search.turbo import TuRBO
 from verifai_jax.search.uniform import Uniform
+from verifai_jax.search.wrapper import Wrapper
 
 __all__ = [
     "CMAES", "Annealing", "Bandit", "Bayes", "CECompat", "Coverage", "CrossEntropy", "Cube",
     "Descent", "Diverse", "EpsilonGreedy", "Gradient", "Grid", "Halton", "Mutation",
     "Observations", "Plan", "PointList", "Portfolio", "Search", "Sobol", "Split", "Suggested",
-    "TraceSurrogate", "TuRBO", "Uniform", "distinct", "from_json", "named", "names", "split",
+    "TraceSurrogate", "TuRBO", "Uniform", "Wants", "Wrapper", "distinct", "from_json", "named",
+    "names", "split",
     "to_json",
 ]  # fmt: skip
 

@@ -7,8 +7,10 @@ Every part sees its own coordinates and the robustness of the whole simulation. 
 takes the others for noise, so that what belongs together belongs into one part.
 """
 
+import operator
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import reduce
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +19,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.errors import unknown_name
-from verifai_jax.search.base import Observations, Plan, Search
+from verifai_jax.search.base import Observations, Plan, Search, Wants
 
 
 @dataclass(frozen=True, init=False)
@@ -58,19 +60,27 @@ class Split(Search[tuple[PyTree, ...]]):
         return (*(search for _, search in self.parts), self.rest)
 
     @property
-    def wants_gradient(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return any(search.wants_gradient for search in self.searches)
+    def wants(self) -> Wants:
+        wants = reduce(operator.or_, (search.wants for search in self.searches))
+        # A model of the traces knows no parts.
+        return replace(wants, traces=None)
 
     @property
-    def wants_clauses(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return any(search.wants_clauses for search in self.searches)
+    def fallback(self) -> "Split | None":
+        """The same with the fallback of each part that follows derivatives."""
+        parts = [each.fallback if each.wants.derivatives else each for each in self.searches]
+        known = [each for each in parts if each is not None]
+        if not self.wants.derivatives or len(known) < len(parts):
+            return None
+        names = (name for name, _ in self.parts)
+        return Split(dict(zip(names, known, strict=False)), known[-1])
 
     @property
-    def samples_prior(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def samples_prior(self) -> bool:
         return all(search.samples_prior for search in self.searches)
 
     @property
-    def learns(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def learns(self) -> bool:
         return any(search.learns for search in self.searches)
 
     def check(self, cube: Cube) -> None:
@@ -118,14 +128,14 @@ class Split(Search[tuple[PyTree, ...]]):
     def temperature(self, state: tuple[PyTree, ...]) -> Float[Array, ""]:
         """Return the temperature of the first part that wants gradients."""
         for search, its in zip(self.searches, state, strict=True):
-            if search.wants_gradient:
+            if search.wants.gradient:
                 return search.temperature(its)
         return super().temperature(state)
 
     def plan(self, state: tuple[PyTree, ...], cube: Cube, batch: int) -> Plan:
         """Return the plan of the first part that has plans."""
         for its, (search, _, part) in zip(state, self._shares(cube), strict=True):
-            if search.wants_clauses:
+            if search.wants.clauses:
                 return search.plan(its, part, batch)
         return super().plan(state, cube, batch)
 
@@ -134,15 +144,16 @@ class Split(Search[tuple[PyTree, ...]]):
     ) -> tuple[PyTree, ...]:
         states = []
         for its, (search, places, part) in zip(state, self._shares(cube), strict=True):
-            gradient, clause_gradients = observations.gradient, observations.clause_gradients
-            its_own = Observations(observations.u[:, places], observations.rho, observations.valid)
-            if gradient is not None and search.wants_gradient:
-                its_own = its_own._replace(gradient=gradient[:, places])
-            if clause_gradients is not None and search.wants_clauses:
-                its_own = its_own._replace(
-                    clauses=observations.clauses, clause_gradients=clause_gradients[:, :, places]
-                )
-            states.append(getattr(search, verb)(its, part, its_own))
+            seen = search.wants.only(observations)
+            gradient, clause_gradients = seen.gradient, seen.clause_gradients
+            seen = seen._replace(
+                u=seen.u[:, places],
+                gradient=None if gradient is None else gradient[:, places],
+                clause_gradients=(
+                    None if clause_gradients is None else clause_gradients[:, :, places]
+                ),
+            )
+            states.append(getattr(search, verb)(its, part, seen))
         return tuple(states)
 
     def _shares(self, cube: Cube) -> list[tuple[Search, np.ndarray, Cube]]:

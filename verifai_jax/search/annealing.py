@@ -24,10 +24,15 @@ from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, draw_uniform, standard_normal
-
-MOST_CELLS = 8
-"""Ordered cells up to which a coordinate is discrete; more are stepped over as if continuous."""
+from verifai_jax.search.base import (
+    Observations,
+    Search,
+    draw_columns,
+    draw_uniform,
+    keep_best,
+    standard_normal,
+)
+from verifai_jax.search.moves import all_or_some, has_fine_cells
 
 RESAMPLED = 0.15
 """Share of the proposals that draw the cell of a coordinate from the prior."""
@@ -116,24 +121,20 @@ class Annealing(Search[AnnealingState]):
     ) -> tuple[Float[Array, "batch d"], AnnealingState]:
         key = jax.random.fold_in(state.key, state.asks)
         d, k, chains = cube.dim, len(cube.discrete), len(state.energy)
-        # One call for all random numbers: each takes a while to compile.
-        random = draw_uniform(key, (batch, 6 + 3 * d + 2 * k))
-        row, prior, noise, move, cell, way = jnp.split(
-            random, 6 + np.array([0, d, 2 * d, 3 * d, 3 * d + k]), axis=1
-        )
+        row, prior, noise, move, cell, way = draw_columns(key, batch, 6, d, d, d, k, k)
         turn = self._turn(state, batch)
         own = state.u[turn]
         # One coordinate moves for certain, others all together or a few at a time.
         certain = jnp.arange(d) == (row[:, :1] * d).astype(jnp.int32)
-        moved = certain | (move < jnp.where(row[:, 1:2] < 0.5, 1.0, max(0.3, 1 / max(d, 1))))
+        moved = certain | all_or_some(row[:, 1:2], move)
         scale = state.step[turn][:, None] * 1.5 * 0.03 ** row[:, 2:3]
         step = scale * standard_normal(noise)
         one, other = (row[:, 3:5] * chains).astype(jnp.int32).T
         along = (0.3 + 0.7 * row[:, 2:3]) * (state.u[one] - state.u[other]) + 0.1 * step
         step = jnp.where(moved, jnp.where(row[:, 5:] < ALONG_OTHERS, along, step), 0.0)
 
-        few = np.array([i for i in cube.discrete if not self._smooth(cube, i)], np.int32)
-        place = np.flatnonzero(np.isin(cube.discrete, few))
+        place = np.flatnonzero(~has_fine_cells(cube))
+        few = cube.discrete[place]
         # Of a cell, the neighbour or any; of a choice, any.
         width = np.array([cube.ordered[i] / cube.levels[i] for i in few], np.float32)
         either = np.where(width > 0, RESAMPLED + NEIGHBOURING, RESAMPLED)
@@ -183,13 +184,10 @@ class Annealing(Search[AnnealingState]):
         self, state: AnnealingState, cube: Cube, observations: Observations
     ) -> AnnealingState:
         """Put the chains at the best points, the best at the coldest."""
-        usable = observations.usable
         new = observations.score
-        energy = jnp.concatenate([new, state.energy])
-        u = jnp.concatenate([jnp.where(usable[:, None], observations.u, 0.5), state.u])
-        best = jnp.argsort(energy)[: len(state.energy)]
+        u, energy = keep_best(observations.u, new, state.u, state.energy)
         spread = jnp.where(state.spread == 0, _best_to_median(new), state.spread)
-        return state._replace(u=u[best], energy=energy[best], spread=spread)
+        return state._replace(u=u, energy=energy, spread=spread)
 
     def _start_at_best(self, state: AnnealingState, batch: int) -> AnnealingState:
         """Move all chains to the best quarter of the first round's points, after that round."""
@@ -224,10 +222,6 @@ class Annealing(Search[AnnealingState]):
         met = jnp.where(jnp.isinf(energy), energy.at[turn].set(new), energy)
         first = jnp.any(jnp.isinf(energy)) & (state.tells * len(turn) < len(energy))
         return jnp.where(first | (state.spread == 0), _best_to_median(met), state.spread)
-
-    def _smooth(self, cube: Cube, i: int | np.integer) -> bool:
-        """Return whether steps in this coordinate are those of a continuous one."""
-        return cube.levels[i] == 0 or (cube.ordered[i] and cube.levels[i] > MOST_CELLS)
 
 
 def _best_to_median(energy: Float[Array, " n"]) -> Float[Array, ""]:

@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, draw_uniform
+from verifai_jax.search.base import Observations, Search, draw_columns, newest_first
 
 BISECTIONS = 20
 """Halvings of the interval that holds the common level of the bounds."""
@@ -93,8 +93,7 @@ class Bandit(Search[BanditState]):
         self, state: BanditState, cube: Cube, batch: int
     ) -> tuple[Float[Array, "batch d"], BanditState]:
         key = jax.random.fold_in(state.key, state.round)
-        random = draw_uniform(key, (batch, 1 + 2 * cube.dim))
-        chance, order, prior = jnp.split(random, [1, 1 + cube.dim], axis=1)
+        chance, order, prior = draw_columns(key, batch, 1, cube.dim, cube.dim)
         # A Latin hypercube: in each coordinate one row in each of `batch` equal parts.
         even = (jnp.argsort(order, axis=0) + prior) / batch
         reward = self._rewards(state.score)
@@ -111,14 +110,11 @@ class Bandit(Search[BanditState]):
         return u, state._replace(round=state.round + 1)
 
     def tell(self, state: BanditState, cube: Cube, observations: Observations) -> BanditState:
-        usable = observations.usable
-        new = observations.score
-        u = jnp.where(usable[:, None], observations.u, 0.5)
-        u = u.at[:, cube.discrete].set(cube.centres(cube.cells(u)))
-        score = jnp.concatenate([new, state.score])
+        u = observations.u.at[:, cube.discrete].set(cube.centres(cube.cells(observations.u)))
+        u, score = newest_first(u, observations.score, state.u, state.score)
         # Points without a verdict push none out.
         kept = jnp.argsort(jnp.isinf(score), stable=True)[: len(state.score)]
-        return state._replace(u=jnp.concatenate([u, state.u])[kept], score=score[kept])
+        return state._replace(u=u[kept], score=score[kept])
 
     def _rewards(self, score: Float[Array, " window"]) -> Float[Array, " window"]:
         """Return rewards: 1 for the best to 0 beyond the best share; equal scores share ranks."""

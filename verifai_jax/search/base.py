@@ -10,7 +10,8 @@ pytree, so that it can be jitted, scanned, saved and resumed. It knows nothing o
 
 import abc
 import math
-from typing import ClassVar, Generic, NamedTuple, TypeVar
+from dataclasses import dataclass, fields
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +19,11 @@ import numpy as np
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from verifai_jax.core.checks import check_count, check_fraction
+from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.notebook import ForUsers
+from verifai_jax.core.outcomes import OUTCOME
 
 KIND = 1 << 16
 """Marks below it are of the first kind, the next so many of the second, and so on."""
@@ -32,16 +36,16 @@ class Observations(NamedTuple):
     - `rho`: robustness; negative is a failure.
     - `valid`: False for padding and for simulations without a verdict: such a row must not
       influence the search, whatever its other entries are (NaN included).
-    - `gradient`: of the smooth robustness with respect to `u`; only for a search that
-      `wants_gradient`.
+    - `gradient`: of the smooth robustness with respect to `u`.
     - `clauses`: values of the clauses to violate together, without unit, all negative in a failure;
-      very low where there are fewer than `CLAUSES`. Only for a search that `wants_clauses`.
+      very low where there are fewer than `CLAUSES`.
     - `clause_gradients`: their gradients with respect to `u`; zero in rounds whose plan does not
       differentiate.
-    - `outcomes`: what happened (`core.outcomes`), NaN where it is not known. Only for a search that
-      `wants_outcomes`.
+    - `outcomes`: what happened (`core.outcomes`), NaN where it is not known.
     - `marks`: numbers of what each simulation covered, -1 for nothing; `marks // KIND` is the kind
-      of thing. Only for a search that `wants_marks`.
+      of thing.
+
+    All after `valid` are None for a search whose `Wants` do not name them.
     """
 
     u: Float[Array, "n d"]
@@ -64,8 +68,113 @@ class Observations(NamedTuple):
         return jnp.where(self.usable, jnp.maximum(self.rho, 0.0), jnp.inf)
 
 
+@dataclass(frozen=True)
+class TraceOptions:
+    """Options of a model of the traces, which the loop keeps for a search and descends on.
+
+    **Arguments:**
+
+    - `initial`: points of the prior before the model has a say.
+    - `share`: of the points that the model proposes; the others are those of the search.
+    - `capacity`: rows that the model knows at most, the best half and the last ones.
+    - `starts`: descents for each proposal, the best one of which is simulated.
+    - `steps`: steps of a descent.
+
+    **Raises:** `ValueError` for values out of range.
+    """
+
+    initial: int = 8
+    share: float = 0.75
+    capacity: int = 512
+    starts: int = 16
+    steps: int = 40
+
+    def __post_init__(self) -> None:
+        check_count("initial", self.initial, 2)
+        check_fraction("share", self.share, one=True)
+        check_count("capacity", self.capacity, 16)
+        check_count("starts", self.starts)
+        check_count("steps", self.steps)
+
+
+@dataclass(frozen=True)
+class Wants:
+    """Needs of a search from the loop, besides the robustness of its points.
+
+    **Arguments:**
+
+    - `gradient`: `Observations.gradient`, at the `temperature` of the search.
+    - `clauses`: `Observations.clauses`. Such a search plans its rounds (`plan`).
+    - `clause_gradients`: `Observations.clause_gradients`, in the rounds whose plan says so.
+    - `marks`: `Observations.marks`.
+    - `outcomes`: `Observations.outcomes`.
+    - `no_verdict_rows`: simulations without a verdict as if they were valid, with the greatest
+      robustness so far, so that a model of the robustness learns to stay away from them.
+    - `traces`: a model of the traces that proposes some of the points, with these options.
+    - `max_batch`: points in a round beyond which more rounds are worth more than larger ones.
+    """
+
+    gradient: bool = False
+    clauses: bool = False
+    clause_gradients: bool = False
+    marks: bool = False
+    outcomes: bool = False
+    no_verdict_rows: bool = False
+    traces: TraceOptions | None = None
+    max_batch: int = 1024
+
+    @property
+    def derivatives(self) -> bool:
+        """True for a search that follows derivatives, of the robustness or of clauses."""
+        return self.gradient or self.clause_gradients
+
+    def __or__(self, other: "Wants") -> "Wants":
+        """Return what two searches want together, in rounds that suit both."""
+        either: dict[str, Any] = {
+            f.name: getattr(self, f.name) or getattr(other, f.name) for f in fields(self)
+        }
+        either["max_batch"] = min(self.max_batch, other.max_batch)
+        return Wants(**either)
+
+    def only(self, observations: Observations) -> Observations:
+        """Return observations without the parts that are not wanted."""
+        wanted = {
+            "gradient": self.gradient,
+            "clauses": self.clauses,
+            "clause_gradients": self.clauses,
+            "marks": self.marks,
+            "outcomes": self.outcomes,
+        }
+        return observations._replace(**{name: None for name, want in wanted.items() if not want})
+
+    def form(self, cube: Cube, batch: int, marks: int) -> Observations:
+        """Return the shapes and types of the observations of a round.
+
+        **Arguments:**
+
+        - `cube`: the cube that is searched.
+        - `batch`: rows of a round.
+        - `marks`: marks of a row.
+        """
+
+        def array(*shape: int, dtype: type = jnp.float32) -> Any:
+            return jax.ShapeDtypeStruct(shape, dtype)
+
+        everything = Observations(
+            u=array(batch, cube.dim),
+            rho=array(batch),
+            valid=array(batch, dtype=jnp.bool_),
+            gradient=array(batch, cube.dim),
+            clauses=array(batch, CLAUSES),
+            clause_gradients=array(batch, CLAUSES, cube.dim),
+            marks=array(batch, marks, dtype=jnp.int32),
+            outcomes=array(batch, OUTCOME),
+        )
+        return self.only(everything)
+
+
 class Plan(NamedTuple):
-    """The simulations that a search with `wants_clauses` wants of its last proposals.
+    """The simulations that a search that wants clauses wants of its last proposals.
 
     - `rows`: number of proposals to simulate, from the first on; the others are told as not valid.
     - `differentiate`: whether to compute the gradients of the clauses too, which costs as much as
@@ -77,6 +186,10 @@ class Plan(NamedTuple):
     differentiate: Bool[Array, ""]
     temperature: Float[Array, " batch"]
 
+
+Origin = Literal["prior", "given", "sequence", "coverage", "learned"]
+"""Where points come from: independent samples of the prior; a list that somebody gave; a sequence
+that is fixed from the start; a search guided by coverage; a search guided by robustness."""
 
 State = TypeVar("State")
 """The state of a search: a pytree of arrays."""
@@ -91,36 +204,51 @@ class Search(ForUsers, abc.ABC, Generic[State]):
     """
 
     _internal = frozenset((
-        "differentiates", "learns", "most_at_once", "plan", "samples_prior", "stage",
-        "start_from", "temperature", "total", "wants_clauses", "wants_gradient", "wants_marks",
-        "wants_outcomes", "warm_start",
+        "distinct", "fallback", "learns", "needs_derivatives", "origin", "plan", "samples_prior",
+        "sequence", "stage", "start_from", "temperature", "total", "wants", "warm_start",
     ))  # fmt: skip
 
-    wants_gradient: ClassVar[bool] = False
-    """Whether `tell` needs `Observations.gradient`."""
+    @property
+    def wants(self) -> Wants:
+        """Needs of this search; a class states them in one line, `wants = Wants(...)`."""
+        return Wants()
 
-    wants_clauses: ClassVar[bool] = False
-    """Whether `tell` needs `Observations.clauses`, with `clause_gradients` in the rounds whose
-    `plan` says so."""
+    @property
+    def learns(self) -> bool:
+        """True if `tell` changes the next proposals; False for sequences fixed from the start."""
+        return True
 
-    wants_marks: ClassVar[bool] = False
-    """Whether `tell` needs `Observations.marks`."""
+    @property
+    def samples_prior(self) -> bool:
+        """True if points are independent samples of the prior, so that failure rates are known."""
+        return False
 
-    wants_outcomes: ClassVar[bool] = False
-    """Whether `tell` needs `Observations.outcomes`."""
+    @property
+    def origin(self) -> Origin:
+        """Origin of the points, which decides what their rows are evidence of."""
+        if self.samples_prior:
+            return "prior"
+        if not self.learns:
+            return "sequence"
+        return "coverage" if self.wants.marks else "learned"
 
-    avoids_no_verdict: ClassVar[bool] = False
-    """Whether a simulation without a verdict is told as one of the greatest robustness so far, so
-    that a model of the robustness leaves alone where there are no verdicts."""
+    @property
+    def sequence(self) -> tuple[str, str]:
+        """Words for the points of a search that ends, and for their order, in a note."""
+        return "search", "in its order"
 
-    samples_prior: ClassVar[bool] = False
-    """Whether points are independent samples of the prior, so that failure rates mean something."""
+    @property
+    def fallback(self) -> "Search | None":
+        """The search that takes its place where the loop cannot give what it wants.
 
-    learns: ClassVar[bool] = True
-    """Whether `tell` changes the next proposals; False for sequences fixed from the start."""
+        None for a search that is of no use then.
+        """
+        return None
 
-    most_at_once: ClassVar[int] = 1024
-    """Points in a round beyond which more rounds are worth more than larger ones."""
+    @property
+    def needs_derivatives(self) -> bool:
+        """True if the search follows derivatives and can do nothing without them."""
+        return self.wants.derivatives and self.fallback is None
 
     def check(self, cube: Cube) -> None:
         """Raise `ValueError` if this search cannot work on this cube."""
@@ -149,10 +277,12 @@ class Search(ForUsers, abc.ABC, Generic[State]):
         """Learn from points that somebody suggested between two rounds, and start from them."""
         return self.warm_start(state, cube, observations)
 
-    @property
-    def differentiates(self) -> bool:
-        """True if a plan of this search may ask for derivatives of clauses."""
-        return self.wants_clauses
+    def distinct(self, state: State) -> Int[Array, ""] | None:
+        """Return the number of failures so far that are far from each other.
+
+        None for a search that does not tell them apart.
+        """
+        return None
 
     def stage(self, state: State | None, cube: Cube, batch: int) -> "Search[State]":
         """Return the search for the next round: this one, or only the parts of it that take part.
@@ -167,11 +297,11 @@ class Search(ForUsers, abc.ABC, Generic[State]):
         return self
 
     def plan(self, state: State, cube: Cube, batch: int) -> Plan:
-        """Return the simulations wanted of the last proposals; only where `wants_clauses`."""
+        """Return the simulations wanted of the last proposals, for a search that wants clauses."""
         raise NotImplementedError(f"{type(self).__name__} has no plans")
 
     def temperature(self, state: State) -> Float[Array, ""]:
-        """Return the temperature of the smooth robustness; only where `wants_gradient`."""
+        """Return the temperature of the smooth robustness, for one that wants a gradient."""
         raise NotImplementedError(f"{type(self).__name__} uses no gradient")
 
 
@@ -195,10 +325,39 @@ def nearest_to_failing(
     - `offered`, `near`: earlier points and their robustness, infinite where there is none.
     """
     usable = observations.usable & (observations.rho >= 0)
-    rho = jnp.concatenate([jnp.where(usable, observations.rho, jnp.inf), near])
-    points = jnp.concatenate([jnp.where(usable[:, None], observations.u, 0.5), offered])
-    _, nearest = jax.lax.top_k(-rho, len(near))
-    return points[nearest], rho[nearest]
+    return keep_best(observations.u, jnp.where(usable, observations.rho, jnp.inf), offered, near)
+
+
+def newest_first(
+    u: Float[Array, "n d"],
+    new: Float[Array, " n"],
+    points: Float[Array, "k d"],
+    score: Float[Array, " k"],
+) -> tuple[Float[Array, "n+k d"], Float[Array, " n+k"]]:
+    """Return the points of a round before those of a memory, with their scores.
+
+    **Arguments:**
+
+    - `u`, `new`: of the round; a score is infinite where there is nothing to learn.
+    - `points`, `score`: of the memory; a score is infinite where there is no point.
+    """
+    u = jnp.where(jnp.isinf(new)[:, None], 0.5, u)
+    return jnp.concatenate([u, points]), jnp.concatenate([new, score])
+
+
+def keep_best(
+    u: Float[Array, "n d"],
+    new: Float[Array, " n"],
+    points: Float[Array, "k d"],
+    score: Float[Array, " k"],
+) -> tuple[Float[Array, "k d"], Float[Array, " k"]]:
+    """Return the best points of a round and a memory, sorted; of equal ones the newest.
+
+    **Arguments:** as of `newest_first`.
+    """
+    points, scores = newest_first(u, new, points, score)
+    _, best = jax.lax.top_k(-scores, len(score))
+    return points[best], scores[best]
 
 
 def draw_uniform(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "*shape"]:
@@ -209,6 +368,14 @@ def draw_uniform(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "*
     """
     flat = jax.random.uniform(key, (math.prod(shape),), jnp.float32)
     return jax.lax.optimization_barrier(flat).reshape(shape)
+
+
+def draw_columns(
+    key: Key[Array, ""], rows: int, *widths: int
+) -> tuple[Float[Array, "rows width"], ...]:
+    """Draw blocks of uniform numbers in `[0, 1)` in one call, as each takes a while to compile."""
+    whole = draw_uniform(key, (rows, sum(widths)))
+    return tuple(jnp.split(whole, np.cumsum(widths[:-1]), axis=1))
 
 
 def standard_normal(uniform: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

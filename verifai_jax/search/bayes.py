@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, draw_uniform, standard_normal
+from verifai_jax.search.base import Observations, Search, Wants, draw_uniform, standard_normal
 from verifai_jax.search.gaussian_process import (
     Hyper,
     Posterior,
@@ -82,8 +82,7 @@ class Bayes(Search[BayesState]):
     **Raises:** `ValueError` for values out of range.
     """
 
-    most_at_once: ClassVar[int] = 16
-    avoids_no_verdict: ClassVar[bool] = True
+    wants: ClassVar[Wants] = Wants(no_verdict_rows=True, max_batch=16)
     acquisition: str = "thompson"
     capacity: int = 512
     candidates: int = 512

@@ -14,27 +14,27 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.cube import Cube
-from verifai_jax.core.outcomes import OUTCOME
 from verifai_jax.core.user_errors import explain_user_error
-from verifai_jax.search.base import Observations, Search
+from verifai_jax.search.base import Search
 
 BATCH = 16
 """Points of a round with which the forms are checked."""
+MARKS = 4
+"""Marks of a point with which the forms are checked."""
 
 
 class SearchError(ValueError):
     """A search that breaks the contract of searches."""
 
 
-def is_own(search: Search) -> bool:
-    """Return whether a search, or a part of it, is none of this package."""
+def is_user_defined(search: Search) -> bool:
+    """Return whether a search, or a part of it, is defined outside of this package."""
     if type(search).__module__.partition(".")[0] != "verifai_jax":
         return True
     parts = [getattr(search, f.name) for f in fields(search)] if is_dataclass(search) else []
     parts = [each for part in parts for each in (part if isinstance(part, tuple) else (part,))]
-    return any(is_own(part) for part in parts if isinstance(part, Search))
+    return any(is_user_defined(part) for part in parts if isinstance(part, Search))
 
 
 def check_contract(search: Search, cube: Cube) -> None:
@@ -45,7 +45,7 @@ def check_contract(search: Search, cube: Cube) -> None:
     **Raises:** `SearchError` that names the function, and the line of the user's file where it
     raised.
     """
-    if not is_own(search):
+    if not is_user_defined(search):
         return
     key = jax.eval_shape(lambda: jax.random.key(0, impl="threefry2x32"))
     state = _form(search, "init", lambda key: search.init(key, cube, BATCH), key)
@@ -65,7 +65,7 @@ def check_contract(search: Search, cube: Cube) -> None:
         )
     _check_state(search, "ask", state, following)
     if search.learns:
-        rows = _rows(search, cube)
+        rows = search.wants.form(cube, BATCH, MARKS)
         updated = _form(search, "tell", lambda s, rows: search.tell(s, cube, rows), state, rows)
         _check_state(search, "tell", state, updated)
 
@@ -85,25 +85,6 @@ def check_points(search: Search, cube: Cube, points: Float[Any, "n d"]) -> None:
         f"row {row} {cube.names[column]} is {values[row, column]:zg}. Clip them, as in "
         "jnp.clip(points, 0, 1), or draw others where they are not finite"
     )
-
-
-def _rows(search: Search, cube: Cube) -> Observations:
-    """Return the form of what a search is told."""
-
-    def real(*shape: int) -> Any:
-        return jax.ShapeDtypeStruct(shape, jnp.float32)
-
-    points, valid = real(BATCH, cube.dim), jax.ShapeDtypeStruct((BATCH,), jnp.bool_)
-    rows = Observations(points, real(BATCH), valid, points if search.wants_gradient else None)  # pyright: ignore[reportArgumentType]
-    if search.wants_marks:
-        marks: Any = jax.ShapeDtypeStruct((BATCH, 4), jnp.int32)
-        rows = rows._replace(marks=marks)
-    if search.wants_outcomes:
-        rows = rows._replace(outcomes=real(BATCH, OUTCOME))
-    if not search.wants_clauses:
-        return rows
-    clauses, gradients = real(BATCH, CLAUSES), real(BATCH, CLAUSES, cube.dim)
-    return rows._replace(clauses=clauses, clause_gradients=gradients)
 
 
 def _form(search: Search, name: str, function: Any, *arguments: PyTree) -> Any:

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import KIND, Observations, Search, standard_normal
+from verifai_jax.search.base import KIND, Observations, Search, Wants, standard_normal
 
 STEP = 0.1
 """Standard deviation of small steps, in unit coordinates."""
@@ -75,8 +75,7 @@ class Coverage(Search[CoverageState]):
     **Raises:** `ValueError` for values out of range.
     """
 
-    wants_marks: ClassVar[bool] = True
-    most_at_once: ClassVar[int] = 64
+    wants: ClassVar[Wants] = Wants(marks=True, max_batch=64)
 
     exploration: float = 0.15
     rarity: float = 2.0

@@ -24,7 +24,13 @@ from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, draw_uniform, standard_normal
+from verifai_jax.search.base import (
+    Observations,
+    Search,
+    draw_columns,
+    keep_best,
+    standard_normal,
+)
 from verifai_jax.search.halton import halton_points
 
 MOST_CELLS = 32
@@ -115,21 +121,15 @@ class CrossEntropy(Search[CrossEntropyState]):
     def tell(
         self, state: CrossEntropyState, cube: Cube, observations: Observations
     ) -> CrossEntropyState:
-        usable = observations.usable
-        score = observations.score
-        # New points come first: of equally good ones the first, so the newest, are kept.
-        u = jnp.where(usable[:, None], observations.u, 0.5)
-        points = jnp.concatenate([u, state.elite])
-        scores = jnp.concatenate([score, state.score])
-        _, best = jax.lax.top_k(-scores, len(state.score))
-        level, before = scores[best[-1]], state.score[-1]
+        elite, score = keep_best(observations.u, observations.score, state.elite, state.score)
+        level, before = score[-1], state.score[-1]
         progress = ~jnp.isfinite(before) | (level < 0.99 * before)
         stale = jnp.where(progress, 0, state.stale + 1)
         more = MORE_PATIENCE * max(cube.dim - FEW_COORDINATES, 0)
-        again = stale >= self.patience + -(-more // len(score))
+        again = stale >= self.patience + -(-more // len(observations.rho))
         return state._replace(
-            elite=points[best],
-            score=jnp.where(again, jnp.inf, scores[best]),
+            elite=elite,
+            score=jnp.where(again, jnp.inf, score),
             stale=jnp.where(again, 0, stale).astype(jnp.int32),
         )
 
@@ -142,11 +142,8 @@ class CrossEntropy(Search[CrossEntropyState]):
             [j for j, i in enumerate(cube.discrete) if cube.levels[i] <= MOST_CELLS], np.int32
         )
         cells = cube.discrete[narrow]
-        # One call for all random numbers: each takes a while to compile.
-        random = draw_uniform(key, (batch, 1 + cube.dim + 2 * len(cells)))
-        pick, noise, draw, inherit = jnp.split(
-            random, [1, 1 + cube.dim, 1 + cube.dim + len(cells)], axis=1
-        )
+        widths = (1, cube.dim, len(cells), len(cells))
+        pick, noise, draw, inherit = draw_columns(key, batch, *widths)
         weight = jnp.isfinite(state.score).astype(jnp.float32)
         count = jnp.maximum(jnp.sum(weight), 1.0)
         # The elite is sorted: the points that exist come first.

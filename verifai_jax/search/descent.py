@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Plan, Search, nearest_to_failing
+from verifai_jax.search.base import Observations, Plan, Search, Wants, nearest_to_failing
 from verifai_jax.search.gradient import NOTHING
 from verifai_jax.search.halton import halton_points
 
@@ -86,7 +86,7 @@ class Descent(Search[DescentState]):
     hottest: float = 0.4
     coldest: float = 0.04
     patience: int = 10
-    wants_clauses: ClassVar[bool] = True
+    wants: ClassVar[Wants] = Wants(clauses=True, clause_gradients=True)
 
     def __post_init__(self) -> None:
         check_count("descents", self.descents)

@@ -19,9 +19,9 @@ rises with how well known their behaviour is (novelty search: Lehman, Stanley, A
 objectives: evolution through the search for novelty alone, Evolutionary Computation 19(2), 2011).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, TypeAlias
+from typing import ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,8 +32,9 @@ from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.outcomes import OUTCOME
-from verifai_jax.search.base import Observations, Plan, Search
+from verifai_jax.search.base import Observations, Search, Wants
 from verifai_jax.search.behaviour import SeenBehaviour, is_known
+from verifai_jax.search.wrapper import Learn, Wrapper
 
 AT_ONCE = 16
 """Failures archived in a round at most."""
@@ -61,12 +62,8 @@ class DiverseState(NamedTuple):
     seen: SeenBehaviour | None  # by behaviour alone
 
 
-_Verb: TypeAlias = Callable[[PyTree, Cube, Observations], PyTree]
-"""A way to learn of the search inside: `tell`, `warm_start` or `start_from`."""
-
-
 @dataclass(frozen=True)
-class Diverse(Search[DiverseState]):
+class Diverse(Wrapper[DiverseState]):
     """Another search, kept away from earlier failures.
 
     **Arguments:**
@@ -91,10 +88,10 @@ class Diverse(Search[DiverseState]):
     patience: int = 8
     capacity: int = 256
     by: Literal["inputs", "behaviour"] = "inputs"
+    learns: ClassVar[bool] = True  # Its archive does, whatever is inside.
 
     def __post_init__(self) -> None:
-        if not isinstance(self.search, Search):
-            raise TypeError(f"Diverse needs a search like CrossEntropy(); got {self.search!r}")
+        super().__post_init__()
         check_fraction("radius", self.radius, one=True)
         check_fraction("least_radius", self.least_radius, one=True)
         check_fraction("shrink", self.shrink, one=True)
@@ -108,28 +105,11 @@ class Diverse(Search[DiverseState]):
             )
 
     @property
-    def wants_gradient(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.search.wants_gradient
-
-    @property
-    def wants_clauses(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.search.wants_clauses
-
-    @property
-    def wants_marks(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.search.wants_marks
-
-    @property
-    def wants_outcomes(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.by == "behaviour" or self.search.wants_outcomes
-
-    @property
-    def samples_prior(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.search.samples_prior
-
-    @property
-    def most_at_once(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.search.most_at_once
+    def wants(self) -> Wants:
+        inner = self.search.wants
+        outcomes = inner.outcomes or self.by == "behaviour"
+        # A model of the traces would lead back to archived failures, of which it knows nothing.
+        return replace(inner, outcomes=outcomes, traces=None)
 
     @staticmethod
     def count(state: DiverseState) -> Int[Array, ""]:
@@ -141,26 +121,14 @@ class Diverse(Search[DiverseState]):
         """Return the distinct failures `[k, d]`, in the order of their discovery."""
         return np.asarray(state.archive)[: int(state.count)]
 
-    @property
-    def differentiates(self) -> bool:
-        return self.search.differentiates
+    def distinct(self, state: DiverseState) -> Int[Array, ""]:
+        return state.count
 
-    def stage(self, state: DiverseState | None, cube: Cube, batch: int) -> Search[DiverseState]:
-        """Return it with the stage of the search inside."""
-        inner = self.search.stage(None if state is None else state.inner, cube, batch)
-        return self if inner is self.search else replace(self, search=inner)
+    def inner_state(self, state: DiverseState) -> PyTree:
+        return state.inner
 
-    def check(self, cube: Cube) -> None:
-        self.search.check(cube)
-
-    def total(self, cube: Cube) -> int | None:
-        return self.search.total(cube)
-
-    def plan(self, state: DiverseState, cube: Cube, batch: int) -> Plan:
-        return self.search.plan(state.inner, cube, batch)
-
-    def temperature(self, state: DiverseState) -> Float[Array, ""]:
-        return self.search.temperature(state.inner)
+    def with_inner_state(self, state: DiverseState, inner: PyTree) -> DiverseState:
+        return state._replace(inner=inner)
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> DiverseState:
         own, its = jax.random.split(key)
@@ -180,27 +148,8 @@ class Diverse(Search[DiverseState]):
             seen=SeenBehaviour.nothing(self.capacity, batch) if self.by == "behaviour" else None,
         )
 
-    def ask(
-        self, state: DiverseState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], DiverseState]:
-        u, inner = self.search.ask(state.inner, cube, batch)
-        return u, state._replace(inner=inner)
-
-    def tell(self, state: DiverseState, cube: Cube, observations: Observations) -> DiverseState:
-        return self._learn(state, cube, observations, self.search.tell)
-
-    def warm_start(
-        self, state: DiverseState, cube: Cube, observations: Observations
-    ) -> DiverseState:
-        return self._learn(state, cube, observations, self.search.warm_start)
-
-    def start_from(
-        self, state: DiverseState, cube: Cube, observations: Observations
-    ) -> DiverseState:
-        return self._learn(state, cube, observations, self.search.start_from)
-
-    def _learn(
-        self, state: DiverseState, cube: Cube, observations: Observations, verb: _Verb
+    def learn(
+        self, learn: Learn, state: DiverseState, cube: Cube, observations: Observations
     ) -> DiverseState:
         usable = observations.usable
         u = jnp.where(usable[:, None], observations.u, 0.5)
@@ -249,7 +198,7 @@ class Diverse(Search[DiverseState]):
         state = state._replace(rho=jnp.where(tired, jnp.inf, state.rho))
 
         raised = self._deflate(state, cube, observations)
-        inner = verb(state.inner, cube, raised)
+        inner = learn(state.inner, cube, raised)
         if self.search.learns and self.search.total(cube) is None:
             inner = jax.lax.cond(
                 discovered | tired, lambda: self._restart(state, cube), lambda: inner

@@ -20,10 +20,15 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, draw_uniform, standard_normal
+from verifai_jax.search.base import (
+    Observations,
+    Search,
+    draw_columns,
+    keep_best,
+    standard_normal,
+)
+from verifai_jax.search.moves import all_or_some, has_fine_cells
 
-# More ordered cells than this are moved by noise, as if continuous.
-MOST_CELLS = 8
 SINGLE_STD = 0.1  # of the noise around a single best point, in unit coordinates
 REMEMBERED = 64  # draws of the prior, for the median
 RECOMBINED = 0.3  # share of greedy draws with a second parent
@@ -101,11 +106,7 @@ class EpsilonGreedy(Search[EpsilonGreedyState]):
     ) -> tuple[Float[Array, "batch d"], EpsilonGreedyState]:
         key = jax.random.fold_in(state.key, state.asks)
         d, k = cube.dim, len(cube.discrete)
-        # One call for all random numbers: each takes a while to compile.
-        random = draw_uniform(key, (batch, 5 + 4 * d + k))
-        row, prior, noise, inherit, move, choice = jnp.split(
-            random, 5 + np.array([0, d, 2 * d, 3 * d, 4 * d]), axis=1
-        )
+        row, prior, noise, inherit, move, choice = draw_columns(key, batch, 5, d, d, d, d, k)
         # Only those that are better than chance are parents; they are sorted.
         good = (state.score < self._median(state)).astype(jnp.float32)
         count = jnp.sum(good)
@@ -119,14 +120,11 @@ class EpsilonGreedy(Search[EpsilonGreedyState]):
         # A single one does not show any.
         std = jnp.where(count >= 2, jnp.maximum(std, self.least_std), SINGLE_STD)
         factor = self.reach * NARROWEST_NOISE ** row[:, 3:4]
-        # Half of the draws move a few coordinates only, at least one of them on average.
-        moved = move < jnp.where(row[:, 4:5] < 0.5, 1.0, max(0.3, 1 / max(d, 1)))
         step = factor * std * standard_normal(noise)
-        u = jnp.clip(parent + jnp.where(moved, step, 0.0), 0.0, 1.0)
+        step = jnp.where(all_or_some(row[:, 4:5], move), step, 0.0)
+        u = jnp.clip(parent + step, 0.0, 1.0)
 
-        many = np.array(
-            [cube.ordered[i] and cube.levels[i] > MOST_CELLS for i in cube.discrete], bool
-        )
+        many = has_fine_cells(cube)
         cell = jnp.where(many, cube.cells(u), cube.cells(parent))
         cell = jnp.where((choice < RESAMPLED) & ~many, cube.cells(prior), cell)
         u = u.at[:, cube.discrete].set(cube.centres(cell))
@@ -179,16 +177,13 @@ class EpsilonGreedy(Search[EpsilonGreedyState]):
         self, state: EpsilonGreedyState, u: Float[Array, "n d"], score: Float[Array, " n"]
     ) -> EpsilonGreedyState:
         """Update the best points, and count the points without progress."""
-        points = jnp.concatenate([jnp.where(jnp.isinf(score)[:, None], 0.5, u), state.best])
-        # New points come first: of equally good ones the newest are kept.
-        scores = jnp.concatenate([score, state.score])
-        _, best = jax.lax.top_k(-scores, len(state.score))
-        level, before = scores[best[-1]], state.score[-1]
+        best, scores = keep_best(u, score, state.best, state.score)
+        level, before = scores[-1], state.score[-1]
         # By a hundredth of what is between them and the prior, wherever zero is.
         far = jnp.maximum(self._median(state) - before, 0.0)
         progress = jnp.isinf(before) | (level < before - 0.01 * far)
         stale = jnp.where(progress, 0, state.stale + len(score)).astype(jnp.int32)
-        return state._replace(best=points[best], score=scores[best], stale=stale)
+        return state._replace(best=best, score=scores, stale=stale)
 
     def _exploring(self, state: EpsilonGreedyState, batch: int) -> Bool[Array, " batch"]:
         """Return the rows of the next `tell` from the prior: every tenth, say, or all at first."""

@@ -38,6 +38,7 @@ from verifai_jax.search.base import (
     Observations,
     Plan,
     Search,
+    Wants,
     choose,
     draw_uniform,
     nearest_to_failing,
@@ -129,7 +130,7 @@ class Gradient(Search[GradientState]):
     patience: int = 4
     temperatures: tuple[float, ...] = (0.002, 0.05, 0.2)
     coldest: float = 0.001
-    wants_clauses: ClassVar[bool] = True
+    wants: ClassVar[Wants] = Wants(clauses=True, clause_gradients=True)
 
     def __post_init__(self) -> None:
         check_count("descents", self.descents)

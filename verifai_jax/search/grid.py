@@ -52,6 +52,7 @@ class Grid(Search[GridState]):
 
     points: int | tuple[int, ...] = 21
     learns: ClassVar[bool] = False
+    sequence: ClassVar[tuple[str, str]] = "grid", "in a random order over the whole of it"
 
     def __post_init__(self) -> None:
         if isinstance(self.points, tuple):

@@ -24,7 +24,13 @@ from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, draw_uniform, standard_normal
+from verifai_jax.search.base import (
+    Observations,
+    Search,
+    draw_columns,
+    keep_best,
+    standard_normal,
+)
 
 PARENTS = 4
 """Best points that are mutated; each half as often as the one before. Of failures all are."""
@@ -110,11 +116,7 @@ class Mutation(Search[MutationState]):
     ) -> tuple[Float[Array, "batch d"], MutationState]:
         d = cube.dim
         key = jax.random.fold_in(state.key, state.round)
-        # One call for all random numbers: each takes a while to compile.
-        random = draw_uniform(key, (batch, 16 + 4 * d))
-        coins, values, cuts, masks, noise = jnp.split(
-            random, [16, 16 + d, 16 + 2 * d, 16 + 3 * d], 1
-        )
+        coins, values, cuts, masks, noise = draw_columns(key, batch, 16, d, d, d, d)
         idle = jnp.minimum(state.stale / self.idle, 1.0)
         fresh = _explore(cube, coins[:, 0], coins[:, 1], coins[:, 14], idle, values, cuts)
         changed = self._mutate(state, cube, coins[:, 2:], values, masks, standard_normal(noise))
@@ -129,19 +131,15 @@ class Mutation(Search[MutationState]):
 
     def tell(self, state: MutationState, cube: Cube, observations: Observations) -> MutationState:
         # Of failures, which are equally good, the worst are kept, and of equal ones the newest.
-        score = jnp.where(observations.usable, observations.rho, jnp.inf)
-        points = jnp.concatenate(
-            [jnp.where(observations.usable[:, None], observations.u, 0.5), state.points]
-        )
-        scores = jnp.concatenate([score, state.score])
-        _, best = jax.lax.top_k(-scores, self.kept)
+        new = jnp.where(observations.usable, observations.rho, jnp.inf)
+        points, score = keep_best(observations.u, new, state.points, state.score)
         usable = jnp.sum(observations.usable).astype(jnp.int32)
-        progress = jnp.maximum(scores[best[0]], 0.0) < 0.999 * state.score[0]
+        progress = jnp.maximum(score[0], 0.0) < 0.999 * state.score[0]
         stale = jnp.where(progress, 0, state.stale + usable)
         again = stale >= self.patience
         return state._replace(
-            points=points[best],
-            score=jnp.where(again, jnp.inf, scores[best]),
+            points=points,
+            score=jnp.where(again, jnp.inf, score),
             verdicts=jnp.where(again, 0, state.verdicts + usable),
             stale=jnp.where(again, 0, stale),
         )

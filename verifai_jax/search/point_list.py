@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search
+from verifai_jax.search.base import Observations, Origin, Search
 
 
 class PointListState(NamedTuple):
@@ -30,6 +30,7 @@ class PointList(Search[PointListState]):
 
     points: Float[Array | np.ndarray, "n d"] | Sequence[Sequence[float]]
     learns: ClassVar[bool] = False
+    origin: ClassVar[Origin] = "given"
 
     def __post_init__(self) -> None:
         points = np.asarray(self.points, np.float32)

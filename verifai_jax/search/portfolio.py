@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Plan, Search, choose
+from verifai_jax.search.base import Observations, Plan, Search, Wants, choose
 from verifai_jax.search.cross_entropy import CrossEntropy, CrossEntropyState
 from verifai_jax.search.gradient import NOTHING, Gradient, GradientState
 from verifai_jax.search.interior import (
@@ -38,6 +38,7 @@ from verifai_jax.search.interior import (
     waits,
 )
 from verifai_jax.search.mutation import FEW, Mutation, MutationState
+from verifai_jax.search.wrapper import Wrapper
 
 GRADIENT, MUTATION, CROSS_ENTROPY = range(3)
 """Numbers of the members."""
@@ -103,12 +104,13 @@ class Portfolio(Search[PortfolioState]):
     gradients: bool = True
 
     @property
-    def wants_clauses(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.gradients
+    def wants(self) -> Wants:
+        return Wants(clauses=self.gradients, clause_gradients=self.gradients)
 
-    def without_gradients(self) -> "Portfolio":
-        """Return the same search without gradients."""
-        return replace(self, gradients=False)
+    @property
+    def fallback(self) -> "Portfolio | None":
+        """The same search without gradients."""
+        return replace(self, gradients=False) if self.gradients else None
 
     def _differentiates(self, cube: Cube) -> bool:
         return self.gradients and len(cube.continuous) > 0
@@ -354,38 +356,27 @@ class Portfolio(Search[PortfolioState]):
 
 
 @dataclass(frozen=True)
-class PortfolioStage(Search[PortfolioState]):
+class PortfolioStage(Wrapper[PortfolioState]):
     """Some members of a portfolio, with the states of all.
 
-    - `whole`: the portfolio.
+    **Arguments:**
+
+    - `search`: the whole portfolio.
     - `descends`: whether short descents take part, or neither these nor those into the interior.
     """
 
-    whole: Portfolio
+    search: Search[PortfolioState]
     descends: bool
 
     @property
-    def wants_clauses(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.whole.wants_clauses
+    def wants(self) -> Wants:
+        return replace(self.search.wants, clause_gradients=self.descends)
 
-    @property
-    def differentiates(self) -> bool:
-        return self.descends
-
-    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> PortfolioState:
-        return self.whole.init(key, cube, batch)
-
-    def ask(
-        self, state: PortfolioState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], PortfolioState]:
-        u, following = self.whole.ask(self._own(state), cube, batch)
-        return u, self._all(following, state)
-
-    def plan(self, state: PortfolioState, cube: Cube, batch: int) -> Plan:
-        return self.whole.plan(self._own(state), cube, batch)
+    def stage(self, state: PortfolioState | None, cube: Cube, batch: int) -> Search[PortfolioState]:
+        return self
 
     def tell(self, state: PortfolioState, cube: Cube, observations: Observations) -> PortfolioState:
-        learned = self._all(self.whole.tell(self._own(state), cube, observations), state)
+        learned = super().tell(state, cube, observations)
         if state.interior is None:
             return learned
         rows = jnp.sum(state.rows)
@@ -395,24 +386,20 @@ class PortfolioStage(Search[PortfolioState]):
         waiting = wait(state.interior, jnp.where(told, score, jnp.inf), spent)
         return learned._replace(interior=waiting)
 
-    def warm_start(
-        self, state: PortfolioState, cube: Cube, observations: Observations
-    ) -> PortfolioState:
-        return self._all(self.whole.warm_start(self._own(state), cube, observations), state)
-
     def start_from(
         self, state: PortfolioState, cube: Cube, observations: Observations
     ) -> PortfolioState:
-        return self.whole.start_from(state, cube, observations)
+        # Whoever suggests a start wants descents from it, which are then in the next stage.
+        return self.search.start_from(state, cube, observations)
 
-    def _own(self, state: PortfolioState) -> PortfolioState:
+    def inner_state(self, state: PortfolioState) -> PortfolioState:
         """Return the state without the members that do not take part."""
         return state._replace(interior=None, gradient=state.gradient if self.descends else None)
 
-    def _all(self, state: PortfolioState, before: PortfolioState) -> PortfolioState:
-        """Return it with these as they were before."""
-        gradient = state.gradient if self.descends else before.gradient
-        return state._replace(interior=before.interior, gradient=gradient)
+    def with_inner_state(self, state: PortfolioState, inner: PortfolioState) -> PortfolioState:
+        """Return the state after a round, with the other members as they were before."""
+        gradient = inner.gradient if self.descends else state.gradient
+        return inner._replace(interior=state.interior, gradient=gradient)
 
 
 def _common(observations: Observations) -> Observations:

@@ -28,8 +28,8 @@ from verifai_jax.core.cube import Cube
 from verifai_jax.core.fingerprint import identity
 from verifai_jax.core.outcomes import OUTCOME
 from verifai_jax.core.remembered import lower_or_recall, remembered_as
-from verifai_jax.search import Diverse, Observations, Plan, Search
-from verifai_jax.search.contract import check_points, is_own
+from verifai_jax.search.base import Observations, Plan, Search
+from verifai_jax.search.contract import check_points, is_user_defined
 from verifai_jax.search.repetition import Repetition
 
 TRIES = 32
@@ -68,11 +68,11 @@ class Proposals:
         self.total = search.total(self.cube)
         self.proposed = self.accepted = 0
         self.cut = False
-        self._marks = marks if search.wants_marks else 0
+        self._marks = marks if search.wants.marks else 0
         self._improve = improve
         self.stage = search.stage(None, self.cube, batch)
         self._program = compiled_search(self.stage, self.cube, batch, self._marks)
-        self._checked = is_own(search)
+        self._checked = is_user_defined(search)
         self._accepts = accepts
         if self._accepts is not None:
             # Compiled now, in the shape that it will be asked in.
@@ -94,9 +94,10 @@ class Proposals:
         return self.total is not None and self.proposed >= self.total and not len(self._queue)
 
     @property
-    def distinct(self) -> int:
-        """Number of failures far from each other, of a search for diverse ones."""
-        return int(Diverse.count(self._state))
+    def distinct(self) -> int | None:
+        """Number of failures far from each other; None for a search that does not count them."""
+        count = self.search.distinct(self._state)
+        return None if count is None else int(count)
 
     @property
     def differentiate(self) -> bool:
@@ -154,9 +155,9 @@ class Proposals:
         """
         if not self.search.learns:
             return
-        if self.search.avoids_no_verdict and valid.any():
+        if self.search.wants.no_verdict_rows and valid.any():
             self._greatest = float(np.max(rho[valid], initial=self._greatest))
-        if self.search.avoids_no_verdict and math.isfinite(self._greatest):
+        if self.search.wants.no_verdict_rows and math.isfinite(self._greatest):
             rho, valid = np.where(valid, rho, np.float32(self._greatest)), np.ones(len(rho), bool)
         observations = Observations(
             u=self._points,
@@ -164,7 +165,7 @@ class Proposals:
             valid=self._spread(valid, False),
             gradient=None if gradient is None else self._spread(gradient, 0.0),
         )
-        if self.search.wants_clauses:
+        if self.search.wants.clauses:
             none = np.zeros((len(rho), CLAUSES, self.cube.dim), np.float32)
             if clauses is None:
                 # Every goal has one, whose value is the robustness.
@@ -176,10 +177,10 @@ class Proposals:
                     none if clause_gradients is None else clause_gradients, 0.0
                 ),
             )
-        if self.search.wants_marks:
+        if self.search.wants.marks:
             whole = np.zeros((len(rho), 0), np.int32) if marks is None else marks
             observations = observations._replace(marks=self._spread(whole, -1))
-        if self.search.wants_outcomes:
+        if self.search.wants.outcomes:
             unknown = np.full((len(rho), OUTCOME), np.nan, np.float32)
             known = unknown if outcomes is None else outcomes
             observations = observations._replace(outcomes=self._spread(known, np.nan))
@@ -187,7 +188,7 @@ class Proposals:
 
     def tell_refused(self) -> None:
         """Let the search know that no row of the last round could be simulated."""
-        gradient = np.zeros((0, self.cube.dim), np.float32) if self.search.wants_gradient else None
+        gradient = np.zeros((0, self.cube.dim), np.float32) if self.search.wants.gradient else None
         marks = np.zeros((0, self._marks), np.int32)
         self.tell(np.zeros(0, np.float32), np.zeros(0, bool), gradient, marks=marks)
 
@@ -234,7 +235,7 @@ class Proposals:
                 rho=np.pad(values.astype(np.float32), (0, missing), constant_values=np.nan),  # pyright: ignore[reportArgumentType]
                 valid=np.arange(self.batch) < len(part),  # pyright: ignore[reportArgumentType]
             )
-            if self.search.wants_outcomes:
+            if self.search.wants.outcomes:
                 whole = np.full((self.batch, OUTCOME), np.nan, np.float32)
                 if outcomes is not None:
                     whole[: len(part)] = outcomes[start : start + self.batch]
@@ -268,7 +269,7 @@ class Proposals:
             **{f"search.{i}": leaf for i, leaf in enumerate(leaves)},
             "queue": self._queue,
             "counts": np.array([self.proposed, self.accepted], np.int64),
-            **({"greatest": np.array(self._greatest)} if self.search.avoids_no_verdict else {}),
+            **({"greatest": np.array(self._greatest)} if self.search.wants.no_verdict_rows else {}),
             **({} if self._repetition is None else {"simulated": self._repetition.codes}),
         }
 
@@ -343,7 +344,7 @@ class Proposals:
             points = self._improve(points)
         self._plan = None
         planned = len(points)
-        if self.search.wants_clauses:
+        if self.search.wants.clauses:
             plan: Plan = self._program.plan(self._state)
             self._plan, planned = plan, int(plan.rows)
         self.proposed += planned
@@ -409,7 +410,7 @@ its programs are large, and then run nearly as fast."""
 
 def effort_of(search: Search, batch: int) -> Effort:
     """Return how much is done to make the programs of a search fast."""
-    return "least" if search.wants_clauses and batch <= SMALL else "little"
+    return "least" if search.wants.clauses and batch <= SMALL else "little"
 
 
 class SearchProgram(NamedTuple):
@@ -436,7 +437,7 @@ def compiled_search(
     state: Any = begun.out_info
     states = jax.tree.structure(state)
     # What a search of this package does follows from its options; a user's may do anything.
-    kept = None if is_own(search) else identity(search, cube, batch, marks)
+    kept = None if is_user_defined(search) else identity(search, cube, batch, marks)
 
     def compiled(verb: str, function: Callable[..., Any], *arguments: PyTree, form: Any) -> Any:
         name = remembered_as(f"search-{verb}", kept, verb)
@@ -444,37 +445,23 @@ def compiled_search(
         return compile_soon("the search", lowered, effort_of(search, batch))
 
     # What takes longest to compile begins first.
-    points: Any = jax.ShapeDtypeStruct((batch, cube.dim), jnp.float32)
     asked = jax.tree.structure((0, jax.tree.unflatten(states, [0] * states.num_leaves)))
     ask = compiled("ask", lambda state: search.ask(state, cube, batch), state, form=asked)
     init: Any = None
     if begins:
         init = compile_soon("the search", begun.lower(), effort_of(search, batch))
-    rho: Any = jax.ShapeDtypeStruct((batch,), jnp.float32)
-    valid: Any = jax.ShapeDtypeStruct((batch,), jnp.bool_)
-    observations = Observations(points, rho, valid, points if search.wants_gradient else None)
-    if search.wants_marks:
-        form: Any = jax.ShapeDtypeStruct((batch, marks), jnp.int32)
-        observations = observations._replace(marks=form)
-    if search.wants_outcomes:
-        happened: Any = jax.ShapeDtypeStruct((batch, OUTCOME), jnp.float32)
-        observations = observations._replace(outcomes=happened)
     plan: Any = None
-    if search.wants_clauses:
-        observations = observations._replace(
-            clauses=jax.ShapeDtypeStruct((batch, CLAUSES), jnp.float32),
-            clause_gradients=jax.ShapeDtypeStruct((batch, CLAUSES, cube.dim), jnp.float32),
-        )
+    if search.wants.clauses:
         form = jax.tree.structure(Plan(0, 0, 0))  # pyright: ignore[reportArgumentType]
         plan = compiled("plan", lambda state: search.plan(state, cube, batch), state, form=form)
     tell: Any = None
     if search.learns:
         tell = compiled(
-            "tell", lambda state, rows: search.tell(state, cube, rows), state, observations,
-            form=states,
+            "tell", lambda state, rows: search.tell(state, cube, rows), state,
+            search.wants.form(cube, batch, marks), form=states,
         )  # fmt: skip
     temperature: Any = lambda state: 1.0  # noqa: E731
-    if search.wants_gradient:
+    if search.wants.gradient:
         form = jax.tree.structure(0)
         temperature = compiled("temperature", search.temperature, state, form=form)
     return SearchProgram(init, ask, tell, temperature, plan)

@@ -16,19 +16,20 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NoReturn, TypeAlias
 
-from jaxtyping import Array, Float, Key, PyTree
+from jaxtyping import PyTree
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search
+from verifai_jax.search.base import Search
 from verifai_jax.search.portfolio import Portfolio
+from verifai_jax.search.wrapper import Wrapper
 
 Suggest: TypeAlias = Callable[[dict[str, Any]], Iterable[Mapping[str, Any]]]
 """A function of a question, plain data as of JSON, that returns features by name, several times."""
 
 
 @dataclass(frozen=True)
-class Suggested(Search[PyTree]):
+class Suggested(Wrapper[PyTree]):
     """Another search, to which a function gives points on the way.
 
     **Arguments:**
@@ -100,15 +101,6 @@ class Suggested(Search[PyTree]):
             f"{self.search!r} inside"
         )
 
-    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> PyTree:
-        return self.search.init(key, cube, batch)
-
-    def ask(self, state: PyTree, cube: Cube, batch: int) -> tuple[Float[Array, "batch d"], PyTree]:
-        return self.search.ask(state, cube, batch)
-
-    def tell(self, state: PyTree, cube: Cube, observations: Observations) -> PyTree:
-        return self.search.tell(state, cube, observations)
-
     def __repr__(self) -> str:
         return f"Suggested({self.source}, {self.search!r})"
 
@@ -125,3 +117,10 @@ class Absent:
             f"the suggestions of this run came from {self.source}, which a record does not hold; "
             "give it: resume(..., search=vj.search.Suggested(function, ...))"
         )
+
+
+def without_suggestions(search: Any) -> tuple[Suggested | None, Any]:
+    """Return a search that asks for suggestions, None if this one does not, and the one inside."""
+    if isinstance(search, Suggested):
+        return search, search.search
+    return None, search

@@ -7,19 +7,17 @@ where the property would be broken. Whoever runs it gives it the traces and the 
 own in any case, in case the model is wrong.
 """
 
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
 
-from jaxtyping import Array, Float, Key
-
-from verifai_jax.core.checks import check_count, check_fraction
-from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search
+from verifai_jax.search.base import TraceOptions, Wants
 from verifai_jax.search.turbo import TuRBO, TuRBOState
+from verifai_jax.search.wrapper import Wrapper
+
+MAX_BATCH = 8
 
 
 @dataclass(frozen=True)
-class TraceSurrogate(Search[TuRBOState]):
+class TraceSurrogate(TraceOptions, Wrapper[TuRBOState]):
     """Model of the traces, monitored and descended on; the real system decides.
 
     **Arguments:**
@@ -33,35 +31,16 @@ class TraceSurrogate(Search[TuRBOState]):
     **Raises:** `ValueError` for values out of range.
     """
 
-    most_at_once: ClassVar[int] = 8
-    initial: int = 8
-    share: float = 0.75
-    capacity: int = 512
-    starts: int = 16
-    steps: int = 40
-
-    def __post_init__(self) -> None:
-        check_count("initial", self.initial, 2)
-        check_fraction("share", self.share, one=True)
-        check_count("capacity", self.capacity, 16)
-        check_count("starts", self.starts)
-        check_count("steps", self.steps)
-
     @property
-    def without_traces(self) -> TuRBO:
-        """The search that it is where there are no traces."""
+    def search(self) -> TuRBO:
+        """The search that it is without traces."""
         return TuRBO(initial=self.initial, capacity=self.capacity)
 
-    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> TuRBOState:
-        return self.without_traces.init(key, cube, batch)
+    @property
+    def fallback(self) -> TuRBO:
+        return self.search
 
-    def ask(
-        self, state: TuRBOState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], TuRBOState]:
-        return self.without_traces.ask(state, cube, batch)
-
-    def tell(self, state: TuRBOState, cube: Cube, observations: Observations) -> TuRBOState:
-        return self.without_traces.tell(state, cube, observations)
-
-    def warm_start(self, state: TuRBOState, cube: Cube, observations: Observations) -> TuRBOState:
-        return self.without_traces.warm_start(state, cube, observations)
+    @property
+    def wants(self) -> Wants:
+        options = TraceOptions(self.initial, self.share, self.capacity, self.starts, self.steps)
+        return replace(self.search.wants, traces=options, max_batch=MAX_BATCH)

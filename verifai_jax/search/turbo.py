@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, draw_uniform
+from verifai_jax.search.base import Observations, Search, Wants, draw_uniform
 from verifai_jax.search.gaussian_process import Hyper
 from verifai_jax.search.halton import halton_points
 from verifai_jax.search.process_data import (
@@ -84,8 +84,7 @@ class TuRBO(Search[TuRBOState]):
     **Raises:** `ValueError` for values out of range.
     """
 
-    most_at_once: ClassVar[int] = 16
-    avoids_no_verdict: ClassVar[bool] = True
+    wants: ClassVar[Wants] = Wants(no_verdict_rows=True, max_batch=16)
     capacity: int = 512
     candidates: int = 1024
     initial: int = 12

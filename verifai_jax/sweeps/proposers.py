@@ -9,7 +9,6 @@ Proposers look for the least `objective`: failure rate first, then worst robustn
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -17,9 +16,8 @@ import numpy as np
 from verifai_jax import search as searches
 from verifai_jax.core.cores import available_cores
 from verifai_jax.core.keys import run_keys
-from verifai_jax.falsification.validation import needs_gradient
 from verifai_jax.features import FeatureSpace
-from verifai_jax.search import Portfolio, Search
+from verifai_jax.search import Search
 from verifai_jax.search.proposals import Proposals
 from verifai_jax.sweeps.hyperparameters import Hyperparameters, values_at
 from verifai_jax.sweeps.optuna import OptunaSampler
@@ -92,9 +90,9 @@ def make_proposer(
             f"search must be a name, a Search or an OptunaSampler; got {search!r}. "
             f"Names: {', '.join(searches.names())}, optuna:tpe"
         )
-    if isinstance(search, Portfolio):
-        search = replace(search, gradients=False)
-    if needs_gradient(search):
+    if search.wants.derivatives and search.fallback is not None:
+        search = search.fallback
+    if search.needs_derivatives:
         raise ValueError(
             f"search {search!r} needs gradients, which trainings do not have; "
             "use one that does not, such as 'halton' or 'bayes'"

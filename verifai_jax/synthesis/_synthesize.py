@@ -447,8 +447,7 @@ def attack_search(problem: Problem, search: str | Search, loop: Parametric) -> S
     if not isinstance(checked, Search):
         raise TypeError(f"attack must be a name or a search like CrossEntropy(); got {search!r}")
     checked.check(loop.environment.cube)
-    clauses = bool(getattr(checked, "wants_clauses", False))
-    if clauses or (checked.wants_gradient and not loop.differentiable):
+    if checked.wants.clauses or (checked.wants.gradient and not loop.differentiable):
         raise ValueError(
             f"attack {checked!r} needs gradients that are not available here; use a search that "
             "needs none, such as 'cross_entropy', whose worst environments are followed downhill "

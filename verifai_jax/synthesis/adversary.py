@@ -109,7 +109,7 @@ def attack(
         if not len(points):
             break
         points = region.project(points)
-        warm = float(proposals.temperature) if search.wants_gradient else None
+        warm = float(proposals.temperature) if search.wants.gradient else None
         pairs = loop.evaluate(theta[None], points, warm)
         parts.append((points, pairs))
         # A pair that cannot happen tells the search nothing.

@@ -1,0 +1,183 @@
+"""What a search wants of the loop, and wrappers that pass on all that they do not change."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from checked_types import unchecked
+
+import verifai_jax as vj
+from verifai_jax.core.cube import Cube
+from verifai_jax.search import (
+    Bayes,
+    Coverage,
+    CrossEntropy,
+    Diverse,
+    Gradient,
+    Grid,
+    Halton,
+    Observations,
+    PointList,
+    Portfolio,
+    Search,
+    Split,
+    TraceSurrogate,
+    TuRBO,
+    Uniform,
+    Wants,
+    Wrapper,
+    named,
+    names,
+)
+from verifai_jax.testing import check_search
+
+CUBE = Cube((0, 0))
+
+
+@dataclass(frozen=True)
+class Rounded(Wrapper):
+    """Another search, whose points are rounded to two digits."""
+
+    search: Search
+
+    def ask(self, state, cube, batch):
+        u, state = super().ask(state, cube, batch)
+        return jnp.round(u, 2), state
+
+
+DERIVED = {"needs_derivatives"}
+"""Members of a search that follow from others."""
+
+
+def members(kind: type) -> set[str]:
+    return {name for name in vars(kind) if not name.startswith("_")}
+
+
+def test_a_wrapper_forwards_every_member_of_a_search():
+    assert members(Search) - DERIVED <= members(Wrapper)
+
+
+@pytest.mark.parametrize("name", names())
+def test_around_any_search_a_wrapper_is_what_that_one_is(name):
+    search = named(name)
+    around = Rounded(search)
+    for each in ("wants", "learns", "samples_prior", "origin", "sequence", "needs_derivatives"):
+        assert getattr(around, each) == getattr(search, each)
+    inner = search.fallback
+    assert around.fallback == (None if inner is None else Rounded(inner))
+    assert around.stage(None, CUBE, 8) == Rounded(search.stage(None, CUBE, 8)) or (
+        around.stage(None, CUBE, 8) is around
+    )
+
+
+@pytest.mark.parametrize("name", names())
+def test_a_search_kept_away_from_failures_wants_what_it_is_around_wants(name):
+    wants = named(name).wants
+    for by in ("inputs", "behaviour"):
+        around = Diverse(named(name), by=by).wants
+        assert around.no_verdict_rows == wants.no_verdict_rows
+        assert around.max_batch == wants.max_batch
+        assert around.outcomes == (by == "behaviour")
+        assert around.traces is None
+        assert around.only(FULL)._fields == wants.only(FULL)._fields
+
+
+FULL = Wants(gradient=True, clauses=True, marks=True, outcomes=True).form(CUBE, 4, 2)
+
+
+def test_observations_have_what_is_wanted():
+    nothing = Wants().only(FULL)
+    assert [name for name, each in nothing._asdict().items() if each is not None] == [
+        "u",
+        "rho",
+        "valid",
+    ]
+    clauses = Wants(clauses=True).form(CUBE, 4, 2)
+    assert clauses.clauses is not None
+    assert clauses.clause_gradients is not None
+    assert clauses.gradient is None
+    assert Wants(marks=True).form(CUBE, 4, 2).marks.shape == (4, 2)
+
+
+def test_two_searches_want_what_either_does_in_the_smaller_rounds():
+    both = Coverage().wants | Bayes().wants
+    assert both == Wants(marks=True, no_verdict_rows=True, max_batch=16)
+
+
+def test_parts_of_a_space_get_what_each_wants():
+    class Noting(Search):
+        seen: ClassVar[list[Observations]] = []
+        wants: ClassVar[Wants] = Wants(marks=True)
+
+        def init(self, key, cube, batch):
+            return ()
+
+        def ask(self, state, cube, batch):
+            return jnp.full((batch, cube.dim), 0.5), state
+
+        def tell(self, state, cube, observations):
+            self.seen.append(observations)
+            return state
+
+    cube = Cube((0, 0), names=("x", "y"))
+    search = Split({"x": Noting()}, Portfolio())
+    assert search.wants == Wants(clauses=True, clause_gradients=True, marks=True)
+    plain = Split({"x": Noting()}, CrossEntropy())
+    import jax
+
+    state = plain.init(jax.random.key(0), cube, 4)
+    marks = jnp.arange(8).reshape(4, 2)
+    told = Observations(jnp.full((4, 2), 0.25), jnp.ones(4), jnp.ones(4, bool), marks=marks)
+    plain.tell(state, cube, told)
+    (seen,) = Noting.seen
+    assert seen.u.shape == (4, 1)
+    np.testing.assert_array_equal(seen.marks, marks)
+
+
+def test_what_takes_the_place_of_a_search():
+    without = Portfolio(gradients=False)
+    assert Portfolio().fallback == without
+    assert without.fallback is None
+    assert Gradient().fallback is None
+    assert TraceSurrogate(initial=5).fallback == TuRBO(initial=5)
+    assert Diverse(Portfolio()).fallback == Diverse(without)
+    assert Split({"x": Portfolio()}, Halton()).fallback == Split({"x": without}, Halton())
+    assert Split({"x": Gradient()}, Portfolio()).fallback is None
+    assert Split({"x": Uniform()}, Halton()).fallback is None
+    assert Gradient().needs_derivatives
+    assert Split({"x": Gradient()}, Portfolio()).needs_derivatives
+    assert not Diverse(Portfolio()).needs_derivatives
+
+
+def test_a_wrapper_of_given_points_is_one_of_given_points():
+    assert Rounded(PointList([[0.5, 0.5]])).origin == "given"
+    assert Rounded(Grid(3)).sequence[0] == "grid"
+
+
+def test_a_wrapper_needs_a_search():
+    with (
+        unchecked(),
+        pytest.raises(TypeError, match=r"Rounded needs a search like CrossEntropy\(\); got 'ce'"),
+    ):
+        Rounded("ce")
+
+
+@pytest.mark.thorough
+def test_a_wrapper_keeps_the_contract():
+    check_search(Rounded(CrossEntropy()), CUBE)
+
+
+@pytest.mark.thorough
+def test_a_diverse_portfolio_does_without_gradients_of_a_black_box():
+    space = vj.FeatureSpace({"x": vj.Box(-1, 1)})
+
+    @vj.blackbox
+    def system(features):
+        return vj.Trace({"z": np.full(3, features["x"])}, dt=1.0)
+
+    problem = vj.Problem("black", space, system, "always (z > -0.5)")
+    run = vj.falsify(problem, Diverse(Portfolio()), 24, batch=8, progress=False)
+    assert run.search == repr(Diverse(Portfolio(gradients=False)))
+    assert any("without gradients: the system is a black box" in note for note in run.notes)

@@ -1,0 +1,25 @@
+"""Moves from one point to another, of the searches that step from the points that they know."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from verifai_jax.core.cube import Cube
+
+MAX_CELLS = 8
+"""Ordered cells up to which a coordinate is discrete; more are stepped over as if continuous."""
+
+
+def has_fine_cells(cube: Cube) -> Bool[np.ndarray, " discrete"]:
+    """Return which discrete coordinates have so many ordered cells that noise moves them."""
+    return np.array([cube.ordered[i] and cube.levels[i] > MAX_CELLS for i in cube.discrete], bool)
+
+
+def all_or_some(coin: Float[Array, "n 1"], mask: Float[Array, "n d"]) -> Bool[Array, "n d"]:
+    """Return which coordinates move: in every second row all, else a third, or one on average.
+
+    **Arguments:**
+
+    - `coin`, `mask`: uniform random numbers.
+    """
+    return mask < jnp.where(coin < 0.5, 1.0, max(0.3, 1 / max(mask.shape[1], 1)))
