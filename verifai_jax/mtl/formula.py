@@ -12,15 +12,15 @@ is written, and restored when it is printed. What is said of an operator stands 
 `Window` over time, a `Witness` with what holds up to it, or `Derived` from other operators.
 """
 
+import abc
 import html
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import ClassVar, TypeAlias, Union
 
 from verifai_jax.core.lazy import late
-from verifai_jax.mtl.node import Node, missing_case
+from verifai_jax.mtl.node import Node
 from verifai_jax.mtl.tree import EVERYTHING as EVERYTHING
 from verifai_jax.mtl.tree import Interval as Interval
 from verifai_jax.mtl.tree import Term as Term
@@ -343,16 +343,16 @@ class Since(Witness):
     word = "since"
 
 
-class Derived(Formula):
+class Derived(Formula, abc.ABC):
     """An operator whose meaning is a formula of other operators, which gives it every semantics.
 
     A subclass has its operands and its interval as fields, and defines `meaning`.
     """
 
-    @cached_property
+    @property
+    @abc.abstractmethod
     def meaning(self) -> Formula:
         """The formula of other operators that it stands for."""
-        raise missing_case("the meaning", self)
 
     @property
     def side(self) -> str:
