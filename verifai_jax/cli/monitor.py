@@ -17,7 +17,8 @@ from verifai_jax.core.text import printable
 
 if TYPE_CHECKING:
     from verifai_jax.core.trace import Trace
-    from verifai_jax.mtl import Formula
+    from verifai_jax.mtl.columns import LeftOut
+from verifai_jax.mtl import Formula
 
 
 @command()
@@ -97,7 +98,7 @@ def monitor(
             raise
         click.echo(f"{'holds' if holds else 'fails'} with robustness {rho:z.10g}")
         for note in trace.notes:
-            if any(repr(name) in note for name in parsed.signals()):
+            if isinstance(note, LeftOut) and note.column in parsed.signals():
                 click.echo(f"note: {printable(note)}")
         if explain or plot is not None:
             why = mtl.explain(parsed, trace, end=end)

@@ -129,7 +129,7 @@ def describe_reversals(matter: Sequence[Influence], rho: float) -> list[str]:
             f"{'raises' if change > 0 else 'lowers'} the robustness by {format_number(abs(change))}"
         )
         sentences.append(
-            f"{_capital(_named(i))} back at nominal ({_usual(i)}) {how} and is not enough alone."
+            f"{_named(i, begins=True)} back at nominal ({_usual(i)}) {how} and is not enough alone."
         )
     return sentences
 
@@ -185,17 +185,14 @@ def describe_gradient(influences: Sequence[Influence]) -> str:
     )
 
 
-def _named(i: Influence) -> str:
-    return i.name if i.spans is None else f"the signal {i.name}"
+def _named(i: Influence, *, begins: bool = False) -> str:
+    """Write the name of a feature, as it `begins` a sentence or stands within one."""
+    return i.name if i.spans is None else f"{'The' if begins else 'the'} signal {i.name}"
 
 
 def _usual(i: Influence) -> str:
     values = list(dict.fromkeys(i.nominal))
     return ", ".join(map(format_number, values[:4])) + ", ..." * (len(values) > 4)
-
-
-def _capital(text: str) -> str:
-    return text[0].upper() + text[1:] if text.startswith("the signal") else text
 
 
 def _listed(names: list[str]) -> str:

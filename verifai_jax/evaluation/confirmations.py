@@ -1,4 +1,4 @@
-"""What closer replays of counterexamples have shown: results, their verdicts, and their texts.
+"""Results of the closer replays of counterexamples: verdicts, and their texts.
 
 found = confirmer(rows, numbers)                    # as `confirmer.py` makes it
 found.verdict                                       # [n]: "confirmed", "fragile", ...

@@ -29,10 +29,7 @@ from verifai_jax.core.user_errors import explain_user_error, format_user_error
 from verifai_jax.evaluation.backends import Choice, resolved
 from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
-from verifai_jax.falsification.model_changes import (
-    ANOTHER_MODEL,
-    continued_with,
-)
+from verifai_jax.falsification.model_changes import continued_with
 from verifai_jax.falsification.origin import origin_of
 from verifai_jax.falsification.run import (
     RECORD,
@@ -43,7 +40,6 @@ from verifai_jax.falsification.run import (
     write_record,
 )
 from verifai_jax.falsification.silent_mistakes import (
-    NOMINAL_FAILS,
     cut_short_note,
     nominal_note,
     notes_after,
@@ -207,8 +203,8 @@ def falsify(
     check_gradient(problem, search)
     with tracing():
         problem.check()
-        search, notes = adapt_search(problem, search, executor)
-        notes += notes_before(problem, search)
+        search, lasting = adapt_search(problem, search, executor)
+        notes = notes_before(problem, search)
     if diverse:
         by = "inputs" if diverse is True else diverse
         search = searches.Diverse(search, capacity=max(256, stop_after or 0), by=by)
@@ -243,7 +239,7 @@ def falsify(
 
         return _run_rounds(
             rounds, ends, seed, choice, progress, target, prepare, notes, callbacks, warm=warm,
-            keep_going=keep_going,
+            keep_going=keep_going, lasting=lasting,
         )  # fmt: skip
 
 
@@ -420,10 +416,8 @@ def _resume(
             rounds.resume(checkpoint)
 
     ends = ends._replace(budget=budget, earlier=_seconds_of(run))
-    kept = ("portfolio ", "search ", NOMINAL_FAILS, ANOTHER_MODEL)
-    notes = [note for note in run.notes if note.startswith(kept)]
-    notes += [changed] if changed else []
-    notes += notes_before(problem, search)
+    lasting = (*run.lasting_notes, *([changed] if changed else []))
+    notes = [*notes_before(problem, search)]
     usual = min(usual_batch(search, budget, ends.stop_after), budget)
     if search.learns and usual != run.batch:
         notes.append(
@@ -443,6 +437,7 @@ def _resume(
         resumed=True,
         sources=sources,
         keep_going=keep_going,
+        lasting=lasting,
     )
 
 
@@ -505,6 +500,7 @@ def _run_rounds(
     resumed: bool = False,
     sources: Sequence[Mapping[str, Any]] | None = None,
     keep_going: bool = False,
+    lasting: Sequence[str] = (),
 ) -> Run:
     """Compile, `prepare`, and play rounds until something ends them."""
     problem, search, place = rounds.problem, rounds.search, rounds.folder
@@ -551,7 +547,8 @@ def _run_rounds(
             guide=None if problem.guide is None else problem.guide.to_json(),
             sources=models,
             derived=problem.system.derived,
-            notes=(*chosen, *notes, *rounds.notes),
+            notes=(*chosen, *lasting, *notes, *rounds.chosen, *rounds.notes),
+            lasting_notes=(*lasting, *rounds.chosen),
         )
 
     def settled() -> Sequence[Mapping[str, Any]]:
@@ -575,8 +572,8 @@ def _run_rounds(
             with tracing():
                 rounds.compile(resumed)
             if not resumed:
-                notes = (*notes, *nominal_note(problem, rounds.evaluate, search))
-            for note in notes:
+                lasting = (*lasting, *nominal_note(problem, rounds.evaluate, search))
+            for note in (*lasting, *notes):
                 bar.note(note)
             prepare()
             if rounds.search is not search:
@@ -585,7 +582,7 @@ def _run_rounds(
                     # Before any row, so that whoever resumes it does not choose again.
                     with writing(place):
                         rounds.record_checksum = write_record(run("running"), place)
-                for note in rounds.notes:
+                for note in (*rounds.chosen, *rounds.notes):
                     bar.note(note)
             stopped = "exhausted" if rounds.exhausted else None
             if rounds.hopeless is not None and not keep_going:

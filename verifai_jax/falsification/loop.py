@@ -112,7 +112,7 @@ class Rounds:
         self._objective = None if problem.rulebook is None else Objective(problem.rulebook)
         self._proposals: Any = None
         self._pending: Any = None  # Points of the first round that are proposed already.
-        self._chosen: tuple[str, ...] = ()
+        self.chosen: tuple[str, ...] = ()
         self._sends_ahead = executor is not None and not search.learns
         self._ahead: Ahead | None = None
         self._saved = time.perf_counter()
@@ -204,7 +204,7 @@ class Rounds:
         if not len(self.first) and self._simulations.measured:
             self.first = np.asarray(self._pending)[: self._simulations.measured]
         self._pending = None
-        self.search, self.batch, self._chosen = search, batch, (note,)
+        self.search, self.batch, self.chosen = search, batch, (note,)
         self._learn_traces(search)
         self._simulations.regroup(batch, keep_traces=self._surrogate is not None)
         self._propose()
@@ -230,7 +230,7 @@ class Rounds:
         """Decisions of the engines that a user may not expect."""
         raised = () if self._confirmer is None else self._confirmer.raised
         suggested = () if self.suggestions is None else self.suggestions.notes
-        return (*self._chosen, *self._simulations.notes, *raised, *suggested)
+        return (*self._simulations.notes, *raised, *suggested)
 
     @property
     def numbers(self) -> dict[str, float]:

@@ -27,8 +27,6 @@ NEAR = 1e-3
 run."""
 EVEN = "even_if_changed=True (--even-if-changed) goes on all the same, and notes it in the record"
 """How to go on with another model."""
-ANOTHER_MODEL = "from row "
-"""Beginning of the note of a run that has gone on with another model or other versions."""
 
 
 def sources_of_row(recorded: Sequence[Mapping[str, Any]], row: int) -> Sources | None:
@@ -94,7 +92,7 @@ def continued_with(
     parts = [f"another model: {list_changes(changes)}"] if changes else []
     parts += [f"other versions: {', '.join(versions)}"] if versions else []
     kept = [part for part in recorded if int(part["first"]) < rows]
-    return (*kept, now.to_json()), f"{ANOTHER_MODEL}{rows} on with {' and '.join(parts)}"
+    return (*kept, now.to_json()), f"from row {rows} on with {' and '.join(parts)}"
 
 
 def has_several_models(recorded: Sequence[Mapping[str, Any]]) -> bool:

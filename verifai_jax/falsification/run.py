@@ -54,7 +54,7 @@ from verifai_jax.falsification.record import (
 from verifai_jax.falsification.table import FINISHED, ErrorTable
 from verifai_jax.falsification.tail import TAIL
 from verifai_jax.features import FeatureSpace
-from verifai_jax.features.density import log_density, tails
+from verifai_jax.features.density import NoDensityError, log_density, tails
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Rulebook
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
@@ -97,6 +97,7 @@ class Run(InNotebook):
     - `precision`: `"float32"` or `"float64"`, of the simulations.
     - `backend`: the engine that simulated; None for a system that has one only.
     - `notes`: decisions that were made without the user.
+    - `lasting_notes`: those of `notes` that are still true when the run goes on.
     - `confirm`: whether violations were replayed more finely before they were claimed.
     - `checks`: names of the checks that a confirmed row has passed; empty if none was made.
     - `first`: points of the unit cube that were simulated before the search began.
@@ -110,8 +111,9 @@ class Run(InNotebook):
     """
 
     _internal = frozenset((
-        "changed_since", "changes", "checkpoint", "compared", "damage", "has_several_models",
-        "origin", "search_data", "space_data", "table_path", "verdict_counts",
+        "changed_since", "changes", "checkpoint", "checks", "compared", "damage",
+        "has_several_models", "lasting_notes", "origin", "search_data", "space_data", "table_path",
+        "verdict_counts",
     ))  # fmt: skip
 
     name: str
@@ -136,6 +138,7 @@ class Run(InNotebook):
     precision: str = "float32"
     backend: str | None = None
     notes: Sequence[str] = ()
+    lasting_notes: Sequence[str] = ()
     confirm: bool = False
     confirm_seconds: float = 0.0
     search_seconds: float = 0.0
@@ -315,9 +318,7 @@ class Run(InNotebook):
         columns = {str(name): rows[name].to_numpy() for name in rows}
         try:
             density = log_density(space, columns)
-        except ValueError as error:
-            if "has no density" not in str(error):
-                raise
+        except NoDensityError:
             density = np.full(len(rows), np.nan)
         found = {f"tail.{name}": tail for name, tail in tails(space, columns).items()}
         return pd.DataFrame({"log_density": density, **found}, index=rows.index)

@@ -25,8 +25,6 @@ from verifai_jax.search import Search
 
 ENOUGH = 32
 """Simulations with a verdict from which on what all of them have in common is worth a note."""
-NOMINAL_FAILS = "the nominal features fail themselves"
-"""Beginning of the note that they do."""
 MOST_SAMPLES = 5_000_000
 """Samples of a whole batch up to which it is simulated for the nominal features alone."""
 HARDLY_MOVES = 0.05
@@ -96,7 +94,7 @@ def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
     if not verdict.violated[0]:
         return ()
     return (
-        f"{NOMINAL_FAILS}, with robustness {verdict.least[0]:z.4g}: "
+        f"the nominal features fail themselves, with robustness {verdict.least[0]:z.4g}: "
         "are the formula and its units right?",
     )
 

@@ -23,8 +23,10 @@ from verifai_jax.search import Suggested
 from verifai_jax.search.suggested import Absent
 
 POINTS, ASKED, REFUSED = "suggested.points", "suggested.asked", "suggested.refused"
+LAST_REFUSED = "suggested.last_refused"
 """Entries of a checkpoint: all rows that were suggested, `[n, row]`; of each question the row at
-which it was asked and how many points came, `[k, 2]`; and what was wrong with others."""
+which it was asked and how many points came, `[k, 2]`; what was wrong with others; and how many
+of these the last question had."""
 
 
 class SuggestionError(ValueError):
@@ -109,7 +111,8 @@ class Suggestions:
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Return what was suggested, as entries of a checkpoint."""
         refused = np.array(self.refused, dtype=np.str_)
-        return {POINTS: self.points, ASKED: self.asked, REFUSED: refused}
+        last = np.array(len(self.last_refused))
+        return {POINTS: self.points, ASKED: self.asked, REFUSED: refused, LAST_REFUSED: last}
 
     def restore(self, checkpoint: Mapping[str, Any]) -> None:
         """Go on with the suggestions of a checkpoint."""
@@ -117,8 +120,8 @@ class Suggestions:
             self.points = np.asarray(checkpoint[POINTS], np.float64)
             self.asked = np.asarray(checkpoint[ASKED], np.int64)
             self.refused = tuple(str(why) for why in checkpoint[REFUSED])
-            last = f" of question {len(self.asked)}: "
-            self.last_refused = tuple(why for why in self.refused if last in why)
+            last = int(checkpoint[LAST_REFUSED])
+            self.last_refused = self.refused[len(self.refused) - last :]
 
 
 def row_of(problem: Problem, suggestion: object, precision: str) -> Float[np.ndarray, " row"]:

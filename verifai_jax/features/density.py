@@ -24,6 +24,10 @@ from verifai_jax.features.signal import Signal
 from verifai_jax.features.space import FeatureSpace
 
 
+class NoDensityError(ValueError):
+    """Raised for a domain whose values have no probability density, such as an automaton."""
+
+
 def log_density(space: FeatureSpace, rows: Mapping[str, Any]) -> Float[np.ndarray, " n"]:
     """Return the natural logarithm of the density that the prior has at rows of a table.
 
@@ -108,7 +112,7 @@ def _log_density(domain: Domain, values: PyTree, name: str) -> Float[np.ndarray,
                 for i, item in ((i, _item(values.values, i)) for i in range(domain.most))
             )
             return _sum(items) - math.log(domain.most - domain.least + 1)
-    raise ValueError(f"the prior of {name} has no density: {domain!r}")
+    raise NoDensityError(f"the prior of {name} has no density: {domain!r}")
 
 
 def _continuous(domain: Domain, name: str) -> list[tuple[str, Continuous]]:

@@ -13,6 +13,18 @@ FRACTIONS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
 """Units of Arrow's times, as fractions of a second."""
 
 
+class LeftOut(str):
+    """A note on a `column` of a recording that is no signal of its trace."""
+
+    column: str
+
+    def __new__(cls, text: str, column: str) -> "LeftOut":
+        """Make a note of its text and the column that it is about."""
+        note = super().__new__(cls, text)
+        note.column = column
+        return note
+
+
 def is_numeric(column: Any) -> bool:
     """Return whether the cells of an Arrow column are numbers or truth values."""
     from pyarrow import types

@@ -14,7 +14,7 @@ import numpy as np
 
 from verifai_jax.core.errors import missing_name
 from verifai_jax.core.trace import Trace
-from verifai_jax.mtl.columns import is_numeric, numbers_of, seconds_of
+from verifai_jax.mtl.columns import LeftOut, is_numeric, numbers_of, seconds_of
 from verifai_jax.mtl.resampling import Method, check_increasing, resample
 
 if TYPE_CHECKING:
@@ -215,7 +215,8 @@ def _signals(
         except ValueError as error:
             if columns is not None and name in columns:
                 raise
-            notes[f"{str(error).replace(f' of {source}', '', 1)}: it is left out"] = 1
+            why = str(error).replace(f" of {source}", "", 1)
+            notes[LeftOut(f"{why}: it is left out", name)] = 1
     if columns is None and not values:
         raise ValueError(f"{source} has no column of numbers")
     vectors = vector_columns([name for name in values if values[name].ndim == 1])

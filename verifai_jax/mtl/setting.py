@@ -14,6 +14,7 @@ from verifai_jax.core.errors import missing_name
 from verifai_jax.core.text import format_seconds, format_time
 from verifai_jax.core.trace import Samples, Trace, as_array, check_period
 from verifai_jax.mtl._parse import parse
+from verifai_jax.mtl.columns import LeftOut
 from verifai_jax.mtl.evaluate import End, Evaluator
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.semantics import Semantics
@@ -128,7 +129,7 @@ def prepare(
 def _missing_signal(name: str, trace: Trace) -> Exception:
     """Return the error for a signal that a trace lacks, with what its recording says of it."""
     error = missing_name("the trace", "signal", name, trace.signals)
-    said = [note for note in trace.notes if note.startswith(f"column {name!r} ")]
+    said = [note for note in trace.notes if isinstance(note, LeftOut) and note.column == name]
     return type(error)(f"{error}; {said[0]}") if said else error
 
 

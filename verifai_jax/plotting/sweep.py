@@ -20,6 +20,7 @@ from verifai_jax.plotting.style import (
     tidy,
     wrap_name,
 )
+from verifai_jax.statistics.confidence_sequences import verdict_kind
 from verifai_jax.sweeps.importance import HyperparameterImportance
 from verifai_jax.sweeps.ranking import (
     full_return_threshold,
@@ -231,7 +232,7 @@ def _draw_curves(axes: Axes, sweep: Sweep, rows: list[int]) -> None:
     for row in rows:
         entry: Any = sweep.table.loc[row].to_dict()
         verdict = str(entry["verdict"])
-        colour, marker = LOOKS["safe" if verdict.startswith("safe") else verdict or "undecided"]
+        colour, marker = LOOKS[verdict_kind(verdict) or "undecided"]
         # Of two with one verdict the second has a colour and a line of its own.
         again = colour in used
         colour, marker = (RETURN, "s") if again else (colour, marker)

@@ -134,6 +134,18 @@ def run_page(
 
 def headline(run: Run) -> str:
     """Write the finding in a sentence or two."""
+    counts, text = run.table.counts, _finding(run)
+    if run.simulations in (0, counts.without_verdict):
+        return text
+    if run.failure_rate is not None:
+        return f"{text} Failure rate {run.failure_rate}, as simulated."
+    if not counts.violating:
+        text += f" That shows no probability: {why_no_rate(run)}."
+    return text
+
+
+def _finding(run: Run) -> str:
+    """Write the finding in one sentence."""
     counts = run.table.counts
     if not run.simulations:
         return f"Nothing was simulated; the run was stopped by {run.stopped}."
@@ -142,12 +154,7 @@ def headline(run: Run) -> str:
     text = f"{counts.violating:,} of {run.simulations:,} simulations violate the property"
     if confirmed := run.verdict_counts.get("confirmed"):
         text += f", {confirmed:,} of them confirmed by closer replays"
-    text += "."
-    if run.failure_rate is not None:
-        return f"{text} Failure rate {run.failure_rate}, as simulated."
-    if not counts.violating:
-        text += f" That shows no probability: {why_no_rate(run)}."
-    return text
+    return f"{text}."
 
 
 def assumptions(run: Run) -> list[str]:
@@ -176,7 +183,7 @@ def run_claims(run: Run, studies: Studies) -> list[Claim]:
     counts, table_ = run.table.counts, "the table of all simulations"
     common = (FROM_DATA.format(run.precision), MODEL)
     texts: list[tuple[str, tuple[str, ...], tuple[str, ...]]] = []
-    texts.append((headline(run).split(". ")[0].rstrip(".") + ".", (table_,), common))
+    texts.append((_finding(run), (table_,), common))
     if confirmed := run.verdict_counts.get("confirmed"):
         checked = describe_checks(run.checks, of_step=False)
         sentence = f"{confirmed:,} of these failures were seen again {checked}."

@@ -39,6 +39,8 @@ ATOM = 0.75
 UNDECIDED = "undecided"
 """Verdict of a policy whose interval contains the failure rate that is allowed."""
 
+SAFE = "safe"
+"""Beginning of the verdict `safe@p`."""
 UNSAFE = "unsafe"
 """Verdict of a policy that fails more often than is allowed."""
 
@@ -186,7 +188,12 @@ def verdict(rate: Rate | None, p: float) -> str:
 
 def safe_at(p: float) -> str:
     """Write the verdict of a policy whose failure rate is below `p`."""
-    return f"safe@{p:zg}"
+    return f"{SAFE}@{p:zg}"
+
+
+def verdict_kind(verdict: str) -> str:
+    """Return `"safe"`, `"unsafe"` or `"undecided"` of a verdict; empty for none."""
+    return SAFE if verdict.split("@")[0] == SAFE else verdict
 
 
 def _border(within: float, outside: float, inside: Callable[[float], bool]) -> float:

@@ -31,7 +31,7 @@ from verifai_jax.sweeps.halving import SAFETY, Halving
 from verifai_jax.sweeps.hyperparameters import Hyperparameters
 from verifai_jax.sweeps.optuna import OptunaSampler
 from verifai_jax.sweeps.proposers import WORST, Proposer, make_proposer, objective
-from verifai_jax.sweeps.record import NONFINITE, STOPPED, TRAINED, SweepRecord
+from verifai_jax.sweeps.record import NONFINITE, STOPPED, TRAINED, SweepRecord, error_status
 from verifai_jax.sweeps.result import Sweep
 from verifai_jax.sweeps.rows import Row, tabulate
 from verifai_jax.sweeps.safety import SCREENING, PolicySafety, SafetyReport, certify_policies
@@ -510,7 +510,7 @@ class _RunningSweep:
                     seed=training.seed,
                     steps=training.checkpoints[-1],
                     values=configuration.values,
-                    status=f"error: {self.runs.errors[run]}",
+                    status=error_status(self.runs.errors[run]),
                     place=(run, -1),
                 )
             )

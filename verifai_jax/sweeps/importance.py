@@ -26,6 +26,7 @@ from jaxtyping import Float, Int
 from verifai_jax.core.lazy import late
 from verifai_jax.core.text import format_percent
 from verifai_jax.features import FeatureSpace
+from verifai_jax.statistics.confidence_sequences import verdict_kind
 from verifai_jax.sweeps.fanova import leaf_boxes, variance_shares
 from verifai_jax.sweeps.trends import trends
 
@@ -351,7 +352,7 @@ def _components(
 
     ordered = [one for one in inputs if one.ordered and one.name != "steps"]
     verdicts = table["verdict"].astype(str)
-    known = verdicts.str.startswith("safe") | (verdicts == "unsafe")
+    known = verdicts.map(verdict_kind).isin(["safe", "unsafe"])
     frame = pd.DataFrame({one.name: one.values for one in ordered}, index=table.index)
     frame["violated"] = (verdicts == "unsafe").to_numpy()
     # One row a configuration, at its last checkpoint; the worst of its seeds decides.

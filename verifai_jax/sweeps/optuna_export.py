@@ -10,7 +10,7 @@ from verifai_jax.core.errors import require
 from verifai_jax.features import FeatureSpace
 from verifai_jax.features.domain import Domain
 from verifai_jax.sweeps.optuna_distributions import optuna_distribution
-from verifai_jax.sweeps.record import algorithm_uses
+from verifai_jax.sweeps.record import STOPPED, algorithm_uses
 
 if TYPE_CHECKING:
     import optuna
@@ -119,7 +119,7 @@ def _trial(
     state = optuna.trial.TrialState.COMPLETE
     if not np.isfinite(values).all():
         state = optuna.trial.TrialState.FAIL
-    elif "stopped" in str(row["status"]):
+    elif STOPPED in str(row["status"]).split(", "):
         state = optuna.trial.TrialState.PRUNED
     complete = state == optuna.trial.TrialState.COMPLETE
     attributes = {name: _plain(row[name]) for name in _ATTRIBUTES if name in row}

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Int
 
+from verifai_jax.statistics.confidence_sequences import verdict_kind
 from verifai_jax.statistics.pareto import fronts
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ _WORST_FIRST = ("unsafe", "undecided")
 
 def is_safe(table: "pd.DataFrame") -> Bool[np.ndarray, " rows"]:
     """Return True for rows with the verdict `safe@p`."""
-    return table["verdict"].astype(str).str.startswith("safe").to_numpy(bool)
+    return (table["verdict"].astype(str).map(verdict_kind) == "safe").to_numpy(bool)
 
 
 def preference_order(table: "pd.DataFrame") -> Int[np.ndarray, " certified"]:

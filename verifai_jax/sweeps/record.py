@@ -35,6 +35,17 @@ AFTER = (
 """Columns of the table after those of the hyper-parameters."""
 
 
+def error_status(message: str) -> str:
+    """Write the status of a training that raised."""
+    return f"error: {message}"
+
+
+def error_message(status: str) -> str | None:
+    """Return what a training of this status raised; None if it did not raise."""
+    kind, colon, message = status.partition(": ")
+    return message if kind == "error" and colon else None
+
+
 class Curve(NamedTuple):
     """A learning curve.
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from verifai_jax.core.text import format_features, format_percent
+from verifai_jax.statistics.confidence_sequences import verdict_kind
 from verifai_jax.sweeps.ranking import (
     full_return_threshold,
     is_safe,
@@ -20,7 +21,7 @@ from verifai_jax.sweeps.ranking import (
     preference_order,
     return_safety_correlation,
 )
-from verifai_jax.sweeps.record import SweepRecord, algorithm_uses
+from verifai_jax.sweeps.record import SweepRecord, algorithm_uses, error_message
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -171,7 +172,7 @@ def format_html(findings: Findings) -> str:
 
 def _html_row(number: str, row: Mapping[str, Any], names: Sequence[str]) -> str:
     verdict = str(row["verdict"])
-    colour = _CSS.get("safe" if verdict.startswith("safe") else verdict, "#7f7f7f")
+    colour = _CSS.get(verdict_kind(verdict), "#7f7f7f")
     texts = [
         f"{format_percent(row['failure_low'])} to {format_percent(row['failure_high'])}",
         _format_return(row["nominal_return"]),
@@ -188,7 +189,7 @@ def _best_lines(findings: Findings) -> list[str]:
     number = table.index[preference_order(table)[0]]
     best: Any = table.loc[number].to_dict()
     verdict = str(best["verdict"])
-    if verdict.startswith("safe"):
+    if verdict_kind(verdict) == "safe":
         which = f"row {number}, {verdict}"
     else:
         which = f"row {number} comes nearest, {verdict}: NONE IS CERTIFIED SAFE"
@@ -237,9 +238,10 @@ def _missing_policies(table: "pd.DataFrame") -> str:
     parts = []
     if count := int((statuses == "nonfinite").sum()):
         parts.append(f"{count} not finite")
-    failed = statuses.loc[statuses.str.startswith("error")]
+    messages = statuses.map(error_message)
+    failed = messages.loc[messages.notna()]
     if len(failed):
-        first = failed.iloc[0].partition(":")[2].strip() or "error"
+        first = failed.iloc[0].strip() or "error"
         errors = _plural(len(failed), "error")
         parts.append(f"{errors}, the first in row {failed.index[0]}: {first}")
     return "; ".join(parts)

@@ -194,10 +194,14 @@ class Samples:
     @property
     def kind(self) -> str:
         """Description of the rows: `"12 counterexamples of cart-pole"`."""
-        what = {"failed": "rows without a verdict", "all": "rows", "safe": "safe rows"}
-        one = len(self) == 1
-        words = what.get(self.which, self.which)
-        words = words.replace("rows", "row").removesuffix("s") if one else words
+        nouns = {
+            "failed": ("row without a verdict", "rows without a verdict"),
+            "all": ("row", "rows"),
+            "safe": ("safe row", "safe rows"),
+            "counterexamples": ("counterexample", "counterexamples"),
+        }
+        one, several = nouns[self.which]
+        words = one if len(self) == 1 else several
         return f"{len(self):,} {words} of {self.name}"
 
     def values(self) -> Float[np.ndarray, "n k"]:
