@@ -8,38 +8,20 @@ The result is a pure function `(features, key) -> Trace` of one episode, which i
 """
 
 import copy
-import importlib.metadata
-import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import jax
 from jaxtyping import Array, Int, Key, PyTree
 
 from verifai_jax.core.compilation import Effort
-from verifai_jax.core.errors import (
-    MissingExtra,
-    require,
-    suggests_options,
-    unknown_name,
-)
-from verifai_jax.core.trace import Trace
-from verifai_jax.core.user_errors import check_called_with
-from verifai_jax.core.waveform import set_durations
-from verifai_jax.systems.base import Carry, Features, Seed, System
-from verifai_jax.systems.delays import (
-    NO_DELAY,
-    Delay,
-    DelayOption,
-    Delays,
-    as_delay,
-    first_refusal,
-)
+from verifai_jax.core.errors import require, suggests_options, unknown_name
+from verifai_jax.systems.base import Features
+from verifai_jax.systems.delays import DelayOption
 from verifai_jax.systems.environments.brax_model import (
     Env,
-    Place,
     check_parts_are_read,
     explain_errors,
     joint_place,
@@ -50,24 +32,8 @@ from verifai_jax.systems.environments.brax_model import (
     with_system,
     with_value,
 )
-from verifai_jax.systems.environments.episode import (
-    Episode,
-    Moment,
-    Time,
-    check_features,
-    check_signals_option,
-    features_at,
-    first_memory,
-    fold,
-    has_waveforms,
-    policy_function,
-    policy_that_sees,
-    read_signals,
-    rollout,
-    sampling_period,
-    step_count,
-    vector_action,
-)
+from verifai_jax.systems.environments.episode import Moment, step_count, vector_action
+from verifai_jax.systems.environments.policy_loop import PolicyLoop, check_version, loop_options
 from verifai_jax.systems.ode.integrators import check_factor
 from verifai_jax.systems.pytree_checks import outline
 
@@ -75,37 +41,21 @@ OLDEST = (0, 14)
 BACKENDS = ("generalized", "spring", "positional", "mjx")
 
 
-@dataclass(frozen=True, eq=False)
-class Brax(System):
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Brax(PolicyLoop):
     """A closed loop `(features, key) -> Trace`; made by `brax`, which says what its parts are.
 
     - `exact_step`: the step belongs to the environment, so that it has no finer one.
     """
 
-    env: Any
-    name: str
-    policy: Any
-    policy_memory: Any
-    steps: int
-    dt: float = field()
-    features: Mapping[str, Place]
-    configure: Callable[..., Any] | None
-    initial: Mapping[str, Place] | Callable[..., Any] | None
-    signals: Any
+    binding: ClassVar[str] = "features={feature: part of the system} or initial={feature: 'q[0]'}"
     exact_step: bool = True
-    observation_delay: Delay = NO_DELAY
-    action_delay: Delay = NO_DELAY
 
     @property
     def effort(self) -> Effort:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Effort of XLA: with `little` the generalized backend compiles sooner and runs as fast."""
         backend = getattr(self.env.unwrapped, "_backend", None)
         return "little" if backend == "generalized" else "most"
-
-    @property
-    def duration(self) -> float:
-        """Simulated seconds."""
-        return self.steps * self.dt
 
     @property
     def reverse_hint(self) -> str:
@@ -139,122 +89,51 @@ class Brax(System):
             check_factor(factor)
         return replace(self, env=with_finer_step(self.env, factor, self.name))
 
-    def __call__(self, features: Features, key: Seed = None) -> Trace:
-        """Simulate one episode, not reset at its end."""
-        return rollout(self._episode(features), key)
+    def _start(self, configured: Env, features: Features, key: Key[Array, ""]) -> Moment:
+        env = configured
+        if callable(self.initial):
+            return _moment(self.initial(env, features, key), self.name)
+        if self.initial:
+            env = with_start(env, {place: features[name] for name, place in self.initial.items()})
+        with explain_errors(self.env, self.name, "reset"):
+            return _moment(env.reset(key), self.name)
 
-    def fold(
-        self,
-        features: Features,
-        key: Seed,
-        carry: Carry,
-        update: Callable[[Carry, dict[str, Array]], Carry],
-    ) -> tuple[Carry, Int[Array, ""]]:
-        """Simulate, and let `carry = update(carry, sample)` take in each sample; none is stored.
+    def _step(self, configured: Env, state: Env, action: PyTree, key: Key[Array, ""]) -> Moment:
+        with explain_errors(self.env, self.name, "step"):
+            return _moment(configured.step(state, action), self.name)
 
-        Behind an early end the last valid sample comes again, until the last step.
+    def _parts(self, state: Env) -> dict[str, Any]:
+        physics = getattr(state, "pipeline_state", None)
+        parts = {part: getattr(physics, part, None) for part in ("q", "qd")} | dict(state.metrics)
+        return {name: value for name, value in parts.items() if value is not None}
 
-        **Returns:** the last carry, and the status.
-        """
-        return fold(self._episode(features), key, carry, update)
+    def _action(self, action: PyTree) -> Array:
+        return vector_action(action, self.env.action_size, self.name)
 
-    def _episode(self, features: Features) -> Episode:
-        """Return the environment under these features, with the policy in the loop."""
-        features = set_durations(features, self.duration)
-        self.check(features)
-        fixed = None if has_waveforms(features) else self._configure(features, 0.0)
-
-        def env_at(time: Time) -> Any:
-            return self._configure(features, time) if fixed is None else fixed
-
-        def start(key: Key[Array, ""]) -> Moment:
-            env, now = env_at(0.0), features_at(features, 0.0)
-            if callable(self.initial):
-                return _moment(self.initial(env, now, key), self.name)
-            if self.initial:
-                env = with_start(env, {place: now[name] for name, place in self.initial.items()})
-            with explain_errors(self.env, self.name, "reset"):
-                return _moment(env.reset(key), self.name)
-
-        def step(time: Time, state: Env, action: PyTree, key: Key[Array, ""]) -> Moment:
-            env = env_at(time)
-            with explain_errors(self.env, self.name, "step"):
-                return _moment(env.step(state, action), self.name)
-
-        def sample(time: Time, moment: Moment, action: PyTree) -> Any:
-            now = features_at(features, time)
-            return read_signals(
-                self.signals, moment, action, now, _named_parts(moment.state), self.name
-            )
-
-        decide, size = policy_function(self.policy, self.policy_memory), self.env.action_size
-
-        def decide_checked(
-            time: Time, observation: PyTree, memory: PyTree, key: Key[Array, ""]
-        ) -> Any:
-            now = features_at(features, time)
-            action, memory = decide(observation, memory, key, now)
-            return vector_action(action, size, self.name), memory
-
-        return Episode(
-            self.name,
-            start,
-            step,
-            decide_checked,
-            self.policy_memory,
-            sample,
-            self.steps,
-            self.dt,
-            Delays.under(self.observation_delay, self.action_delay, features),
-        )
-
-    def _configure(self, features: Features, time: Time) -> Any:
-        """Return the environment under the features of an instant."""
-        now, env = features_at(features, time), self.env
+    def _configured(self, features: Features) -> Any:
+        env = self.env
         if self.features:
             sys = env.unwrapped.sys
             for name, place in self.features.items():
-                sys = with_value(sys, place, now[name], name)
+                sys = with_value(sys, place, features[name], name)
             env = with_system(env, sys)
         if self.configure is None:
             return env
         if not hasattr(env.unwrapped, "sys"):
-            configured = self.configure(copy.copy(env), now)
+            configured = self.configure(copy.copy(env), features)
             if not hasattr(configured, "step"):
                 raise ValueError(
                     f"configure must return the environment {self.name}, which has no sys of its "
                     f"own; got {outline(configured)}"
                 )
             return configured
-        sys = self.configure(env.unwrapped.sys, now)
+        sys = self.configure(env.unwrapped.sys, features)
         if not isinstance(sys, type(env.unwrapped.sys)):
             raise ValueError(
                 f"configure must return the sys of {self.name}, a "
                 f"{type(env.unwrapped.sys).__name__}; got {outline(sys)}"
             )
         return with_system(env, sys)
-
-    def check(self, features: Features) -> None:
-        """Refuse features that do not exist, or that nothing would read.
-
-        **Raises:** `UnknownNameError`, `ValueError`.
-        """
-        starts = self.initial if isinstance(self.initial, Mapping) else {}
-        delays = (*self.observation_delay.features, *self.action_delay.features)
-        check_features(
-            features,
-            [*self.features, *starts, *delays],
-            (self.configure, self.signals, self.initial, policy_that_sees(self.policy)),
-            self.name,
-            "features={feature: part of the system} or initial={feature: 'q[0]'}",
-        )
-        self.observation_delay.check(features)
-        self.action_delay.check(features)
-
-    def why_error(self, features: Features) -> str | None:
-        """Say which delay is none that the environment was made for."""
-        delays = (self.observation_delay, self.action_delay)
-        return first_refusal(delays, features, self.name)
 
 
 @suggests_options
@@ -326,7 +205,7 @@ def brax(
     do not, and for an environment that does not work with the installed versions.
     """
     _import("brax.envs")
-    _check_version()
+    check_version("brax", OLDEST)
     if isinstance(env, str):
         name = env
         env = _make(name, backend, dict(options or {}))
@@ -342,38 +221,25 @@ def brax(
             dt = env.dt
         except AttributeError as error:
             raise ValueError(f"{name} has no dt: give dt=..., seconds of a step") from error
-    seconds = sampling_period(dt)
-    check_signals_option(signals)
-    check_called_with("configure", configure, ("sys", "features"))
-    if not isinstance(initial, Mapping):
-        check_called_with("initial", initial, ("env", "features", "key"))
-    policy_memory = first_memory(policy, policy_memory)
-    policy_function(policy, policy_memory)
-    bindings = features if isinstance(features, Mapping) else {path: path for path in features}
-    places = {feature: system_place(env, path, name) for feature, path in bindings.items()}
-    starts = initial
+    delays = (observation_delay, action_delay)
+    shared = loop_options(
+        dt, policy, policy_memory, features, configure, initial, signals, delays, "sys", "env"
+    )
+    places = {f: system_place(env, path, name) for f, path in shared["features"].items()}
     if isinstance(initial, Mapping):
         if not hasattr(env, "pipeline_init"):
             raise ValueError(
                 f"{name} has no pipeline_init: initial must be a function (env, features, key) -> "
                 "State"
             )
-        starts = {feature: joint_place(env, path, name) for feature, path in initial.items()}
+        shared["initial"] = {f: joint_place(env, path, name) for f, path in initial.items()}
     check_parts_are_read(env, name, places)
     return Brax(
+        **{**shared, "features": places},
         env=env,
         name=name,
-        policy=policy,
-        policy_memory=policy_memory,
-        steps=step_count(steps, duration, seconds),
-        dt=seconds,
-        features=places,
-        configure=configure,
-        initial=starts,  # pyright: ignore[reportArgumentType]
-        signals=signals,
+        steps=step_count(steps, duration, shared["dt"]),
         exact_step=exact_step,
-        observation_delay=as_delay(observation_delay, "observation_delay"),
-        action_delay=as_delay(action_delay, "action_delay"),
     )
 
 
@@ -383,16 +249,6 @@ def _import(module: str) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         return require(module, extra="brax")
-
-
-def _check_version() -> None:
-    version = importlib.metadata.version("brax")
-    numbers = tuple(int(n) for n in re.findall(r"\d+", version)[:3])
-    if numbers < OLDEST:
-        raise MissingExtra(
-            f"brax {version} is installed, verifai_jax needs {'.'.join(map(str, OLDEST))} or "
-            "later: pip install 'verifai_jax[brax]'"
-        )
 
 
 def _make(name: str, backend: str | None, options: dict[str, object]) -> Any:
@@ -440,12 +296,3 @@ def _moment(state: Env, name: str) -> Moment:
             f"{name}: reset, step and initial must return a brax State; got {outline(state)}"
         )
     return Moment(state, state.obs, state.reward, state.done)
-
-
-def _named_parts(state: Env) -> dict[str, Any]:
-    """Return the parts of a Brax State that have names of their own."""
-    physics = getattr(state, "pipeline_state", None)
-    parts = {part: getattr(physics, part, None) for part in ("q", "qd")}
-    return {
-        name: value for name, value in (parts | dict(state.metrics)).items() if value is not None
-    }

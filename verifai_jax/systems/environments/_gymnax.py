@@ -7,54 +7,24 @@
 The result is a pure function `(features, key) -> Trace` of one episode, which is never reset.
 """
 
-import importlib.metadata
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, Key, PyTree
+from jaxtyping import Array, Key, PyTree
 
 from verifai_jax.core.errors import (
-    MissingExtra,
     check_names,
     require,
     suggests_options,
     unknown_name,
 )
-from verifai_jax.core.trace import Trace
-from verifai_jax.core.user_errors import check_called_with
-from verifai_jax.core.waveform import set_durations
-from verifai_jax.systems.base import Carry, Features, Seed, System
-from verifai_jax.systems.delays import (
-    NO_DELAY,
-    Delay,
-    DelayOption,
-    Delays,
-    as_delay,
-    first_refusal,
-)
-from verifai_jax.systems.environments.episode import (
-    Episode,
-    Moment,
-    Time,
-    check_features,
-    check_signals_option,
-    features_at,
-    first_memory,
-    fold,
-    has_waveforms,
-    policy_function,
-    policy_that_sees,
-    read_signals,
-    rollout,
-    sampling_period,
-    step_count,
-    used_inputs,
-    vector_action,
-)
+from verifai_jax.systems.base import Features
+from verifai_jax.systems.delays import DelayOption
+from verifai_jax.systems.environments.episode import Moment, step_count, used_inputs, vector_action
+from verifai_jax.systems.environments.policy_loop import PolicyLoop, check_version, loop_options
 from verifai_jax.systems.pytree_checks import check_like, outline
 
 OLDEST = (1, 0, 1)
@@ -75,116 +45,53 @@ DERIVED: dict[str, dict[str, Callable[[Any], Any]]] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Gymnax(System):
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Gymnax(PolicyLoop):
     """A closed loop `(features, key) -> Trace`; made by `gymnax`, which says what its parts are."""
 
+    binding: ClassVar[str] = "features={feature: parameter} or initial={feature: part of the state}"
     # An environment is the difference equation that its `step` computes.
     exact_step: ClassVar[bool] = True
-    env: Any
     params: Any
-    policy: Any
-    policy_memory: Any
-    steps: int
-    dt: float = field()
-    features: Mapping[str, str]
-    configure: Callable[..., Any] | None
-    initial: Mapping[str, str] | Callable[..., Any] | None
-    signals: Any
     truncate: bool
-    observation_delay: Delay = NO_DELAY
-    action_delay: Delay = NO_DELAY
 
-    @property
-    def duration(self) -> float:
-        """Simulated seconds."""
-        return self.steps * self.dt
+    def _start(self, configured: Params, features: Features, key: Key[Array, ""]) -> Moment:
+        observation, state = self.env.reset_env(key, configured)
+        if self.initial is not None:
+            state = self._initial_state(state, features, key)
+            observation = self.env.observe(key, state, None, configured)
+        return Moment(state, observation, 0.0, False)
 
-    def __call__(self, features: Features, key: Seed = None) -> Trace:
-        """Simulate one episode, not reset at its end."""
-        return rollout(self._episode(features), key)
+    def _step(
+        self, configured: Params, state: PyTree, action: PyTree, key: Key[Array, ""]
+    ) -> Moment:
+        state, params = _differentiable(self.env, state, action, key, configured)
+        observation, state, reward, over, _ = self.env.step_env(key, state, action, params)
+        if self.truncate:
+            over = over | self.env.is_truncated(state, params)
+        return Moment(state, observation, reward, over)
 
-    def fold(
-        self,
-        features: Features,
-        key: Seed,
-        carry: Carry,
-        update: Callable[[Carry, dict[str, Array]], Carry],
-    ) -> tuple[Carry, Int[Array, ""]]:
-        """Simulate, and let `carry = update(carry, sample)` take in each sample; none is stored.
+    def _parts(self, state: PyTree) -> dict[str, Any]:
+        return {name: value for name, value in _fields(state).items() if name != "time"}
 
-        Behind an early end the last valid sample comes again, until the last step.
+    def _action(self, action: PyTree) -> Array:
+        return _as_action(action, self.env.action_space(self.params), self.name)
 
-        **Returns:** the last carry, and the status.
-        """
-        return fold(self._episode(features), key, carry, update)
-
-    def _episode(self, features: Features) -> Episode:
-        """Return the environment under these features, with the policy in the loop."""
-        features = set_durations(features, self.duration)
-        self.check(features)
-        fixed = None if has_waveforms(features) else self._configure(features, 0.0)
-
-        def params_at(time: Time) -> Any:
-            return self._configure(features, time) if fixed is None else fixed
-
-        def start(key: Key[Array, ""]) -> Moment:
-            params = params_at(0.0)
-            observation, state = self.env.reset_env(key, params)
-            if self.initial is not None:
-                state = self._initial_state(state, features_at(features, 0.0), key)
-                observation = self.env.observe(key, state, None, params)
-            return Moment(state, observation, 0.0, False)
-
-        def step(time: Time, state: PyTree, action: PyTree, key: Key[Array, ""]) -> Moment:
-            params = params_at(time)
-            state, params = _differentiable(self.env, state, action, key, params)
-            observation, state, reward, over, _ = self.env.step_env(key, state, action, params)
-            if self.truncate:
-                over = over | self.env.is_truncated(state, params)
-            return Moment(state, observation, reward, over)
-
-        def sample(time: Time, moment: Moment, action: PyTree) -> Any:
-            named = {n: v for n, v in _fields(moment.state).items() if n != "time"}
-            now = features_at(features, time)
-            return read_signals(self.signals, moment, action, now, named, self.env.name)
-
-        decide = policy_function(self.policy, self.policy_memory)
-
-        def decide_checked(
-            time: Time, observation: PyTree, memory: PyTree, key: Key[Array, ""]
-        ) -> Any:
-            now = features_at(features, time)
-            action, memory = decide(observation, memory, key, now)
-            return _as_action(action, self.env.action_space(self.params), self.env.name), memory
-
-        return Episode(
-            self.env.name,
-            start,
-            step,
-            decide_checked,
-            self.policy_memory,
-            sample,
-            self.steps,
-            self.dt,
-            Delays.under(self.observation_delay, self.action_delay, features),
-        )
-
-    def _configure(self, features: Features, time: Time) -> Any:
+    def _configured(self, features: Features) -> Params:
         """Return the environment's parameters under the features of an instant."""
-        now, params = features_at(features, time), self.params
+        params = self.params
         if self.features:
-            fields = {field: now[name] for name, field in self.features.items()}
+            fields = {field: features[name] for name, field in self.features.items()}
             params = params.replace(**fields)
-            derived = DERIVED.get(self.env.name, {})
+            derived = DERIVED.get(self.name, {})
             params = params.replace(
                 **{name: rule(params) for name, rule in derived.items() if name not in fields}
             )
         if self.configure is not None:
-            params = self.configure(params, now)
+            params = self.configure(params, features)
             if not isinstance(params, type(self.params)):
                 raise ValueError(
-                    f"configure must return the parameters of {self.env.name}, a "
+                    f"configure must return the parameters of {self.name}, a "
                     f"{type(self.params).__name__}; got {outline(params)}"
                 )
         return params
@@ -194,35 +101,13 @@ class Gymnax(System):
         if not isinstance(self.initial, Mapping):
             assert self.initial is not None
             placed = self.initial(state, features, key)
-            role = f"a state of {self.env.name}"
+            role = f"a state of {self.name}"
             if jax.tree.structure(placed) != jax.tree.structure(state):
                 check_like(placed, state, "initial", role)
             return jax.tree.map(jnp.asarray, placed)
         known = _fields(state)
-        check_names(f"part of {self.env.name}'s state", self.initial.values(), known)
+        check_names(f"part of {self.name}'s state", self.initial.values(), known)
         return state.replace(**{part: features[name] for name, part in self.initial.items()})
-
-    def check(self, features: Features) -> None:
-        """Refuse features that do not exist, or that nothing would read.
-
-        **Raises:** `UnknownNameError`, `ValueError`.
-        """
-        starts = self.initial if isinstance(self.initial, Mapping) else {}
-        delays = (*self.observation_delay.features, *self.action_delay.features)
-        check_features(
-            features,
-            [*self.features, *starts, *delays],
-            (self.configure, self.signals, self.initial, policy_that_sees(self.policy)),
-            self.env.name,
-            "features={feature: parameter} or initial={feature: part of the state}",
-        )
-        self.observation_delay.check(features)
-        self.action_delay.check(features)
-
-    def why_error(self, features: Features) -> str | None:
-        """Say which delay is none that the environment was made for."""
-        delays = (self.observation_delay, self.action_delay)
-        return first_refusal(delays, features, self.env.name)
 
 
 @suggests_options
@@ -282,7 +167,7 @@ def gymnax(
     system is traced, for a policy, a state or signals that do not.
     """
     package = require("gymnax", extra="gymnax")
-    _check_version()
+    check_version("gymnax", OLDEST)
     if isinstance(env, str):
         if env not in package.registered_envs:
             raise unknown_name("environment of gymnax", env, package.registered_envs)
@@ -304,53 +189,33 @@ def gymnax(
         env = env.with_transition_gradients()
     params = env.default_params if params is None else params
     fields = _fields(params)
-    bindings = features if isinstance(features, Mapping) else {name: name for name in features}
-    check_names(f"parameter of {env.name}", bindings.values(), fields)
     clocks = [name for name in ("dt", "tau") if name in fields]
-    for name, parameter in bindings.items():
+    delays, period = (observation_delay, action_delay), dt
+    if period is None:
+        period = fields[clocks[0]] if clocks else 1.0
+    options = loop_options(
+        period, policy, policy_memory, features, configure, initial, signals, delays, "params",
+        "state",
+    )  # fmt: skip
+    check_names(f"parameter of {env.name}", options["features"].values(), fields)
+    for name, parameter in options["features"].items():
         if parameter in clocks and dt is None:
             raise ValueError(
                 f"feature {name!r} cannot set {parameter!r}: all samples of a trace are one fixed "
                 "period apart; give dt=... if it is not the environment's time step"
             )
-    if dt is None:
-        dt = fields[clocks[0]] if clocks else 1.0
-    seconds = sampling_period(dt)
-    check_signals_option(signals)
-    check_called_with("configure", configure, ("params", "features"))
-    if not isinstance(initial, Mapping):
-        check_called_with("initial", initial, ("state", "features", "key"))
-    policy_memory = first_memory(policy, policy_memory)
-    policy_function(policy, policy_memory)
     _check_choices(policy, env.action_space(params), env.name)
     if isinstance(initial, Mapping):
         state = jax.eval_shape(env.reset_env, jax.eval_shape(lambda: jax.random.key(0)), params)[1]
         check_names(f"part of {env.name}'s state", initial.values(), _fields(state))
     return Gymnax(
+        **options,
         env=env,
+        name=env.name,
         params=params,
-        policy=policy,
-        policy_memory=policy_memory,
-        steps=step_count(steps, duration, seconds, fields.get("max_steps_in_episode")),
-        dt=seconds,
-        features=bindings,
-        configure=configure,
-        initial=initial,
-        signals=signals,
+        steps=step_count(steps, duration, options["dt"], fields.get("max_steps_in_episode")),
         truncate=truncate,
-        observation_delay=as_delay(observation_delay, "observation_delay"),
-        action_delay=as_delay(action_delay, "action_delay"),
     )
-
-
-def _check_version() -> None:
-    version = importlib.metadata.version("gymnax")
-    numbers = tuple(int(n) for n in re.findall(r"\d+", version)[:3])
-    if numbers < OLDEST:
-        raise MissingExtra(
-            f"gymnax {version} is installed, verifai_jax needs {'.'.join(map(str, OLDEST))} or "
-            "later: pip install 'verifai_jax[gymnax]'"
-        )
 
 
 def _fields(value: object) -> dict[str, Any]:
