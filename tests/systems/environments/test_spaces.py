@@ -279,6 +279,7 @@ def test_late_actions_are_of_the_space():
     assert problem.system({"x0": 0.0}, 0)["x"].tolist() == [0, 0, 0, 1, 2]
 
 
+@pytest.mark.thorough
 def test_actions_of_spaces_without_a_shape_are_simulated():
     class Sequences(gym.Env):
         action_space = spaces.Sequence(spaces.Discrete(3))
