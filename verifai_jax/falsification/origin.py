@@ -9,8 +9,8 @@ from verifai_jax.search import PointList, Search
 
 Origin = Literal["prior", "first", "given", "sequence", "coverage", "learned"]
 """Where rows come from: independent samples of the prior; such samples after rows that were given;
-given rows alone; a sequence that spreads its points, in all features or some; a search guided by coverage; a search
-guided by robustness."""
+given rows alone; a sequence that spreads its points, in all features or some; a search guided by
+coverage; a search guided by robustness."""
 ORIGINS: tuple[Origin, ...] = get_args(Origin)
 
 

@@ -164,8 +164,8 @@ def assumptions(run: Run) -> list[str]:
         )
         if run.table.counts.repetitions.moved:
             items.append(
-                "The system has memory or chance of its own, and what a simulation gives may depend "
-                "on those before it: the interval counts them as independent."
+                "The system has memory or chance of its own, and a simulation may depend on those "
+                "before it: the interval counts them as independent."
             )
         items.append(
             "The rate is one of the prior, which a person chose: of another distribution of the "
