@@ -147,3 +147,32 @@ def test_without_any_verdict_no_robustness_is_claimed():
     said = str(estimate(problem, budget=500, progress=False))
     assert "no simulation gave a verdict" in said
     assert "inf" not in said
+
+
+@pytest.mark.thorough
+def test_chance_that_does_not_come_from_the_key_is_noticed():
+    rng = np.random.default_rng(7)
+
+    def noisy(features):
+        margin = 3.5 - features["x"] - 0.9 * rng.standard_normal(features["x"].shape)
+        return vj.Trace({"margin": np.repeat(margin[:, None], 2, axis=1)}, dt=1.0)
+
+    def steady(features):
+        return vj.Trace({"margin": np.repeat(3.5 - features["x"][:, None], 2, axis=1)}, dt=1.0)
+
+    space = {"x": vj.Normal(0.0, 1.0), "y": vj.Normal(0.0, 1.0)}
+    found = {
+        system.__name__: estimate(
+            vj.Problem("own", space, vj.blackbox(system, vectorised=True), "margin > 0"),
+            budget=2000,
+            progress=False,
+        )
+        for system in (noisy, steady)
+    }
+    assert "memory or chance of its own" not in str(found["steady"])
+    assert "of 8 samples of the prior simulated again with the same features 8 gave another" in str(
+        found["noisy"]
+    )
+    assert found["noisy"].method != "splitting"
+    assert found["noisy"].low < norm.sf(3.5 / np.sqrt(1.81)) < found["noisy"].high
+    assert found["noisy"].simulations <= 2000

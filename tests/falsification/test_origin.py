@@ -8,13 +8,13 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax import search as searches
-from verifai_jax.falsification.no_rate import why_no_rate
+from verifai_jax.falsification.no_rate import what_lies_between, why_no_rate
 from verifai_jax.falsification.origin import ORIGINS, origin_of
 
 OTHERS = {
     "first": "rows were given",
     "given": "its rows were given",
-    "sequence": "its points are a fixed sequence",
+    "sequence": "its points are those of a sequence, spread on purpose",
     "coverage": "this search goes where coverage grows",
     "learned": "this search goes where failures are",
 }
@@ -107,3 +107,13 @@ def test_times_of_a_black_box_add_up(runs, tmp_path):
         assert sum(map(float, re.findall(seconds, line))) == pytest.approx(spent, abs=0.08)
         parts = run.search_seconds + run.simulate_seconds
         assert 0 <= parts <= run.run_seconds + 1e-9
+
+
+@pytest.mark.thorough
+def test_where_nothing_has_a_verdict_no_rate_is_spoken_of():
+    def system(features):
+        return vj.Trace({"y": np.full(2, np.nan)}, dt=1.0)
+
+    problem = vj.Problem("lost", {"a": vj.Box(0, 1)}, vj.blackbox(system), "y >= 0")
+    run = vj.falsify(problem, "uniform", 4, progress=False)
+    assert what_lies_between(run) == "The points between the 4 samples: nothing is known of them."

@@ -32,6 +32,7 @@ from verifai_jax.estimation.methods import (
     estimate_by_splitting,
 )
 from verifai_jax.estimation.monte_carlo import AT_ONCE
+from verifai_jax.estimation.moved_priors import notice_own_chance
 from verifai_jax.estimation.normal_space import LimitState
 from verifai_jax.estimation.result import METHODS, Estimate
 from verifai_jax.evaluation.backends import resolved
@@ -128,6 +129,8 @@ def estimate(
             one_by_one=choice.problem.black_box and executor is None,
         )
         plan = Plan(confidence, chains, simulated.clamped)
+        if choice.problem.black_box:
+            notice_own_chance(limit_state, np.random.default_rng((seed, 1)))
         try:
             answer = _METHODS[method](limit_state, np.random.default_rng(seed), plan)
         except KeyboardInterrupt:
@@ -160,7 +163,7 @@ def _result(
     p0: float | None,
     seconds: float,
 ) -> Estimate:
-    notes = list(answer.notes)
+    notes = [text for text in (limit_state.own_chance,) if text] + list(answer.notes)
     bound = answer.prior.upper_bound(plan.confidence)
     high = answer.high
     if answer.prior.no_verdict and answer.method in ("importance", "splitting"):

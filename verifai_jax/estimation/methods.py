@@ -208,7 +208,7 @@ def estimate_by_importance_sampling(
         few = not by_chance and fitted.effective * limit_state.left < LEAST_EFFECTIVE
         if few or fitted.promise(limit_state.left) < least:
             answer = _without_proposal(limit_state, rng, plan, run, counts, fitted, counted)
-            return _with_chance(answer, again)
+            return _with_chance(answer, again, limit_state.own_chance)
         # A little is left over to see whether the searches agree.
         size = limit_state.left - round(SHARE_OF_PATHS * limit_state.budget)
         samples = importance.sample_proposal(
@@ -227,7 +227,9 @@ def estimate_by_importance_sampling(
         )
     except Ended:
         return _without_samples(limit_state, rng, plan, run, counts)
-    answer = _with_chance(_importance_answer(samples, run, agreement, counts, plan), again)
+    answer = _with_chance(
+        _importance_answer(samples, run, agreement, counts, plan), again, limit_state.own_chance
+    )
     answer.samples = samples
     if explorations:
         answer.nearest = join_explorations(explorations).nearest
@@ -284,15 +286,18 @@ def _cost(run: SplittingRun, size: int) -> float:
     return size + (len(run.fractions) - 1) * (size - size // CHAIN)
 
 
-def _with_chance(answer: Answer, again: float) -> Answer:
+def _with_chance(answer: Answer, again: float, own_chance: str) -> Answer:
     """Say of an answer how far the system's own draws decide, where they do."""
     if again < 1:
         answer.diagnostics["failing_again"] = again
     if again < SURE:
+        what = "the system draws random numbers, and they decide"
+        keys = "with other random keys"
+        if own_chance:
+            what, keys = "what the system has of its own decides", "when simulated again"
         answer.notes.append(
-            "the system draws random numbers, and they decide with the features whether a "
-            f"simulation fails: of the failures found {format_percent(again)} fail again with "
-            "other random keys. The probability is over both"
+            f"{what} with the features whether a simulation fails: of the failures found "
+            f"{format_percent(again)} fail again {keys}. The probability is over both"
         )
     return answer
 

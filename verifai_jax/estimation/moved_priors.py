@@ -12,6 +12,8 @@ and nothing tells. The prior moved by a vector, as wide as it was, has weights w
 Source: Asmussen and Glynn, Stochastic Simulation (2007), chapter VI, for exponential tilting.
 """
 
+from contextlib import suppress
+
 import numpy as np
 from jaxtyping import Float
 
@@ -26,8 +28,12 @@ from verifai_jax.estimation.importance import (
 )
 from verifai_jax.estimation.intervals import tail_index
 from verifai_jax.estimation.mixture import Mixture, optimal_shares
-from verifai_jax.estimation.normal_space import LimitState, fails_at, farthest_first
+from verifai_jax.estimation.normal_space import Ended, LimitState, fails_at, farthest_first
+from verifai_jax.evaluation.confirmation_verdicts import came_otherwise
 
+TWICE = 8
+"""Samples of the prior that are simulated twice on the host, to learn whether a system has memory
+or chance of its own; in budgets in which they are less than a hundredth."""
 TRIED_AGAIN = 64
 """Failures that are simulated again, to learn whether the system's own draws decide."""
 SURE = 0.8
@@ -40,6 +46,24 @@ ENDS = 12
 """Failures towards which the prior is moved, at most."""
 EVEN = 0.5
 """Share of the proposal in which all moves are alike; the rest is what the failures say is best."""
+
+
+def notice_own_chance(limit_state: LimitState, rng: np.random.Generator) -> None:
+    """Simulate a few samples of the prior twice, and note where they come otherwise.
+
+    A function on the host may draw numbers that do not come from the random key, or keep state.
+    """
+    if limit_state.draws or limit_state.budget < 200 * TWICE:
+        return
+    with suppress(Ended):
+        z = limit_state.sample_prior(rng, TWICE)
+        once, again = limit_state(z).score, limit_state(z).score
+        if count := int(came_otherwise(once, again).sum()):
+            limit_state.draws = True
+            limit_state.own_chance = (
+                f"the system has memory or chance of its own: of {TWICE} samples of the prior "
+                f"simulated again with the same features {count} gave another robustness"
+            )
 
 
 def share_failing_again(

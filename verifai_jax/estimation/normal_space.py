@@ -126,6 +126,8 @@ class LimitState:
         self.simulations = self.evaluated = self.failures = self.no_verdict = 0
         self.pilot: tuple[int, int, int] = (0, 0, 0)
         """Simulations, failures and missing verdicts of the first samples of the prior."""
+        self.own_chance = ""
+        """A sentence on memory or chance that the system has beside its random key, if it has."""
         self.least = np.inf
         self.ended: str | None = None
 

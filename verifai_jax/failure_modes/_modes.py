@@ -40,6 +40,7 @@ from verifai_jax.estimation.methods import (
     chains_for,
     estimate_by_importance_sampling,
 )
+from verifai_jax.estimation.moved_priors import notice_own_chance
 from verifai_jax.estimation.normal_space import Ended, LimitState, to_unit_cube
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.confirmations import NOT_CLAIMED
@@ -141,6 +142,8 @@ def modes(
             draws=draws,
         )
         plan = Plan(confidence, chains, simulated.clamped)
+        if chosen.problem.black_box:
+            notice_own_chance(limit_state, np.random.default_rng((seed, 1)))
         try:
             answer = estimate_by_importance_sampling(limit_state, rng, plan)
         except KeyboardInterrupt:
@@ -152,6 +155,8 @@ def modes(
     bound = answer.prior.upper_bound(confidence)
     listed, rest, run, unexplained = (), 0.0, None, (0.0, 1.0)
     notes = list(answer.notes)
+    if limit_state.own_chance:
+        notes.insert(0, f"{limit_state.own_chance}; what a mode hands out may not fail again")
     if divided is not None and answer.samples is not None:
         numbers = _Numbers(chosen.problem, seed, precision, backend, confidence, least_share)
         listed, rest, run = _list_modes(numbers, rng, answer, divided)

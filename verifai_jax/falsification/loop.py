@@ -297,9 +297,10 @@ class Rounds:
             return
         if verdicts is None:
             verdicts = self._verdicts(points, first, given=len(given) > 0)
+        # What follows knows points alone: the nearest ones.
+        given = np.asarray(given[:, : self.problem.space.dim], np.float32)
         if len(given):
-            # What follows knows points alone: the nearest ones.
-            points = given = np.asarray(given[:, : self.problem.space.dim], np.float32)
+            points = given
         self._take_in(points, verdicts, first, given, suggested)
         if not (cut and self.search.learns):
             # A larger budget goes on before a round that this one cut, with all of its points.

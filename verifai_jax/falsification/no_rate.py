@@ -1,6 +1,6 @@
 """Sentences on a run whose rows are no samples of the prior, and so give no failure rate.
 
-    why_no_rate(run)                   "its points are a fixed sequence"
+    why_no_rate(run)                   "its points are those of a sequence, spread on purpose"
 
 Every text that says so takes its reason from here, so that all of them give the same one.
 """
@@ -9,7 +9,7 @@ from verifai_jax.falsification.run import Run
 
 _WHY: dict[str, str] = {
     "given": "its rows were given",
-    "sequence": "its points are a fixed sequence",
+    "sequence": "its points are those of a sequence, spread on purpose",
     "coverage": "this search goes where coverage grows",
     "learned": "this search goes where failures are",
 }
@@ -33,8 +33,8 @@ _BETWEEN: dict[str, str] = {
         "of failing rows is no probability."
     ),
     "sequence": (
-        "The points between the {rows} of the sequence: nothing is known of them. The sequence is "
-        "fixed, so that the share of failing rows is no probability with an interval."
+        "The points between the {rows} of the sequence: nothing is known of them. They were not "
+        "drawn independently, so that the share of failing rows is no probability with an interval."
     ),
     "coverage": (
         "The search chose its points by what it had covered before. Where it did not look nothing "
@@ -45,6 +45,7 @@ _BETWEEN: dict[str, str] = {
         "shown, and the share of failing rows is no probability."
     ),
 }
+_NO_RATE = "The points between the {rows} samples: nothing is known of them."
 _BETWEEN_UNKNOWN = (
     "The points between the {rows} simulations: nothing is known of them. The rows are no "
     "independent samples of the prior, so that the share of failing ones is no probability."
@@ -70,4 +71,6 @@ def what_lies_between(run: Run) -> str:
     """Say what is not known of the points that a run did not simulate."""
     origin = "prior" if run.prior else run.origin
     text = _BETWEEN.get(origin, _BETWEEN_UNKNOWN)
+    if run.prior and run.failure_rate is None:
+        text = _NO_RATE  # No simulation has a verdict, or they are of several models.
     return text.format(rows=f"{run.simulations:,}", given=f"{len(run.first):,}")

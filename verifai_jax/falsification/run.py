@@ -86,8 +86,9 @@ class Run(InNotebook):
     - `prior`: whether the rows are independent samples of the feature space.
     - `origin`: where the rows come from, one of `origin.ORIGINS`, which says why they are no such
       samples: `"first"` (rows that were given came before the samples), `"given"` (all rows were),
-      `"sequence"` (the points of a fixed sequence), `"coverage"` and `"learned"` (a search that
-      goes where coverage grows, or where failures are); empty in a record that does not say.
+      `"sequence"` (the points of a sequence that spreads them), `"coverage"` and `"learned"` (a
+      search that goes where coverage grows, or where failures are); empty in a record that does
+      not say.
     - `folder`: on disk; None for a run in memory.
     - `target`: the problem's name on the command line.
     - `problem`: None for a run that was loaded without it.

@@ -169,6 +169,11 @@ def assumptions(run: Run) -> list[str]:
                 else f"{ENDED.get(run.stopped, BROKE_DOWN)} (Clopper and Pearson's exact interval)."
             )
         )
+        if run.table.counts.repetitions.moved:
+            items.append(
+                "The system has memory or chance of its own, and a simulation may depend on those "
+                "before it: the interval counts them as independent."
+            )
         items.append(
             "The rate is one of the prior, which a person chose: of another distribution of the "
             "inputs it says nothing."

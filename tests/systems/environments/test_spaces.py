@@ -279,6 +279,27 @@ def test_late_actions_are_of_the_space():
     assert problem.system({"x0": 0.0}, 0)["x"].tolist() == [0, 0, 0, 1, 2]
 
 
+@pytest.mark.thorough
+def test_actions_of_spaces_without_a_shape_are_simulated():
+    class Sequences(gym.Env):
+        action_space = spaces.Sequence(spaces.Discrete(3))
+        observation_space = spaces.Box(-9, 9, (1,), np.float64)
+        dt, x0 = 0.1, 0.0
+
+        def reset(self, *, seed=None, options=None):
+            return np.zeros(1), {}
+
+        def step(self, action):
+            return np.array([float(sum(action))]), 0.0, False, False, {}
+
+    for action, status in (((1, 2), "ok"), ((1, 3), "error")):
+        options = {"steps": 2, "signals": ("x",), "features": {"x0": "x0"}}
+        system = vj.gymnasium(Sequences, lambda observation, a=action: a, **options)
+        problem = vj.Problem("sequences", {"x0": vj.Box(0, 1)}, system, "x <= 3")
+        table = vj.falsify(problem, "uniform", 1, progress=False).table.all
+        assert set(table["status"]) == {status}
+
+
 def test_the_option_is_checked():
     with unchecked(), pytest.raises(ValueError, match="clip is True or False; got 2"):
         vj.gymnasium(Machine, act, steps=2, clip=2)

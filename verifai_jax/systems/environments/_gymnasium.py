@@ -146,7 +146,7 @@ class EpisodeFunction:
         changes = any(is_waveform(features[name]) for name in self.features)
         reward, over, rows, overshoots = 0.0, False, [], 0
         wait, lag = (self._delay(d, features) for d in (self.observation_delay, self.action_delay))
-        observations, actions = [], [Fitted(no_action(env.action_space), False)] * lag
+        observations, actions = [], [Fitted(no_action(env.action_space), False) for _ in range(lag)]
         for k in range(self.steps + 1):
             # Copied: an environment may write its next observation into the same array.
             observations.append(copy.deepcopy(observation) if wait else observation)
