@@ -105,6 +105,17 @@ def test_a_run_that_is_resumed_counts_on(run, tmp_path):
 
 
 @pytest.mark.thorough
+def test_a_run_that_is_interrupted_before_its_first_batch_has_a_summary(monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("verifai_jax.falsification.loop.Rounds.advance", interrupted)
+    run = vj.fuzz(LEVEL, 256, batch=64, cells=CELLS, seed=3, confirm=False, progress=False)
+    assert "nothing was simulated; stopped by interrupted" in run.summary()
+    assert len(run.corpus) == len(run.failures) == 0
+
+
+@pytest.mark.thorough
 def test_pictures(run, tmp_path):
     run.coverage.plot(tmp_path / "pairs.png")
     assert (tmp_path / "pairs.png").stat().st_size > 5000

@@ -38,7 +38,8 @@ class FuzzRun(Run):
     def corpus(self) -> "pd.DataFrame":
         """The rows that extended coverage: each covered something that no row before it did."""
         table = self.table.all
-        return table.loc[table["new_marks"] > 0]
+        # A run that was interrupted before its first batch has no row, nor this column.
+        return table.loc[table["new_marks"] > 0] if len(table) else table
 
     @property
     def failures(self) -> "pd.DataFrame":
