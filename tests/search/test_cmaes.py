@@ -213,7 +213,7 @@ def test_contract(cube):
         ({"step": 0}, r"step must be in \(0, 1\]; got 0"),
         ({"small_step": 2}, r"small_step must be in \(0, 1\]; got 2"),
         ({"exploration": 0}, r"exploration must be in \(0, 1\]; got 0"),
-        ({"least_std": "tiny"}, r"least_std must be in \(0, 1\]; got 'tiny'"),
+        ({"min_std": "tiny"}, r"min_std must be in \(0, 1\]; got 'tiny'"),
         ({"full_up_to": -1}, "full_up_to must be an integer of at least 0; got -1"),
         ({"patience": 0}, "patience must be an integer of at least 1; got 0"),
         ({"failures": 1.5}, "failures must be an integer of at least 1; got 1.5"),

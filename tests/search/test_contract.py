@@ -181,7 +181,7 @@ class TestNames:
             (lambda: Halton(scramble=1), "scramble must be True, False or None; got 1"),
             (lambda: CrossEntropy(elite=0), r"elite must be in \(0, 1\]; got 0"),
             (lambda: CrossEntropy(elite="many"), r"elite must be in \(0, 1\]; got 'many'"),
-            (lambda: CrossEntropy(least_elite=1), "integer of at least 2; got 1"),
+            (lambda: CrossEntropy(min_elite=1), "integer of at least 2; got 1"),
             (lambda: CrossEntropy(focus=1.5), r"focus must be in \[0, 1\]; got 1.5"),
             (lambda: CrossEntropy(exploration=0), r"exploration must be in \(0, 1\]; got 0"),
             (lambda: CrossEntropy(widening=0), "widening must be positive and finite; got 0"),

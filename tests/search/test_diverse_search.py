@@ -78,9 +78,9 @@ def test_refusals():
         Diverse(Uniform(), radius=2)
     with (
         unchecked(),
-        pytest.raises(ValueError, match=r"least_radius must be at most radius, 0.1; got 0.2"),
+        pytest.raises(ValueError, match=r"min_radius must be at most radius, 0.1; got 0.2"),
     ):
-        Diverse(Uniform(), radius=0.1, least_radius=0.2)
+        Diverse(Uniform(), radius=0.1, min_radius=0.2)
     with (
         unchecked(),
         pytest.raises(ValueError, match="patience must be an integer of at least 1; got 0"),
@@ -253,7 +253,7 @@ def test_the_radius_shrinks_when_nothing_new_comes():
         radii.append(float(state.radius))
     assert radii[0] == pytest.approx(0.2)
     assert radii[-1] <= 0.05
-    assert min(radii) >= search.least_radius
+    assert min(radii) >= search.min_radius
 
 
 @pytest.mark.thorough

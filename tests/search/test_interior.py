@@ -106,7 +106,7 @@ def shares(**changes):
 
 
 def test_shares_follow_the_evidence():
-    most, least = interior.MOST_SHARE, interior.LEAST_SHARE
+    most, least = interior.MAX_SHARE, interior.MIN_SHARE
     assert shares() == pytest.approx(most / 4)
     assert shares(own=jnp.array(0.5)) == pytest.approx(most)
     assert shares(own=jnp.array(20.0)) == pytest.approx(least)

@@ -139,7 +139,7 @@ def test_halton_points_are_the_same_in_a_loop_and_written_out(dim, monkeypatch):
     for key in (None, jax.random.key(dim)):
         points = []
         for most in (2**14, -1):
-            monkeypatch.setattr("verifai_jax.search.halton.MOST_IN_LOOP", most)
+            monkeypatch.setattr("verifai_jax.search.halton.MAX_IN_LOOP", most)
             points.append(np.asarray(jax.jit(lambda i, key=key: halton_points(i, dim, key))(index)))
         # Which products and sums are joined to one operation is the compiler's choice.
         np.testing.assert_allclose(*points, rtol=5e-7, atol=1.2e-7)

@@ -104,9 +104,9 @@ class Split(Search[tuple[PyTree, ...]]):
     ) -> tuple[Float[Array, "batch d"], tuple[PyTree, ...]]:
         u = jnp.zeros((batch, cube.dim), jnp.float32)
         states = []
-        for its, (search, places, part) in zip(state, self._shares(cube), strict=True):
+        for its, (search, indices, part) in zip(state, self._shares(cube), strict=True):
             points, its = search.ask(its, part, batch)
-            u = u.at[:, places].set(points)
+            u = u.at[:, indices].set(points)
             states.append(its)
         return u, tuple(states)
 
@@ -143,14 +143,14 @@ class Split(Search[tuple[PyTree, ...]]):
         self, verb: str, state: tuple[PyTree, ...], cube: Cube, observations: Observations
     ) -> tuple[PyTree, ...]:
         states = []
-        for its, (search, places, part) in zip(state, self._shares(cube), strict=True):
+        for its, (search, indices, part) in zip(state, self._shares(cube), strict=True):
             seen = search.wants.only(observations)
             gradient, clause_gradients = seen.gradient, seen.clause_gradients
             seen = seen._replace(
-                u=seen.u[:, places],
-                gradient=None if gradient is None else gradient[:, places],
+                u=seen.u[:, indices],
+                gradient=None if gradient is None else gradient[:, indices],
                 clause_gradients=(
-                    None if clause_gradients is None else clause_gradients[:, :, places]
+                    None if clause_gradients is None else clause_gradients[:, :, indices]
                 ),
             )
             states.append(getattr(search, verb)(its, part, seen))
@@ -161,17 +161,17 @@ class Split(Search[tuple[PyTree, ...]]):
         owner = np.full(cube.dim, len(self.parts))
         for number, (names, _) in enumerate(self.parts):
             for name in map(str.strip, names.split(",")):
-                places = [i for i, label in enumerate(cube.names) if _covers(name, label)]
-                if not places:
+                indices = [i for i, label in enumerate(cube.names) if _covers(name, label)]
+                if not indices:
                     raise unknown_name("feature", name, dict.fromkeys(map(_top, cube.names)))
-                for i in places:
+                for i in indices:
                     if owner[i] != len(self.parts):
                         raise ValueError(f"feature {cube.names[i]!r} is in two parts of the Split")
                     owner[i] = number
         shares = []
         for number, search in enumerate(self.searches):
-            places = np.flatnonzero(owner == number)
-            shares.append((search, places, cube.take(tuple(places.tolist()))))
+            indices = np.flatnonzero(owner == number)
+            shares.append((search, indices, cube.take(tuple(indices.tolist()))))
         return shares
 
 

@@ -34,6 +34,8 @@ from verifai_jax.search.base import (
 )
 from verifai_jax.search.moves import all_or_some, has_fine_cells
 
+# The shares and scales below were chosen by hand; no comparison with other values is recorded. With
+# them the search is held to 2.5 times fewer simulations than uniform sampling (test_quality.py).
 RESAMPLED = 0.15
 """Share of the proposals that draw the cell of a coordinate from the prior."""
 
@@ -44,7 +46,9 @@ ALONG_OTHERS = 0.7
 """Share of the proposals along differences of other chains."""
 
 ACCEPTED = 0.3
-"""Acceptance rate that the scales of the steps aim at."""
+"""Acceptance rate that the scales of the steps aim at: between 0.44 and 0.23, the best rates of a
+random walk in one and in many dimensions (Gelman, Roberts, Gilks, Efficient Metropolis jumping
+rules, Bayesian Statistics 5, 1996)."""
 
 ADAPTATION = 0.3
 """Change of the logarithm of the scale by one acceptance."""
@@ -52,10 +56,10 @@ ADAPTATION = 0.3
 COPIES = 4
 """Chains that begin at one point."""
 
-LEAST_SCALE = 0.01
+MIN_SCALE = 0.01
 """Smallest scale of the steps, in unit coordinates."""
 
-LARGEST_SCALE = 0.5
+MAX_SCALE = 0.5
 """Largest scale of the steps, in unit coordinates."""
 
 
@@ -76,7 +80,7 @@ class Annealing(Search[AnnealingState]):
 
     **Arguments:**
 
-    - `chains`: least number of chains; more than the batch has rows take turns.
+    - `chains`: minimum number of chains; more than the batch has rows take turns.
     - `hottest`, `coldest`: temperatures, geometric in between, in units of the robustness' spread
       (from the best to the median) where the chains start.
     - `exploration`: share of chains that draw from the prior, for ever; at least one.
@@ -133,13 +137,13 @@ class Annealing(Search[AnnealingState]):
         along = (0.3 + 0.7 * row[:, 2:3]) * (state.u[one] - state.u[other]) + 0.1 * step
         step = jnp.where(moved, jnp.where(row[:, 5:] < ALONG_OTHERS, along, step), 0.0)
 
-        place = np.flatnonzero(~has_fine_cells(cube))
-        few = cube.discrete[place]
+        index = np.flatnonzero(~has_fine_cells(cube))
+        few = cube.discrete[index]
         # Of a cell, the neighbour or any; of a choice, any.
         width = np.array([cube.ordered[i] / cube.levels[i] for i in few], np.float32)
         either = np.where(width > 0, RESAMPLED + NEIGHBOURING, RESAMPLED)
-        drawn = cell[:, place] * jnp.where(certain[:, few], either, 1.0)
-        sideways = jnp.where(way[:, place] < 0.5, width, -width)
+        drawn = cell[:, index] * jnp.where(certain[:, few], either, 1.0)
+        sideways = jnp.where(way[:, index] < 0.5, width, -width)
         step = step.at[:, few].set(jnp.where((drawn > RESAMPLED) & (drawn < either), sideways, 0.0))
         u = _reflect(own + step)
         u = u.at[:, few].set(jnp.where(drawn < RESAMPLED, prior[:, few], u[:, few]))
@@ -171,13 +175,13 @@ class Annealing(Search[AnnealingState]):
             u=state.u.at[turn].set(jnp.where(accepted[:, None], observations.u, state.u[turn])),
             energy=state.energy.at[turn].set(energy),
             rests=state.rests.at[turn].set(rests.astype(jnp.int32)),
-            step=state.step.at[turn].set(jnp.clip(step, LEAST_SCALE, LARGEST_SCALE)),
+            step=state.step.at[turn].set(jnp.clip(step, MIN_SCALE, MAX_SCALE)),
             spread=spread,
         )
         state = self._start_at_best(state, batch)
-        place = _exchange(state.energy, coldness, chance[batch:].reshape(-1, chains))
+        index = _exchange(state.energy, coldness, chance[batch:].reshape(-1, chains))
         return state._replace(
-            u=state.u[place], energy=state.energy[place], rests=state.rests[place]
+            u=state.u[index], energy=state.energy[index], rests=state.rests[index]
         )
 
     def warm_start(
@@ -194,9 +198,9 @@ class Annealing(Search[AnnealingState]):
         chains = len(state.energy)
         if chains > batch:
             return state
-        place = jnp.argsort(state.energy)[np.arange(chains) // COPIES]
-        place = jnp.where(state.tells == 1, place, jnp.arange(chains))
-        return state._replace(u=state.u[place], energy=state.energy[place])
+        index = jnp.argsort(state.energy)[np.arange(chains) // COPIES]
+        index = jnp.where(state.tells == 1, index, jnp.arange(chains))
+        return state._replace(u=state.u[index], energy=state.energy[index])
 
     def _turn(self, state: AnnealingState, batch: int) -> Int[Array, " batch"]:
         """Return the chains that the rows of the next `tell` belong to."""
@@ -210,8 +214,8 @@ class Annealing(Search[AnnealingState]):
     def _coldness(self, chains: int) -> Float[Array, " chains"]:
         """Return inverse temperatures in units of the inverse spread, zero for the prior."""
         warm = chains - int(np.ceil(self.exploration * chains))
-        place = np.arange(chains) / max(warm - 1, 1)
-        cold = self.coldest * (self.hottest / self.coldest) ** np.minimum(place, 1)
+        share = np.arange(chains) / max(warm - 1, 1)
+        cold = self.coldest * (self.hottest / self.coldest) ** np.minimum(share, 1)
         return jnp.asarray(np.where(np.arange(chains) < warm, 1 / cold, 0.0), jnp.float32)
 
     def _spread(
@@ -239,13 +243,13 @@ def _reflect(u: Float[Array, "n d"]) -> Float[Array, "n d"]:
 
 def _matchings(chains: int) -> Int[np.ndarray, "matchings chains"]:
     """Return partners for exchanges; distances halve, so that a point can get anywhere at once."""
-    place = np.arange(chains, dtype=np.int32)
+    index = np.arange(chains, dtype=np.int32)
     matchings = []
     for distance in (1 << i for i in reversed(range((chains - 1).bit_length()))):
         for first in (0, distance):
-            left = (place - first) // distance % 2 == 0
-            partner = np.where(left, place + distance, place - distance)
-            matchings.append(np.where((partner >= 0) & (partner < chains), partner, place))
+            left = (index - first) // distance % 2 == 0
+            partner = np.where(left, index + distance, index - distance)
+            matchings.append(np.where((partner >= 0) & (partner < chains), partner, index))
     return np.stack(matchings)
 
 
@@ -255,7 +259,7 @@ def _exchange(
     chance: Float[Array, "matchings chains"],
 ) -> Int[Array, " chains"]:
     """Return the chain from which each chain takes its point; hot ones get the missing points."""
-    place = jnp.arange(len(energy), dtype=jnp.int32)
+    index = jnp.arange(len(energy), dtype=jnp.int32)
 
     def exchange(
         carry: tuple[Array, Array], inputs: tuple[Array, Array]
@@ -264,9 +268,9 @@ def _exchange(
         partner, chance = inputs
         gain = (coldness - coldness[partner]) * (energy - energy[partner])
         # One chance for both, that of the colder.
-        taken = jnp.where(chance[jnp.minimum(partner, place)] < gain, partner, place)
+        taken = jnp.where(chance[jnp.minimum(partner, index)] < gain, partner, index)
         return (energy[taken], source[taken]), None
 
-    start = jnp.minimum(energy, np.float32(1e30)), place
+    start = jnp.minimum(energy, np.float32(1e30)), index
     (_, source), _ = jax.lax.scan(exchange, start, (jnp.asarray(_matchings(len(energy))), chance))
     return source

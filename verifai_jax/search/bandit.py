@@ -32,7 +32,8 @@ from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Search, draw_columns, newest_first
 
 BISECTIONS = 20
-"""Halvings of the interval that holds the common level of the bounds."""
+"""Halvings of the interval that holds the common level of the bounds: the level is then known to
+a millionth of the interval, which is near the precision of float32."""
 
 
 class BanditState(NamedTuple):
@@ -98,13 +99,13 @@ class Bandit(Search[BanditState]):
         even = (jnp.argsort(order, axis=0) + prior) / batch
         reward = self._rewards(state.score)
         u = jnp.zeros((batch, cube.dim), jnp.float32)
-        for places, edges, branching in self._bandits(cube):
+        for indices, edges, branching in self._bandits(cube):
             part = _draw(
-                self._density(state, reward, places, edges, branching, batch),
+                self._density(state, reward, indices, edges, branching, batch),
                 edges,
-                even[:, places],
+                even[:, indices],
             )
-            u = u.at[:, places].set(part)
+            u = u.at[:, indices].set(part)
         u = jnp.where(chance < self.exploration, prior, u)
         u = u.at[:, cube.discrete].set(cube.centres(cube.cells(u)))
         return u, state._replace(round=state.round + 1)
@@ -132,35 +133,38 @@ class Bandit(Search[BanditState]):
         choices = [i for i in cells if not cube.ordered[i]]
         others = [i for i in range(cube.dim) if i not in choices]
         groups = []
-        most = max((cube.levels[i] for i in choices), default=0)
-        for places, branching in ((others, (self.buckets,) * self.depth), (choices, (most,))):
-            if not places:
+        max_levels = max((cube.levels[i] for i in choices), default=0)
+        for indices, branching in (
+            (others, (self.buckets,) * self.depth),
+            (choices, (max_levels,)),
+        ):
+            if not indices:
                 continue
             leaves = int(np.prod(branching))
-            edges = np.tile(np.linspace(0, 1, leaves + 1), (len(places), 1))
-            for row, i in zip(edges, places, strict=True):
+            edges = np.tile(np.linspace(0, 1, leaves + 1), (len(indices), 1))
+            for row, i in zip(edges, indices, strict=True):
                 if i in cells:
                     # Cell c is in leaf c * leaves // n (or, a choice, in leaf c).
                     n = cube.levels[i]
                     first = np.arange(leaves + 1)
                     first = np.minimum(first, n) if i in choices else -(-first * n // leaves)
                     row[:] = np.concatenate([[0], np.cumsum(cells[i])])[first]
-            groups.append((np.array(places), edges.astype(np.float32), branching))
+            groups.append((np.array(indices), edges.astype(np.float32), branching))
         return groups
 
     def _density(
         self,
         state: BanditState,
         reward: Float[Array, " window"],
-        places: np.ndarray,
+        indices: np.ndarray,
         edges: Float[np.ndarray, "d edges"],
         branching: tuple[int, ...],
         batch: int,
     ) -> Float[Array, "d edges-1"]:
         """Return the share of the next batch that each leaf gets."""
-        d, leaves = len(places), edges.shape[1] - 1
+        d, leaves = len(indices), edges.shape[1] - 1
         find = jax.vmap(lambda edge, x: jnp.searchsorted(edge, x, side="right"), (0, 1), 1)
-        leaf = find(jnp.asarray(edges[:, 1:-1]), state.u[:, places])
+        leaf = find(jnp.asarray(edges[:, 1:-1]), state.u[:, indices])
         present = jnp.isfinite(state.score).astype(jnp.float32)
         sums = jnp.zeros((d, leaves, 2), jnp.float32)
         sums = sums.at[np.arange(d), leaf].add(jnp.stack([present, reward], axis=1)[:, None])

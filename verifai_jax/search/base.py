@@ -26,7 +26,8 @@ from verifai_jax.core.notebook import ForUsers
 from verifai_jax.core.outcomes import OUTCOME
 
 KIND = 1 << 16
-"""Marks below it are of the first kind, the next so many of the second, and so on."""
+"""Marks of one kind: a mark is `kind * KIND + number`. An int32 has room for 32 768
+kinds with 65 536 numbers each."""
 
 
 class Observations(NamedTuple):
@@ -76,7 +77,7 @@ class TraceOptions:
 
     - `initial`: points of the prior before the model has a say.
     - `share`: of the points that the model proposes; the others are those of the search.
-    - `capacity`: rows that the model knows at most, the best half and the last ones.
+    - `capacity`: maximum number of rows that the model knows, the best half and the last ones.
     - `starts`: descents for each proposal, the best one of which is simulated.
     - `steps`: steps of a descent.
 
@@ -111,7 +112,9 @@ class Wants:
     - `no_verdict_rows`: simulations without a verdict as if they were valid, with the greatest
       robustness so far, so that a model of the robustness learns to stay away from them.
     - `traces`: a model of the traces that proposes some of the points, with these options.
-    - `max_batch`: points in a round beyond which more rounds are worth more than larger ones.
+    - `max_batch`: points in a round beyond which more rounds are worth more than larger ones. The
+      default is a size at which compiled simulators run at three quarters of their greatest speed
+      or more (`benchmarks/RESULTS.md`, "The engine on real dynamics").
     """
 
     gradient: bool = False
@@ -176,7 +179,8 @@ class Wants:
 class Plan(NamedTuple):
     """The simulations that a search that wants clauses wants of its last proposals.
 
-    - `rows`: number of proposals to simulate, from the first on; the others are told as not valid.
+    - `rows`: number of proposals to simulate, from the first on; the search gets the others as rows
+      that are not valid.
     - `differentiate`: whether to compute the gradients of the clauses too, which costs as much as
       another simulation or two.
     - `temperature`: of the smooth robustness to differentiate, row by row, without unit.
@@ -239,7 +243,7 @@ class Search(ForUsers, abc.ABC, Generic[State]):
 
     @property
     def fallback(self) -> "Search | None":
-        """The search that takes its place where the loop cannot give what it wants.
+        """The search to use instead where the loop cannot give what this one wants.
 
         None for a search that is of no use then.
         """

@@ -18,13 +18,16 @@ from jaxtyping import Array, Bool, Float, Int
 from verifai_jax.core.outcomes import OUTCOME, SEGMENTS, SIGNALS
 
 MEMORY = 256
-"""Outcomes that are remembered; the last ones."""
+"""Outcomes that are remembered; the last ones. As many as `Diverse` archives failures by
+default."""
 
 NEIGHBOURS = 15
-"""Remembered outcomes that say how well known one is."""
+"""Remembered outcomes that say how well known one is: the k of novelty search, which Lehman and
+Stanley set to 15."""
 
 ALIKE = 1e-4
-"""Spread of the robustness of safe points, over its size, up to which it says nothing."""
+"""Spread of the robustness of safe points, over its size, up to which it says nothing: a thousand
+roundings of float32, as a constant robustness may have from the arithmetic of a simulation."""
 
 
 class SeenBehaviour(NamedTuple):
@@ -33,19 +36,19 @@ class SeenBehaviour(NamedTuple):
     - `archive`: of archived failures.
     - `best`: of the points to begin afresh from.
     - `memory`: the last outcomes, whatever the robustness; not finite where there is none.
-    - `place`: where in the memory the next one goes.
+    - `index`: row of the memory that the next one takes.
     - `low`, `high`: of each signal.
-    - `least`, `most`: robustness of safe points.
+    - `lowest`, `highest`: robustness of safe points.
     """
 
     archive: Float[Array, "capacity outcome"]
     best: Float[Array, "batch outcome"]
     memory: Float[Array, "memory outcome"]
-    place: Int[Array, ""]
+    index: Int[Array, ""]
     low: Float[Array, " signals"]
     high: Float[Array, " signals"]
-    least: Float[Array, ""]
-    most: Float[Array, ""]
+    lowest: Float[Array, ""]
+    highest: Float[Array, ""]
 
     @classmethod
     def nothing(cls, capacity: int, batch: int) -> "SeenBehaviour":
@@ -55,17 +58,17 @@ class SeenBehaviour(NamedTuple):
             archive=jnp.full((capacity, OUTCOME), unknown),
             best=jnp.full((batch, OUTCOME), unknown),
             memory=jnp.full((MEMORY, OUTCOME), unknown),
-            place=jnp.int32(0),
+            index=jnp.int32(0),
             low=jnp.full(SIGNALS, np.float32(np.inf)),
             high=jnp.full(SIGNALS, np.float32(-np.inf)),
-            least=jnp.float32(np.inf),
-            most=jnp.float32(-np.inf),
+            lowest=jnp.float32(np.inf),
+            highest=jnp.float32(-np.inf),
         )
 
     @property
     def level(self) -> Bool[Array, ""]:
         """True where the robustness of all safe points is the same, so that it says nothing."""
-        return self.most - self.least <= ALIKE * jnp.abs(self.most)
+        return self.highest - self.lowest <= ALIKE * jnp.abs(self.highest)
 
     def widened(
         self, outcomes: Float[Array, "n outcome"], safe: Float[Array, " n"]
@@ -81,23 +84,23 @@ class SeenBehaviour(NamedTuple):
         shape = _shape(outcomes)
         low = jnp.min(jnp.where(known, shape, jnp.inf), axis=(0, 2), initial=jnp.inf)
         high = jnp.max(jnp.where(known, shape, -jnp.inf), axis=(0, 2), initial=-jnp.inf)
-        least = jnp.min(jnp.where(jnp.isnan(safe), jnp.inf, safe), initial=jnp.inf)
-        most = jnp.max(jnp.where(jnp.isnan(safe), -jnp.inf, safe), initial=-jnp.inf)
+        lowest = jnp.min(jnp.where(jnp.isnan(safe), jnp.inf, safe), initial=jnp.inf)
+        highest = jnp.max(jnp.where(jnp.isnan(safe), -jnp.inf, safe), initial=-jnp.inf)
         return self._replace(
             low=jnp.minimum(self.low, low),
             high=jnp.maximum(self.high, high),
-            least=jnp.minimum(self.least, least).astype(jnp.float32),
-            most=jnp.maximum(self.most, most).astype(jnp.float32),
+            lowest=jnp.minimum(self.lowest, lowest).astype(jnp.float32),
+            highest=jnp.maximum(self.highest, highest).astype(jnp.float32),
         )
 
     def recorded(self, outcomes: Float[Array, "n outcome"]) -> "SeenBehaviour":
         """Return the memory with these outcomes among the last ones; unknown ones are left out."""
         known = is_known(outcomes)
-        number = self.place + jnp.cumsum(known) - 1
+        number = self.index + jnp.cumsum(known) - 1
         slot = jnp.where(known, number % MEMORY, MEMORY)
         return self._replace(
             memory=self.memory.at[slot].set(outcomes, mode="drop"),
-            place=((self.place + jnp.sum(known)) % MEMORY).astype(jnp.int32),
+            index=((self.index + jnp.sum(known)) % MEMORY).astype(jnp.int32),
         )
 
     def familiarity(

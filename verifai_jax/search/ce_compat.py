@@ -19,11 +19,12 @@ from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Search, draw_uniform
 
-MOST_COMBINATIONS = 1024
-"""Combinations of the lengths of arrays at most."""
+MAX_COMBINATIONS = 1024
+"""Maximum number of combinations of the lengths of arrays: in a run of a thousand
+simulations more of them would be met once or never, and their histograms would learn nothing."""
 
-MOST_BINS = 2**22
-"""Bins of all histograms at most."""
+MAX_BINS = 2**22
+"""Maximum number of bins of all histograms, which take 16 MB."""
 
 
 class CECompatState(NamedTuple):
@@ -66,16 +67,16 @@ class CECompat(Search[CECompatState]):
         """Raise `ValueError` for too many combinations of lengths, or too many bins."""
         lengths = [cube.levels[i] for i in cube.lengths]
         sets = math.prod(lengths)
-        if sets > MOST_COMBINATIONS:
+        if sets > MAX_COMBINATIONS:
             raise ValueError(
                 f"search ce_compat keeps histograms for each combination of the arrays' lengths, "
-                f"{MOST_COMBINATIONS} at most; this space has {' * '.join(map(str, lengths))} = "
+                f"{MAX_COMBINATIONS} at most; this space has {' * '.join(map(str, lengths))} = "
                 f"{sets}. Use 'cross_entropy'"
             )
         bins = sets * cube.dim * max(self._sizes(cube), default=0)
-        if bins > MOST_BINS:
+        if bins > MAX_BINS:
             raise ValueError(
-                f"search ce_compat would keep {bins} histogram bins on this space, {MOST_BINS} at "
+                f"search ce_compat would keep {bins} histogram bins on this space, {MAX_BINS} at "
                 "most are allowed. Use 'cross_entropy'"
             )
 
@@ -97,16 +98,16 @@ class CECompat(Search[CECompatState]):
         after = state._replace(round=state.round + 1)
         if cube.dim == 0:
             return pick, after
-        which, place = self._set(pick, cube)[:, None], np.arange(cube.dim)
+        which, index = self._set(pick, cube)[:, None], np.arange(cube.dim)
         limits = jnp.cumsum(state.histograms, axis=-1)
-        # Rounding leaves a sum next to one: a pick must not fall behind the last bin.
-        scaled = pick * limits[which, place, -1]
+        # Rounding leaves a sum next to one: a pick must not fall after the last bin.
+        scaled = pick * limits[which, index, -1]
         sizes = np.array(self._sizes(cube), np.int32)
         # The first bin whose limit is above the pick, by bisection.
         bins = jnp.zeros((batch, cube.dim), jnp.int32)
         for step in 2 ** np.arange(int(sizes.max() - 1).bit_length())[::-1]:
             further = jnp.minimum(bins + step, sizes - 1)
-            bins = jnp.where(limits[which, place, further - 1] <= scaled, further, bins)
+            bins = jnp.where(limits[which, index, further - 1] <= scaled, further, bins)
         u = jnp.clip((bins + inside) / sizes, 0.0, 1.0)
         u = u.at[:, cube.discrete].set(cube.centres(bins[:, cube.discrete]))
         lengths = np.array(cube.lengths, np.int32)
@@ -117,13 +118,13 @@ class CECompat(Search[CECompatState]):
         if cube.dim == 0:
             return state
         which = self._set(observations.u, cube)
-        sets, _, most = state.histograms.shape
+        sets, _, max_bins = state.histograms.shape
         own = jax.nn.one_hot(which, sets, dtype=jnp.int32) * fails[:, None]
         total = jnp.sum(own, axis=0)
         # A failure's share shrinks with each further one of the same set, as row by row it would.
         later = jnp.take_along_axis(total - jnp.cumsum(own, axis=0), which[:, None], axis=1)[:, 0]
         share = jnp.where(fails, (1 - self.alpha) * self._power(later), 0.0)
-        new = jnp.zeros((sets, cube.dim, most), jnp.float32)
+        new = jnp.zeros((sets, cube.dim, max_bins), jnp.float32)
         bins = self._bins(observations.u, cube)
         new = new.at[which[:, None], np.arange(cube.dim), bins].add(share[:, None])
         histograms = self._power(total)[:, None, None] * state.histograms + new
@@ -145,6 +146,6 @@ class CECompat(Search[CECompatState]):
         number = jnp.zeros(len(u), jnp.int32)
         cells = cube.cells(u)
         for i in cube.lengths:
-            place = int(np.flatnonzero(cube.discrete == i)[0])
-            number = number * cube.levels[i] + cells[:, place]
+            index = int(np.flatnonzero(cube.discrete == i)[0])
+            number = number * cube.levels[i] + cells[:, index]
         return number

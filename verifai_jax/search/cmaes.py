@@ -40,17 +40,19 @@ from verifai_jax.search.evolution import (
 )
 from verifai_jax.search.halton import halton_points
 
-MOST_CELLS = 32
+MAX_CELLS = 32
 """Cells up to which an unordered coordinate has probabilities: a generation cannot learn more."""
 
 MARGIN = 0.25
-"""Least standard deviation of an ordered discrete coordinate, in cells."""
+"""Minimum standard deviation of an ordered discrete coordinate, in cells: the next cell, whose edge
+is then two standard deviations away, is still drawn in one of twenty points."""
 
 LEARNING = 0.3
-"""Learning rate of the probabilities of unordered cells, per generation."""
+"""Learning rate of the probabilities of unordered cells, per generation. Chosen by hand;
+no comparison with other values is recorded."""
 
 LARGEST = 1e30
-"""Robustness above which all is equally bad."""
+"""Robustness above which all is equally bad: sums of such stay finite in float32."""
 
 
 ADAPTATIONS = 4
@@ -100,8 +102,8 @@ class CMAES(Search[CMAESState]):
     - `exploration`: share of the points drawn from the prior, for ever, in up to five coordinates;
       in more of them it is less, in proportion.
     - `full_up_to`: coordinates up to which there is a whole covariance matrix.
-    - `least_std`: standard deviation at which a run has converged, if all coordinates are below.
-    - `patience`: generations without progress after which a run ends, beside four times those in
+    - `min_std`: standard deviation at which a run has converged, if all coordinates are below.
+    - `patience`: generations without progress after which a run ends, besides four times those in
       which the covariance is learned (25 in all in four coordinates with batches of 16, 130 in ten
       with batches of 10).
     - `failures`: after this many failing points, and no fewer than two generations', a run ends.
@@ -113,12 +115,12 @@ class CMAES(Search[CMAESState]):
     small_step: float = 0.1
     exploration: float = 0.1
     full_up_to: int = 40
-    least_std: float = 1e-5
+    min_std: float = 1e-5
     patience: int = 6
     failures: int = 20
 
     def __post_init__(self) -> None:
-        for name in ("step", "small_step", "exploration", "least_std"):
+        for name in ("step", "small_step", "exploration", "min_std"):
             check_fraction(name, getattr(self, name), one=True)
         check_count("full_up_to", self.full_up_to, 0)
         check_count("patience", self.patience)
@@ -223,8 +225,8 @@ class CMAES(Search[CMAESState]):
     def _learn(self, state: CMAESState, cube: Cube) -> CMAESState:
         there = jnp.isfinite(state.score)
         worst = jnp.max(state.score, where=there, initial=-jnp.inf)
-        least = jnp.min(state.score, where=there, initial=jnp.inf)
-        better = (least < 0.99 * state.best) | ((least == 0) & (state.best > 0))
+        lowest = jnp.min(state.score, where=there, initial=jnp.inf)
+        better = (lowest < 0.99 * state.best) | ((lowest == 0) & (state.best > 0))
         weights = recombination(state.score)
         points = state.u[:, _plain(cube)]
         # A generation of the prior says where the run begins.
@@ -238,9 +240,9 @@ class CMAES(Search[CMAESState]):
             generation=state.generation + 1,
         )
         # Without differences between points there is nothing to learn.
-        learned = _where((least < worst) | (least == 0), learned, state)
+        learned = _where((lowest < worst) | (lowest == 0), learned, state)
         learned = learned._replace(
-            best=jnp.minimum(least, state.best),
+            best=jnp.minimum(lowest, state.best),
             stale=jnp.where(better, 0, state.stale + 1).astype(jnp.int32),
             length=state.length + 1,
         )
@@ -255,7 +257,7 @@ class CMAES(Search[CMAESState]):
         stuck = state.stale >= patience
         if n:
             widest = state.gaussian.size * jnp.sqrt(jnp.max(state.gaussian.variance()))
-            stuck |= (widest < self.least_std) | ~jnp.isfinite(widest)
+            stuck |= (widest < self.min_std) | ~jnp.isfinite(widest)
         failed = state.failures >= max(self.failures, 2 * population)
         return failed | (stuck & (state.generation > 0))
 
@@ -319,7 +321,7 @@ def _plain(cube: Cube) -> Int[np.ndarray, " n"]:
 def _codes(cube: Cube) -> Int[np.ndarray, " k"]:
     """Return indices of the coordinates that have probabilities."""
     return np.array(
-        [i for i in cube.discrete if not cube.ordered[i] and cube.levels[i] <= MOST_CELLS], np.int64
+        [i for i in cube.discrete if not cube.ordered[i] and cube.levels[i] <= MAX_CELLS], np.int64
     )
 
 
@@ -333,8 +335,8 @@ def _prior(cube: Cube) -> Float[np.ndarray, "k cells"]:
 
 def _population(cube: Cube, batch: int) -> int:
     """Return the points in a generation: whole batches, no fewer than the tutorial's default."""
-    least = 4 + int(3 * math.log(max(cube.dim, 1)))
-    return batch * -(-least // batch)
+    smallest = 4 + int(3 * math.log(max(cube.dim, 1)))
+    return batch * -(-smallest // batch)
 
 
 def _learning_time(n: int, population: int, full: bool) -> Float[Array, ""]:
@@ -361,7 +363,7 @@ def _updated_choices(
 
 
 def _margins(cube: Cube) -> Float[np.ndarray, " n"]:
-    """Return the least standard deviation of each coordinate of the Gaussian."""
+    """Return the minimum standard deviation of each coordinate of the Gaussian."""
     return np.array(
         [MARGIN / cube.levels[i] if cube.levels[i] else 0.0 for i in _plain(cube)], np.float32
     )
@@ -378,11 +380,11 @@ def _with_reserve(
     state: CMAESState, u: Float[Array, "n d"], score: Float[Array, " n"]
 ) -> CMAESState:
     """Record the best point of exploration, of equally good ones the newest."""
-    place = jnp.argmin(score)
-    better = jnp.isfinite(score[place]) & (score[place] <= state.reserve_score)
+    index = jnp.argmin(score)
+    better = jnp.isfinite(score[index]) & (score[index] <= state.reserve_score)
     return state._replace(
-        reserve=jnp.where(better, u[place], state.reserve),
-        reserve_score=jnp.where(better, score[place], state.reserve_score),
+        reserve=jnp.where(better, u[index], state.reserve),
+        reserve_score=jnp.where(better, score[index], state.reserve_score),
     )
 
 

@@ -19,9 +19,9 @@ from verifai_jax.core.user_errors import explain_user_error
 from verifai_jax.search.base import Search
 
 BATCH = 16
-"""Points of a round with which the forms are checked."""
+"""Points of a round with which the forms are checked. Nothing is computed; any number serves."""
 MARKS = 4
-"""Marks of a point with which the forms are checked."""
+"""Marks of a point with which the forms are checked; any number serves."""
 
 
 class SearchError(ValueError):

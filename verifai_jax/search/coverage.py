@@ -1,7 +1,7 @@
 """Coverage-guided fuzzing: mutations of points that did what few others did.
 
 Each simulation has marks, numbers of what it covered: transitions of an automaton, cells of
-behaviour, the clause nearest to breaking. For each mark the search keeps the point with the least
+behaviour, the clause nearest to breaking. For each mark the search keeps the point with the lowest
 robustness among those that have it (an archive of elites: Mouret, Clune, Illuminating search spaces
 by mapping elites, 2015), and mutates those of seldom marks more often (Boehme, Pham, Roychoudhury,
 Coverage-based greybox fuzzing as Markov chain, IEEE Transactions on Software Engineering 45(5),
@@ -21,18 +21,19 @@ from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import KIND, Observations, Search, Wants, standard_normal
 
+# The shares and sizes below were chosen by hand; no comparison with other values is recorded.
 STEP = 0.1
 """Standard deviation of small steps, in unit coordinates."""
 
 WAYS = (0.35, 0.55, 0.75, 0.9)
-"""Cumulative shares of mutations: a few coordinates, a stretch, all from a place on, a splice; the
-rest are small steps."""
+"""Cumulative shares of mutations: a few coordinates, a stretch, all from one coordinate on, a
+splice; the rest are small steps."""
 
 SHARES = (0.25, 0.5, 0.25, 0.25)
 """Shares of the kinds of marks: of features, of cells of behaviour, of verdicts, and others."""
 
 KINDS = len(SHARES)
-"""Kinds of marks that are told apart."""
+"""Number of kinds of marks that the search distinguishes."""
 
 VERDICT = 2
 """The kind of marks of verdicts."""
@@ -42,7 +43,7 @@ EDITED = 0.85
 
 EDITS = (0.3, 0.38, 0.72, 0.8)
 """Cumulative shares of edits: putting an item in, another item in place of one, the same kind of
-item with one other number, taking one out; the rest are new items from a place on."""
+item with one other number, taking one out; the rest are new items from one on."""
 
 APPENDED = 0.3
 """Share of edits at the end of an array, where what has happened before stays as it is."""
@@ -70,7 +71,7 @@ class Coverage(Search[CoverageState]):
 
     - `exploration`: share of points drawn from the prior, for ever.
     - `rarity`: exponent by which seldom marks are preferred; 0 is not at all.
-    - `buckets`: marks of a kind that are told apart; others share one.
+    - `buckets`: marks of a kind that the search distinguishes; further marks share these buckets.
 
     **Raises:** `ValueError` for values out of range.
     """
@@ -130,13 +131,13 @@ class Coverage(Search[CoverageState]):
         noise: Float[Array, "n d"],
     ) -> Float[Array, "n d"]:
         d = max(cube.dim, 1)
-        place = np.arange(cube.dim)
+        index = np.arange(cube.dim)
         begin = jnp.floor(coins[:, 0] * d)[:, None]
         length = jnp.ceil(2.0 ** (coins[:, 1] * np.log2(d)))[:, None]
         # One coordinate surely, and one, two, four or eight of them in the mean.
-        few = (place == begin) | (masks * d < 2.0 ** jnp.floor(coins[:, 2:3] * 4) - 1)
-        stretch = (place >= begin) & (place < begin + length)
-        tail = place >= begin
+        few = (index == begin) | (masks * d < 2.0 ** jnp.floor(coins[:, 2:3] * 4) - 1)
+        stretch = (index >= begin) & (index < begin + length)
+        tail = index >= begin
         way = coins[:, 3][:, None]
         drawn = jnp.where(
             way < WAYS[0], few, jnp.where(way < WAYS[1], stretch, tail & (way < WAYS[2]))
@@ -147,8 +148,8 @@ class Coverage(Search[CoverageState]):
         steps = few & continuous & (way >= WAYS[3])
         moved = jnp.where(steps, moved + STEP * standard_normal(noise), moved)
         if cube.lengths:
-            # Items behind the end change nothing.
-            is_length = np.isin(place, cube.lengths)
+            # Items after the end change nothing.
+            is_length = np.isin(index, cube.lengths)
             longer = is_length & (coins[:, 4:5] < LONGER)
             moved = jnp.where(longer, jnp.maximum(parent, fresh), moved)
         if cube.sequences:
@@ -163,10 +164,10 @@ class Coverage(Search[CoverageState]):
             marks = jnp.zeros((n, 1), jnp.int32)
         u = jnp.where(usable[:, None], observations.u, 0.5)
         known, size = usable[:, None] & (marks >= 0), KINDS * self.buckets
-        place = (marks // KIND) % KINDS * self.buckets + marks % KIND % self.buckets
-        bucket = jnp.where(known, place, size)
+        index = (marks // KIND) % KINDS * self.buckets + marks % KIND % self.buckets
+        bucket = jnp.where(known, index, size)
         rows = jnp.broadcast_to(jnp.arange(n)[:, None], bucket.shape)
-        scores = self._scores(cube, observations, place)
+        scores = self._scores(cube, observations, index)
         best = jnp.full(size, jnp.inf, jnp.float32).at[bucket].min(scores, mode="drop")
         nearest = best[jnp.minimum(bucket, size - 1)]
         first = jnp.where(scores <= nearest, rows, n)
@@ -181,9 +182,9 @@ class Coverage(Search[CoverageState]):
         )
 
     def _scores(
-        self, cube: Cube, observations: Observations, place: Int[Array, "n marks"]
+        self, cube: Cube, observations: Observations, index: Int[Array, "n marks"]
     ) -> Float[Array, "n marks"]:
-        """Return what is kept for each mark: short arrays, then the least robustness.
+        """Return what is kept for each mark: short arrays, then the lowest robustness.
 
         For marks of verdicts the robustness alone: those lead to what fails.
         """
@@ -193,7 +194,7 @@ class Coverage(Search[CoverageState]):
         if cube.lengths:
             is_length = np.isin(cube.discrete, cube.lengths)
             size = jnp.sum(cube.cells(observations.u)[:, is_length], axis=1).astype(jnp.float32)
-        verdict = place // self.buckets == VERDICT
+        verdict = index // self.buckets == VERDICT
         return jnp.where(verdict, score[:, None], (size + score)[:, None])
 
 
@@ -208,11 +209,11 @@ def _edited(
     result = parent
     for number, (length, first, width, count) in enumerate(cube.sequences):
         levels = cube.levels[length]
-        least = count + 1 - levels
-        items = jnp.minimum(jnp.floor(parent[:, length] * levels), levels - 1) + least
+        min_items = count + 1 - levels
+        items = jnp.minimum(jnp.floor(parent[:, length] * levels), levels - 1) + min_items
         block = parent[:, first : first + width * count].reshape(-1, count, width)
         new = fresh[:, first : first + width * count].reshape(block.shape)
-        # Behind the last item too, where one more goes.
+        # After the last item too, where one more goes.
         slot = jnp.floor(coins[:, 1] * (items + 1))
         slot = jnp.where(coins[:, 6] < APPENDED, items, slot)
         changes = (coins[:, 3] >= EDITS[1]) & (coins[:, 3] < EDITS[2])
@@ -221,23 +222,23 @@ def _edited(
         # Arcsine distributed: dense at both ends. The kind of an item is its first coordinate.
         extreme = (coins[:, 7] < EXTREME)[:, None, None] & (np.arange(width) > 0)
         new = jnp.where(extreme, jnp.sin(0.5 * np.pi * new) ** 2, new)
-        places, way = jnp.arange(count), coins[:, 3][:, None]
-        here = (places == slot)[:, :, None]
-        behind = (places > slot)[:, :, None]
-        inserted = jnp.where(here, new, jnp.where(behind, jnp.roll(block, 1, axis=1), block))
-        removed = jnp.where(here | behind, jnp.roll(block, -1, axis=1), block)
+        indices, way = jnp.arange(count), coins[:, 3][:, None]
+        here = (indices == slot)[:, :, None]
+        after = (indices > slot)[:, :, None]
+        inserted = jnp.where(here, new, jnp.where(after, jnp.roll(block, 1, axis=1), block))
+        removed = jnp.where(here | after, jnp.roll(block, -1, axis=1), block)
         # Some changes keep the kind of an item and all its numbers but one.
         one = 1 + jnp.floor(coins[:, 8] * max(width - 1, 1))[:, None, None]
         within = here & ((np.arange(width) == one) | (way[:, :, None] < EDITS[1]))
         replaced = jnp.where(within, new, block)
-        tail = jnp.where(here | behind, new, block)
+        tail = jnp.where(here | after, new, block)
         ways = [way < EDITS[0], way < EDITS[2], way < EDITS[3]]
         sizes = [items + 1, jnp.maximum(items, slot[:, 0] + 1), items - 1]
-        longest = jnp.maximum(items, jnp.floor(fresh[:, length] * levels) + least)
+        longest = jnp.maximum(items, jnp.floor(fresh[:, length] * levels) + min_items)
         size = jnp.select([w[:, 0] for w in ways], sizes, longest)
         edited = jnp.select([w[:, :, None] for w in ways], [inserted, replaced, removed], tail)
-        size = jnp.clip(size, least, count)
+        size = jnp.clip(size, min_items, count)
         whole = parent.at[:, first : first + width * count].set(edited.reshape(len(parent), -1))
-        whole = whole.at[:, length].set((size - least + 0.5) / levels)
+        whole = whole.at[:, length].set((size - min_items + 0.5) / levels)
         result = jnp.where((chosen == number)[:, None], whole, result)
     return result

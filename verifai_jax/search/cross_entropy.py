@@ -33,18 +33,19 @@ from verifai_jax.search.base import (
 )
 from verifai_jax.search.halton import halton_points
 
-MOST_CELLS = 32
+MAX_CELLS = 32
 """Cells up to which a coordinate has a histogram: a batch cannot fill one of more."""
 
 FEW_COORDINATES = 4
-"""Coordinates up to which the options that depend on the dimension are the given ones."""
+"""Coordinates up to which the options that depend on the dimension are the given ones. Chosen
+by hand; no comparison with other values is recorded."""
 
 MORE_PATIENCE = 30
 """Simulations without progress that a search waits longer for each further coordinate. In ten
 dimensions, batches of ten and 6 rounds alone, one search in three missed Rastrigin's function."""
 
 NARROWER = 1.5
-"""Power of the dimension with which `least_std` falls: to 0.005 in ten dimensions, where 0.02 and
+"""Power of the dimension with which `min_std` falls: to 0.005 in ten dimensions, where 0.02 and
 0.008 are too wide to hit a ball of radius 0.007."""
 
 
@@ -63,11 +64,11 @@ class CrossEntropy(Search[CrossEntropyState]):
 
     **Arguments:**
 
-    - `elite`: size of the elite, as a share of the batch; at least `least_elite` points.
+    - `elite`: size of the elite, as a share of the batch; at least `min_elite` points.
     - `focus`: in `[0, 1]`; 0 draws from one Gaussian, 1 from the surroundings of elite points.
     - `exploration`: share of each batch drawn from the prior, for ever.
     - `widening`: factor on the elite's standard deviation; above 1 it reaches out of the elite.
-    - `least_std`: standard deviation, in unit coordinates, below which no coordinate narrows; in
+    - `min_std`: standard deviation, in unit coordinates, below which no coordinate narrows; in
       more than four coordinates it is less, since a point must be near in all of them.
     - `patience`: rounds without progress after which it starts afresh elsewhere; in more than four
       coordinates 30 simulations more for each of the others.
@@ -76,24 +77,24 @@ class CrossEntropy(Search[CrossEntropyState]):
     """
 
     elite: float = 0.1
-    least_elite: int = 6
+    min_elite: int = 6
     focus: float = 0.7
     exploration: float = 0.1
     widening: float = 1.5
-    least_std: float = 0.02
+    min_std: float = 0.02
     patience: int = 6
 
     def __post_init__(self) -> None:
         check_fraction("elite", self.elite, one=True)
-        check_count("least_elite", self.least_elite, 2)
+        check_count("min_elite", self.min_elite, 2)
         check_fraction("focus", self.focus, zero=True, one=True)
         check_fraction("exploration", self.exploration, one=True)
-        check_fraction("least_std", self.least_std, one=True)
+        check_fraction("min_std", self.min_std, one=True)
         check_count("patience", self.patience)
         check_positive("widening", self.widening, finite=True)
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> CrossEntropyState:
-        k = max(self.least_elite, int(np.ceil(self.elite * batch)))
+        k = max(self.min_elite, int(np.ceil(self.elite * batch)))
         return CrossEntropyState(
             key=key,
             round=jnp.uint32(0),
@@ -137,9 +138,9 @@ class CrossEntropy(Search[CrossEntropyState]):
         self, key: Key[Array, ""], state: CrossEntropyState, cube: Cube, batch: int
     ) -> Float[Array, "batch d"]:
         """Draw points from the mixture around the elite."""
-        # Places among the discrete coordinates, and their indices among all.
+        # Indices among the discrete coordinates, and among all.
         narrow = np.array(
-            [j for j, i in enumerate(cube.discrete) if cube.levels[i] <= MOST_CELLS], np.int32
+            [j for j, i in enumerate(cube.discrete) if cube.levels[i] <= MAX_CELLS], np.int32
         )
         cells = cube.discrete[narrow]
         widths = (1, cube.dim, len(cells), len(cells))
@@ -152,7 +153,7 @@ class CrossEntropy(Search[CrossEntropyState]):
         mean = weight @ state.elite / count
         std = jnp.sqrt(weight @ (state.elite - mean) ** 2 / count)
         fewer = min(1.0, FEW_COORDINATES / max(cube.dim, 1))
-        std = jnp.maximum(self.widening * std, self.least_std * fewer**NARROWER)
+        std = jnp.maximum(self.widening * std, self.min_std * fewer**NARROWER)
         normal = standard_normal(noise)
         spread = float(np.sqrt(1 - self.focus**2))
         u = jnp.clip(mean + self.focus * (parent - mean) + spread * std * normal, 0.0, 1.0)

@@ -33,14 +33,16 @@ from verifai_jax.search.halton import halton_points
 FIRST_DECAY, SECOND_DECAY = 0.9, 0.99
 """Decay of Adam's means of the gradient and of its square; the latter for short descents."""
 
+# The first two were chosen by hand; no comparison with other values is recorded.
 NEARER = 0.5
 """Factor on the steps of a descent that starts from a good point."""
 
 CLEARLY = 0.995
-"""Share of the least value so far below which a new one is clearly less."""
+"""Share of the lowest value so far below which a new one is clearly lower."""
 
 REMEMBERED = 32
-"""Latest descents at each rung among which one must be good to go on."""
+"""Latest descents at each rung among which one must be good to go on: enough for a quantile such as
+the half, and few enough to follow the search."""
 
 
 class DescentState(NamedTuple):
@@ -50,7 +52,7 @@ class DescentState(NamedTuple):
     mean: Float[Array, "descents d"]  # of the gradients, and of their squares
     square: Float[Array, "descents d"]
     step: Int[Array, " descents"]  # gradients taken since the start; 0 for a descent yet to start
-    best: Float[Array, " descents"]  # least greatest clause since the start
+    best: Float[Array, " descents"]  # lowest greatest clause since the start
     slow: Int[Array, " descents"]  # gradients since it fell clearly
     given: Bool[Array, " descents"]  # descents whose start came from elsewhere
     offered: Float[Array, "descents d"]  # starts from elsewhere
@@ -65,9 +67,9 @@ class Descent(Search[DescentState]):
 
     **Arguments:**
 
-    - `descents`: at once, at most; the batch if that is less.
+    - `descents`: maximum number at once; the batch if that is smaller.
     - `rate`: size of the first steps, in unit coordinates; they fall to a twentieth.
-    - `steps`: gradients of a descent, at most.
+    - `steps`: maximum number of gradients of a descent.
     - `trial`: steps after which a descent is first compared with others.
     - `kept`: share of the descents that go on, at each comparison.
     - `hottest`, `coldest`: temperature of the smooth robustness at the start and at the end of a
@@ -158,12 +160,12 @@ class Descent(Search[DescentState]):
         assert observations.clauses is not None, "the descent search needs clauses"
         assert observations.clause_gradients is not None
         n = len(state.step)
-        told = jax.tree.map(lambda each: each[:n], observations)
-        clauses = _clauses(told)
-        usable = told.usable
-        # The greatest clause counts most: the gradient of a maximum that is smooth.
+        observed = jax.tree.map(lambda each: each[:n], observations)
+        clauses = _clauses(observed)
+        usable = observed.usable
+        # The greatest clause has the largest weight: the gradient of a maximum that is smooth.
         weights = jax.nn.softmax(clauses / self.coldest, axis=1)
-        gradients = jnp.where(usable[:, None, None], told.clause_gradients, 0.0)
+        gradients = jnp.where(usable[:, None, None], observed.clause_gradients, 0.0)
         gradient = jnp.sum(weights[:, :, None] * gradients, axis=1)
         gradient = jnp.where(np.array(cube.levels) == 0, gradient, 0.0)
         informative = jnp.all(jnp.isfinite(gradient), axis=1) & jnp.any(gradient != 0, axis=1)
@@ -174,7 +176,7 @@ class Descent(Search[DescentState]):
         best = jnp.minimum(state.best, merit)
         step = state.step + 1
         slow = jnp.where(merit < CLEARLY * state.best, 0, state.slow + 1)
-        over = ~informative | (told.rho < 0) | (step >= self.steps) | (slow >= self.patience)
+        over = ~informative | (observed.rho < 0) | (step >= self.steps) | (slow >= self.patience)
         arrives = (step[None] == np.array(self.rungs)[:, None]) & ~over & ~state.given
         rungs = _latest(jnp.where(arrives, best, jnp.inf), state.rungs)
         better = jnp.sum(rungs[:, None] < best[:, None], axis=2)
@@ -188,7 +190,7 @@ class Descent(Search[DescentState]):
         direction /= jnp.sqrt(square / (1 - SECOND_DECAY**count)) + 1e-12
         falling = 0.525 + 0.475 * jnp.cos(np.pi * self._progress(state.step))
         rate = self.rate * jnp.where(state.given, NEARER, 1.0) * falling
-        point = jnp.clip(told.u - rate[:, None] * direction, 0.0, 1.0)
+        point = jnp.clip(observed.u - rate[:, None] * direction, 0.0, 1.0)
 
         def kept(new: Array, fresh: float) -> Array:
             return jnp.where(over.reshape(-1, *(1,) * (new.ndim - 1)), fresh, new)
@@ -216,13 +218,13 @@ class Descent(Search[DescentState]):
         return jnp.minimum(step / max(self.steps - 1, 1), 1.0).astype(jnp.float32)
 
 
-def _clauses(told: Observations) -> Float[Array, "n clauses"]:
+def _clauses(observed: Observations) -> Float[Array, "n clauses"]:
     """Return the clauses, and of a single one the robustness, whose scale does not change."""
-    assert told.clauses is not None
-    several = told.clauses[:, 1] > NOTHING
-    first = jnp.where(several, told.clauses[:, 0], told.rho)
-    clauses = told.clauses.at[:, 0].set(first)
-    return jnp.where(told.usable[:, None], clauses, 0.0)
+    assert observed.clauses is not None
+    several = observed.clauses[:, 1] > NOTHING
+    first = jnp.where(several, observed.clauses[:, 0], observed.rho)
+    clauses = observed.clauses.at[:, 0].set(first)
+    return jnp.where(observed.usable[:, None], clauses, 0.0)
 
 
 def _latest(

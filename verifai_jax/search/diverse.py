@@ -5,7 +5,7 @@
     Diverse(Portfolio(), by="behaviour")
     Diverse.count(state), Diverse.archive(state)        # how many distinct failures, and where
 
-An archive holds failures no two of which are within a radius. The search inside is told that what
+An archive holds failures no two of which are within a radius. The search inside learns that what
 is near an archived failure is worse than safe, and where the robustness is differentiated that it
 rises towards it (deflation, as in Farrell, Birkisson and Funke, Deflation techniques for finding
 distinct solutions of nonlinear partial differential equations, SIAM Journal on Scientific Computing
@@ -14,7 +14,7 @@ begins afresh from the best points that lie elsewhere. When it comes no nearer t
 radius shrinks, so that first the modes are found and then the insides of them filled.
 
 By behaviour, failures are apart in what happens (`search/behaviour.py`), wherever their inputs are.
-Where the robustness of all safe points is the same, it says nothing; then what is told of them
+Where the robustness of all safe points is the same, it says nothing; then what it learns of them
 rises with how well known their behaviour is (novelty search: Lehman, Stanley, Abandoning
 objectives: evolution through the search for novelty alone, Evolutionary Computation 19(2), 2011).
 """
@@ -34,16 +34,15 @@ from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.outcomes import OUTCOME
 from verifai_jax.search.base import Observations, Search, Wants
 from verifai_jax.search.behaviour import SeenBehaviour, is_known
+from verifai_jax.search.gradient import NOTHING
 from verifai_jax.search.wrapper import Learn, Wrapper
 
 AT_ONCE = 16
-"""Failures archived in a round at most."""
+"""Maximum number of failures archived in a round, each by one step of a loop: as many as the rounds
+of a diverse run have points by default."""
 
 WAYS = ("inputs", "behaviour")
 """What failures can be far from each other in."""
-
-ABSENT = -1e8
-"""Values of clauses below mean that there is no such clause."""
 
 
 class DiverseState(NamedTuple):
@@ -54,7 +53,7 @@ class DiverseState(NamedTuple):
     count: Int[Array, ""]
     radius: Float[Array, ""]
     idle: Int[Array, ""]  # rounds without a new failure and without coming nearer to one
-    level: Float[Array, ""]  # the least raised robustness since the search began afresh
+    level: Float[Array, ""]  # the lowest raised robustness since the search began afresh
     size: Float[Array, ""]  # sum of the sizes of robustness seen
     verdicts: Float[Array, ""]  # and how many there were
     points: Float[Array, "batch d"]  # the best points away from the archive, to begin afresh from,
@@ -71,10 +70,10 @@ class Diverse(Wrapper[DiverseState]):
     - `search`: the one inside.
     - `radius`: how far distinct failures are apart at first: root mean square over the unit
       coordinates, in which two random points are 0.41 apart; choices differ by 0 or 1.
-    - `least_radius`: the radius shrinks no further.
+    - `min_radius`: the radius shrinks no further.
     - `shrink`: factor on the radius, and a new beginning for the search inside, after
     - `patience` rounds that brought no new failure and came no nearer to one.
-    - `capacity`: of the archive; no more failures than that are told apart.
+    - `capacity`: of the archive, and so the maximum number of distinct failures.
     - `by`: what distinct failures are far from each other in: `"inputs"`, or `"behaviour"`, for
       which the radius is a share of what can differ (`search.behaviour.unlike`).
 
@@ -83,7 +82,7 @@ class Diverse(Wrapper[DiverseState]):
 
     search: Search
     radius: float = 0.25
-    least_radius: float = 0.01
+    min_radius: float = 0.01
     shrink: float = 0.8
     patience: int = 8
     capacity: int = 256
@@ -93,15 +92,15 @@ class Diverse(Wrapper[DiverseState]):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_fraction("radius", self.radius, one=True)
-        check_fraction("least_radius", self.least_radius, one=True)
+        check_fraction("min_radius", self.min_radius, one=True)
         check_fraction("shrink", self.shrink, one=True)
         check_count("patience", self.patience)
         check_count("capacity", self.capacity)
         if self.by not in WAYS:
             raise unknown_name("way of being diverse", self.by, WAYS)
-        if self.least_radius > self.radius:
+        if self.min_radius > self.radius:
             raise ValueError(
-                f"least_radius must be at most radius, {self.radius}; got {self.least_radius}"
+                f"min_radius must be at most radius, {self.radius}; got {self.min_radius}"
             )
 
     @property
@@ -171,7 +170,7 @@ class Diverse(Wrapper[DiverseState]):
             observations = observations._replace(rho=rho, outcomes=happened)
             if observations.clauses is not None:
                 # These have no unit.
-                there = observations.clauses > ABSENT
+                there = observations.clauses > NOTHING
                 clauses = observations.clauses + jnp.where(there, known[:, None], 0.0)
                 observations = observations._replace(clauses=clauses)
         state = state._replace(
@@ -186,7 +185,7 @@ class Diverse(Wrapper[DiverseState]):
         progress = discovered | (nearest < 0.98 * state.level) | ~jnp.isfinite(state.level)
         idle = jnp.where(progress, 0, state.idle + 1).astype(jnp.int32)
         tired = idle >= self.patience
-        smaller = jnp.maximum(self.shrink * state.radius, self.least_radius)
+        smaller = jnp.maximum(self.shrink * state.radius, self.min_radius)
         state = state._replace(
             idle=jnp.where(tired, 0, idle),
             radius=jnp.where(tired, smaller, state.radius).astype(jnp.float32),
@@ -223,22 +222,22 @@ class Diverse(Wrapper[DiverseState]):
             _: Int[Array, ""], carry: tuple[Array, Array, Array, Array]
         ) -> tuple[Array, Array, Array, Array]:
             archive, kept, count, far = carry
-            place = jnp.argmax(jnp.where(failing, far, -1.0))
-            fresh = failing[place] & (far[place] > state.radius) & (count < self.capacity)
+            index = jnp.argmax(jnp.where(failing, far, -1.0))
+            fresh = failing[index] & (far[index] > state.radius) & (count < self.capacity)
             slot = jnp.minimum(count, self.capacity - 1)
-            archive = jnp.where(fresh, archive.at[slot].set(u[place]), archive)
+            archive = jnp.where(fresh, archive.at[slot].set(u[index]), archive)
             if seen is None or happened is None:
-                between = apart(cube, u, u[place][None])
+                between = apart(cube, u, u[index][None])
             else:
-                kept = jnp.where(fresh, kept.at[slot].set(happened[place]), kept)
-                between = seen.unlike(happened, happened[place][None])
+                kept = jnp.where(fresh, kept.at[slot].set(happened[index]), kept)
+                between = seen.unlike(happened, happened[index][None])
             closer = jnp.minimum(far, between[:, 0])
             return archive, kept, count + fresh.astype(count.dtype), jnp.where(fresh, closer, far)
 
         far = jnp.min(self._distances(state, cube, u, happened), axis=1)
-        most = min(AT_ONCE, len(u))
+        max_new = min(AT_ONCE, len(u))
         start = (state.archive, kept, state.count, far)
-        archive, kept, count, _ = jax.lax.fori_loop(0, most, add, start)
+        archive, kept, count, _ = jax.lax.fori_loop(0, max_new, add, start)
         if seen is not None:
             seen = seen._replace(archive=kept)
         return state._replace(archive=archive, count=count, seen=seen)
@@ -250,7 +249,7 @@ class Diverse(Wrapper[DiverseState]):
         u: Float[Array, "n d"],
         happened: Float[Array, "n outcome"] | None,
     ) -> Float[Array, "n capacity"]:
-        """Return distances to all archived failures; infinite for empty places of the archive."""
+        """Return distances to all archived failures; infinite for empty rows of the archive."""
         known = jnp.arange(self.capacity) < state.count
         if state.seen is None or happened is None:
             return jnp.where(known, apart(cube, u, state.archive), jnp.inf)
@@ -266,8 +265,8 @@ class Diverse(Wrapper[DiverseState]):
         """Return 1 at an archived failure, 0 from one and a half radii on; and its index."""
         far = self._distances(state, cube, u, happened)
         nearest = jnp.argmin(far, axis=1)
-        least = jnp.min(far, axis=1)
-        return jnp.clip(1 - least / (1.5 * state.radius), 0.0, 1.0), nearest
+        distance = jnp.min(far, axis=1)
+        return jnp.clip(1 - distance / (1.5 * state.radius), 0.0, 1.0), nearest
 
     def _scale(self, state: DiverseState) -> Float[Array, ""]:
         return 2.0 * state.size / jnp.maximum(state.verdicts, 1.0) + 1e-6
@@ -309,7 +308,7 @@ class Diverse(Wrapper[DiverseState]):
             )
         if observations.clauses is not None:
             # These have no unit, and of clauses that there are not the values stay very low.
-            there = inside[:, None] & (observations.clauses > ABSENT)
+            there = inside[:, None] & (observations.clauses > NOTHING)
             lifted = jnp.maximum(observations.clauses, 0.0) + near[:, None]
             changed = changed._replace(clauses=jnp.where(there, lifted, observations.clauses))
             gradients = observations.clause_gradients
@@ -350,8 +349,8 @@ class Diverse(Wrapper[DiverseState]):
         happened = None if state.seen is None else state.seen.best
         rho = jnp.where(known, state.rho, 1.0)
         raised = self._raise(state, cube, state.points, happened, rho)
-        told = Observations(state.points, raised, known, outcomes=happened)
-        return self.search.warm_start(inner, cube, told)
+        observed = Observations(state.points, raised, known, outcomes=happened)
+        return self.search.warm_start(inner, cube, observed)
 
 
 def apart(cube: Cube, one: Float[Array, "n d"], other: Float[Array, "m d"]) -> Float[Array, "n m"]:

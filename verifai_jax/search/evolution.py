@@ -70,8 +70,8 @@ class Evolution(NamedTuple):
         # Points that others replaced may be far out: as for injected ones, their steps are cut
         # (Hansen, Injecting external solutions into CMA-ES, 2011).
         norm = jnp.sqrt(jnp.sum(white**2, axis=1, keepdims=True))
-        most = math.sqrt(n) + 2 * n / (n + 2)
-        cut = jnp.minimum(1.0, most / jnp.maximum(norm, 1e-12))
+        limit = math.sqrt(n) + 2 * n / (n + 2)
+        cut = jnp.minimum(1.0, limit / jnp.maximum(norm, 1e-12))
         steps, white = steps * cut, white * cut
 
         mass = _mass(weights)  # mu_eff
@@ -112,15 +112,15 @@ class Evolution(NamedTuple):
             age=self.age + 1,
         )
 
-    def widened(self, least: Float[np.ndarray, " n"]) -> "Evolution":
-        """Raise standard deviations to at least `least`, and give the covariance a factor."""
+    def widened(self, min_std: Float[np.ndarray, " n"]) -> "Evolution":
+        """Raise standard deviations to at least `min_std`, and give the covariance a factor."""
         if len(self.mean) == 0:
             return self
         # A direction may become narrow, but not so that 32 bits lose it.
         variance = self.variance()
         floor = jnp.maximum(1e-6 * jnp.max(variance), 1e-12)
         std = self.size * jnp.sqrt(jnp.maximum(variance, floor))
-        factor = jnp.maximum(least.astype(np.float32) / std, 1.0)
+        factor = jnp.maximum(min_std.astype(np.float32) / std, 1.0)
         if self.covariance.ndim == 1:
             return self._replace(covariance=factor**2 * jnp.maximum(variance, floor))
         covariance = self.covariance + floor * jnp.eye(len(self.mean), dtype=jnp.float32)

@@ -23,10 +23,12 @@ from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float, Key
 
 VARIANCE = (-3.0, 4.0)
-"""Range of the logarithm of the variance."""
+"""Range of the logarithm of the variance. Data have variance 1, whose logarithm is well inside."""
 
 LENGTH = (-4.0, 8.0)
-"""Range of the logarithms of the length scales."""
+"""Range of the logarithms of the length scales, in cubes: from a fiftieth of a cube, below which a
+few hundred points say nothing about what lies between them, to 3000 cubes, where a coordinate is of
+no influence."""
 
 NOISE = (-9.0, 0.0)
 """Range of the logarithm of the noise, which keeps 32-bit factors finite."""
@@ -84,7 +86,7 @@ class GaussianProcess:
 
     def first(self) -> Hyper:
         """Return the start of the fit: neighbours are related over half the cube's diagonal."""
-        plain, codes = self._places()
+        plain, codes = self._indices()
         lengths = np.zeros(len(self.unordered))
         lengths[plain] = math.log(0.5 * math.sqrt(max(len(plain), 1)))
         lengths[codes] = math.log(max(len(codes), 1))
@@ -94,7 +96,7 @@ class GaussianProcess:
         self, hyper: Hyper, a: Float[Array, "n d"], b: Float[Array, "m d"]
     ) -> Float[Array, "n m"]:
         """Return the covariance of the values at the points `a` and `b`, without noise."""
-        plain, codes = self._places()
+        plain, codes = self._indices()
         inverse = jnp.exp(-hyper.lengths)
         # About the middle, so that the difference below loses few digits.
         left, right = ((x[:, plain] - 0.5) * inverse[plain] for x in (a, b))
@@ -118,7 +120,7 @@ class GaussianProcess:
         (Hvarfner, Hellsten, Nardi, Vanilla Bayesian optimization performs great in high dimensions,
         ICML 2024).
         """
-        plain, codes = self._places()
+        plain, codes = self._indices()
         mean = math.sqrt(2) + 0.5 * math.log(max(len(plain), 1))
         lengths = jnp.sum((hyper.lengths[plain] - mean) ** 2) / 3
         mean = math.log(max(len(codes), 1))
@@ -174,7 +176,7 @@ class GaussianProcess:
     def paths(self, posterior: Posterior, key: Key[Array, ""], count: int, waves: int) -> Paths:
         """Draw `count` functions from the posterior; the prior's part has `waves` random waves."""
         hyper, n = posterior.hyper, len(posterior.residual)
-        plain, codes = self._places()
+        plain, codes = self._indices()
         c, k = len(plain), len(codes)
         # One call for all random numbers: each costs a good part of a second to compile.
         sizes = [waves * (c + 5), waves * (1 + 3 * k), (waves + n) * count]
@@ -215,7 +217,7 @@ class GaussianProcess:
         return jnp.where(posterior.mask, self.covariance(posterior.hyper, x, posterior.x), 0.0)
 
     def _waves(self, hyper: Hyper, paths: Paths, x: Float[Array, "m d"]) -> Float[Array, "m f"]:
-        plain, codes = self._places()
+        plain, codes = self._indices()
         size = jnp.sqrt(2 * jnp.exp(hyper.variance) / len(paths.phases))
         waves = size * jnp.cos((x[:, plain] - 0.5) @ paths.frequencies.T + paths.phases)
         if len(codes) == 0:
@@ -235,7 +237,7 @@ class GaussianProcess:
         value = jnp.where(both, self.covariance(hyper, x, x), 0.0)
         return value + jnp.diag(jnp.where(mask, jnp.exp(hyper.noise), 1.0))
 
-    def _places(self) -> tuple[np.ndarray, np.ndarray]:
+    def _indices(self) -> tuple[np.ndarray, np.ndarray]:
         """Return indices of the quantities and of the codes."""
         codes = np.array(self.unordered, bool)
         return np.flatnonzero(~codes), np.flatnonzero(codes)

@@ -2,8 +2,8 @@
 
 A system fails where all clauses of a goal are negative at once (`mtl.clauses`). Around a point
 where their values and gradients are known, each clause is taken for linear, and the next point is
-where the greatest of them is least: a corner of the cube or of a box around the point, or where two
-clauses meet. That is sequential linear programming for a minimax problem (Fletcher, Practical
+where the greatest of them is lowest: a corner of the cube or of a box around the point, or where
+two clauses meet. That is sequential linear programming for a minimax problem (Fletcher, Practical
 Methods of Optimization, 1987, section 14.6); for one clause it is a jump along the signs of its
 gradient, which often ends in a corner that fails. A maximum of clauses does not stall it, as it
 does a plain gradient, because the gradients of all clauses count.
@@ -32,7 +32,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction, check_positive
-from verifai_jax.core.clauses import CLAUSES
+from verifai_jax.core.clauses import ABSENT, CLAUSES
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import (
     Observations,
@@ -45,37 +45,46 @@ from verifai_jax.search.base import (
 )
 from verifai_jax.search.halton import halton_points
 
-NOTHING = -1e8
-"""Values of clauses below mean that a goal has no such clause."""
+NOTHING = ABSENT / 10
+"""Values of clauses below mean that a goal has no such clause. Above `ABSENT`, which is raised
+where what a search learns is changed, and below the value of any clause, which has no unit."""
 
 LITTLE = 0.9
-"""Share of the robustness that is left after a step which is only a little better."""
+"""Share of the robustness that is left after a step which is only a little better.
+Chosen by hand; no comparison with other values is recorded."""
 
 WOBBLE = 0.1
 """Greatest share by which boxes smaller than the cube are less, in all of a run: with it all points
 of a descent but its start and a corner depend on the seed."""
 
 SIZES = 6
-"""Boxes tried at once at most."""
+"""Maximum number of boxes tried at once: after the whole cube, the sixth box has a hundredth of its
+side, which is less than the default `min_radius`."""
 
 FIRST_BOX = 0.4
-"""Size of the first box of most descents: beyond it gradients say little."""
+"""Size of the first box of short descents: beyond it gradients say little. Chosen among others from
+192 to 384 random starts, by simulations a failure (`benchmarks/RESULTS.md`, "Short descents")."""
 
 WHOLE_CUBE = 2
-"""Of so many descents one begins with the whole cube."""
+"""Of so many descents one begins with the whole cube, for failures in corners such as those of CC2.
+With one of four, and twelve descents first, the landscape of ripples cost half as much again."""
 
 OFFERED_BOX = 0.16
-"""Size of the first box around a start that was offered."""
+"""Size of the first box around a start that was offered: `FIRST_BOX` shrunk once by the
+default factor."""
 
 UNPROMISING = 0.75
-"""Share of `FIRST_BOX` below which a box is not tried where no greater one was better."""
+"""Share of `FIRST_BOX` below which a box is not tried where no greater one was better: the first
+box is tried, and the next smaller one is not."""
 
 COOLING = 0.7
-"""Factor on the temperature with each step, behind the first descent."""
+"""Factor on the temperature with each step, after the first descent. Chosen by hand;
+no comparison with other values is recorded."""
 
 
 HALVINGS = 24
-"""Halvings of the interval that holds the weight at which two clauses are equal."""
+"""Halvings of the interval that holds the weight at which two clauses are equal: as many as a
+float32 has bits, so that more would change nothing."""
 
 
 class GradientState(NamedTuple):
@@ -109,9 +118,9 @@ class Gradient(Search[GradientState]):
 
     **Arguments:**
 
-    - `descents`: at once, at most; a quarter of the batch if that is less.
+    - `descents`: maximum number at once; a quarter of the batch if that is smaller.
     - `shrinks`: factor on the size of the box when nothing in it was better.
-    - `least_radius`: size of the box below which a descent ends, once it has made a step.
+    - `min_radius`: size of the box below which a descent ends, once it has made a step.
     - `flips`: coordinates of a corner tried the other way before a descent ends.
     - `patience`: steps in a row that are little better after which a descent ends.
     - `temperatures`: of the smooth robustness, in units of the spread of the predicates: of the
@@ -125,7 +134,7 @@ class Gradient(Search[GradientState]):
 
     descents: int = 16
     shrinks: float = 0.4
-    least_radius: float = 0.02
+    min_radius: float = 0.02
     flips: int = 3
     patience: int = 4
     temperatures: tuple[float, ...] = (0.002, 0.05, 0.2)
@@ -135,7 +144,7 @@ class Gradient(Search[GradientState]):
     def __post_init__(self) -> None:
         check_count("descents", self.descents)
         check_fraction("shrinks", self.shrinks, one=True)
-        check_fraction("least_radius", self.least_radius, one=True)
+        check_fraction("min_radius", self.min_radius, one=True)
         check_count("flips", self.flips, 0)
         check_count("patience", self.patience)
         check_positive("coldest", self.coldest, finite=True)
@@ -208,18 +217,20 @@ class Gradient(Search[GradientState]):
         box = state.radius[descent] * self.shrinks ** size.astype(jnp.float32)
         tried_box = jnp.where(box < 1, box * (1 - WOBBLE * draw_uniform(state.key, (1,))), box)
         # No more rows than these are ever simulated.
-        most = min(n * min(SIZES, batch // n), batch)
+        max_rows = min(n * min(SIZES, batch // n), batch)
         tried, flipped = jax.lax.cond(
             differentiates,
-            lambda: (starts[descent[:most]], jnp.zeros(most, bool)),
-            lambda: self._boxes(state, cube, descent[:most], size[:most], tried_box[:most]),
+            lambda: (starts[descent[:max_rows]], jnp.zeros(max_rows, bool)),
+            lambda: self._boxes(
+                state, cube, descent[:max_rows], size[:max_rows], tried_box[:max_rows]
+            ),
         )
-        tried = jnp.pad(tried, ((0, batch - most), (0, 0)), constant_values=0.5)
+        tried = jnp.pad(tried, ((0, batch - max_rows), (0, 0)), constant_values=0.5)
         u = jnp.where(differentiates, starts[descent], tried)
         return u, state._replace(
             descent=descent,
             box=box,
-            flipped=jnp.pad(flipped, (0, batch - most)),
+            flipped=jnp.pad(flipped, (0, batch - max_rows)),
             rows=rows.astype(jnp.int32),
             differentiates=differentiates,
         )
@@ -232,7 +243,7 @@ class Gradient(Search[GradientState]):
         size: Int[Array, " n"],
         box: Float[Array, " n"],
     ) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:
-        """Return where the linear clauses are least in boxes of descents, and which are flips."""
+        """Return where the linear clauses are lowest in boxes of descents, and which are flips."""
         free = np.array(cube.levels) == 0
         clauses, gradients = state.clauses[descent], state.gradients[descent]
         point = state.point[descent]
@@ -266,13 +277,13 @@ class Gradient(Search[GradientState]):
         # For each descent the best of its rows, the first of equally good ones.
         scores = jnp.where(owner & usable[None], merit[None], jnp.inf)
         best = jnp.argmin(scores, axis=1)
-        least = jnp.min(scores, axis=1)
+        lowest = jnp.min(scores, axis=1)
         failed = jnp.any(owner & (usable & (observations.rho < 0))[None], axis=1)
 
         gradients = jnp.where(usable[best][:, None, None], observations.clause_gradients[best], 0.0)
         finite = jnp.all(jnp.isfinite(gradients), axis=(1, 2))
         gradients = jnp.where(finite[:, None, None], gradients, 0.0)
-        informative = finite & jnp.any(gradients != 0, axis=(1, 2)) & jnp.isfinite(least)
+        informative = finite & jnp.any(gradients != 0, axis=(1, 2)) & jnp.isfinite(lowest)
         visited = jnp.any(owner, axis=1)
         before = jnp.max(state.clauses, axis=1)
 
@@ -292,11 +303,11 @@ class Gradient(Search[GradientState]):
             useless=jnp.where(
                 jnp.any(informative),
                 0,
-                state.useless + jnp.sum(visited & jnp.isfinite(least) & ~informative),
+                state.useless + jnp.sum(visited & jnp.isfinite(lowest) & ~informative),
             ).astype(jnp.int32),
         )
         # Without: a better point, whose gradients are wanted next, or a smaller box.
-        better = least < before - 1e-4 * jnp.abs(before)
+        better = lowest < before - 1e-4 * jnp.abs(before)
         smallest = jnp.min(jnp.where(owner, state.box[None], jnp.inf), axis=1)
         turned = state.flipped[best] & visited
         flips = state.flips + jnp.sum(owner, axis=1).astype(jnp.int32)
@@ -306,9 +317,9 @@ class Gradient(Search[GradientState]):
         radius = jnp.where(better, grown, smallest * self.shrinks)
         limit = min(self.flips, len(cube.continuous))
         early = ~long & ~state.given & (state.steps == 0)
-        least_radius = jnp.where(early, UNPROMISING * FIRST_BOX, self.least_radius)
-        over = failed | (~better & jnp.where(turned, flips >= limit, radius < least_radius))
-        slow = jnp.where(least > LITTLE * before, state.slow + 1, 0)
+        min_radius = jnp.where(early, UNPROMISING * FIRST_BOX, self.min_radius)
+        over = failed | (~better & jnp.where(turned, flips >= limit, radius < min_radius))
+        slow = jnp.where(lowest > LITTLE * before, state.slow + 1, 0)
         over |= better & (slow >= self.patience)
         goes_on = visited & ~over
         cooling = jnp.where(long, 0.5, COOLING)
@@ -344,13 +355,13 @@ class Gradient(Search[GradientState]):
         rounds of gradients do not go on until the others have found some too.
         """
         none = jnp.full_like(state.near, jnp.inf)
-        told = self.warm_start(state._replace(near=none), cube, observations)
-        count, n = jnp.sum(jnp.isfinite(told.near)), len(state.near)
-        place = jnp.arange(n) % jnp.maximum(count, 1)
+        warmed = self.warm_start(state._replace(near=none), cube, observations)
+        count, n = jnp.sum(jnp.isfinite(warmed.near)), len(state.near)
+        index = jnp.arange(n) % jnp.maximum(count, 1)
         chosen = (jnp.arange(n) < jnp.maximum(count, n // 2 + 1)) & (count > 0)
         return state._replace(
-            offered=_rows(chosen, told.offered[place], state.offered),
-            near=jnp.where(chosen, told.near[place], none),
+            offered=_rows(chosen, warmed.offered[index], state.offered),
+            near=jnp.where(chosen, warmed.near[index], none),
             fresh=state.fresh | chosen,
             known=state.known & ~chosen,
         )
@@ -399,8 +410,8 @@ def _minimax(
     low, high = jnp.maximum(point - radius, 0.0), jnp.minimum(point + radius, 1.0)
 
     def corner(gradient: Float[Array, "*m d"]) -> Float[Array, "*m d"]:
-        place = jnp.where(gradient > 0, low, jnp.where(gradient < 0, high, point))
-        return jnp.where(free, place, point)
+        target = jnp.where(gradient > 0, low, jnp.where(gradient < 0, high, point))
+        return jnp.where(free, target, point)
 
     def linear(points: Float[Array, "*m d"]) -> Float[Array, "*m clauses"]:
         return clauses + (points - point) @ gradients.T
@@ -414,15 +425,15 @@ def _minimax(
         return apart + jnp.sum((points - point) * turned, axis=1)
 
     def halve(_: Int[Array, ""], weights: tuple[Array, Array]) -> tuple[Array, Array]:
-        # At the least weight on the first clause it is the greater one, at the most the second.
-        least, most = weights
-        middle = (least + most) / 2
+        # At the lower weight on the first clause it is the greater one, at the upper the second.
+        lower, upper = weights
+        middle = (lower + upper) / 2
         above = gap(corner(middle[:, None] * one + (1 - middle)[:, None] * two)) > 0
-        return jnp.where(above, middle, least), jnp.where(above, most, middle)
+        return jnp.where(above, middle, lower), jnp.where(above, upper, middle)
 
     zero = jnp.zeros(len(pairs), jnp.float32)
-    least, most = jax.lax.fori_loop(0, halvings, halve, (zero, zero + 1))
-    a, b = (corner(w[:, None] * one + (1 - w)[:, None] * two) for w in (least, most))
+    lower, upper = jax.lax.fori_loop(0, halvings, halve, (zero, zero + 1))
+    a, b = (corner(w[:, None] * one + (1 - w)[:, None] * two) for w in (lower, upper))
     above, below = jnp.maximum(gap(a), 0.0), jnp.maximum(-gap(b), 0.0)
     share = jnp.where(above + below > 0, below / (above + below), 0.5)[:, None]
     candidates = jnp.concatenate([corner(gradients), share * a + (1 - share) * b])

@@ -20,9 +20,9 @@ from verifai_jax.core.checks import check_count
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Search
 
-MOST_POINTS = 2**31 - 1
-"""Points of a grid at most."""
-
+MAX_POINTS = 2**31 - 1
+"""Maximum number of points of a grid: numbers of points are 32 bits, and sums of two of them
+too."""
 
 STEPS = 6
 """Steps of the permutation; with fewer, small grids have fewer different orders."""
@@ -56,8 +56,8 @@ class Grid(Search[GridState]):
 
     def __post_init__(self) -> None:
         if isinstance(self.points, tuple):
-            for place, points in enumerate(self.points):
-                check_count(f"points[{place}]", points)
+            for index, points in enumerate(self.points):
+                check_count(f"points[{index}]", points)
         else:
             check_count("points", self.points)
 
@@ -69,12 +69,12 @@ class Grid(Search[GridState]):
                 f"coordinate; got {self.points}"
             )
         total = self.total(cube)
-        if total > MOST_POINTS:
+        if total > MAX_POINTS:
             size = f"{total}" if total < 10**15 else f"about 10^{len(str(total)) - 1}"
             raise ValueError(
                 f"a grid with points={self.points} on the {len(cube.continuous)} continuous and "
                 f"{len(cube.discrete)} discrete unit coordinates of this space has {size} points; "
-                f"at most {MOST_POINTS} are allowed. Take fewer points, such as "
+                f"at most {MAX_POINTS} are allowed. Take fewer points, such as "
                 "points=(5, 1, 1, ...) for each continuous coordinate, or search a part of the "
                 "space by grid and the rest by another search"
             )
@@ -106,11 +106,11 @@ class Grid(Search[GridState]):
             figures.append((rest % np.uint32(size)).astype(jnp.int32))
             rest = rest // np.uint32(size)
         k = len(cube.discrete)
-        places = jnp.stack(figures, axis=1) if figures else jnp.zeros((batch, 0), jnp.int32)
+        digits = jnp.stack(figures, axis=1) if figures else jnp.zeros((batch, 0), jnp.int32)
         u = jnp.zeros((batch, cube.dim), jnp.float32)
-        u = u.at[:, cube.discrete].set(cube.centres(places[:, :k]))
+        u = u.at[:, cube.discrete].set(cube.centres(digits[:, :k]))
         sizes = np.array(self._sizes(cube)[k:], np.int32)
-        steps = places[:, k:] / np.maximum(sizes - 1, 1).astype(np.float32)
+        steps = digits[:, k:] / np.maximum(sizes - 1, 1).astype(np.float32)
         return u.at[:, cube.continuous].set(jnp.where(sizes > 1, steps, np.float32(0.5)))
 
     def tell(self, state: GridState, cube: Cube, observations: Observations) -> GridState:

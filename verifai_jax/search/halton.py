@@ -20,20 +20,21 @@ from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Search, draw_uniform
 
 BITS = 32
-"""Bits of the index of a point."""
+"""Bits of the index of a point: JAX has no wider integers by default."""
 
 PLAIN_UP_TO = 8
 """Number of bases up to which the sequence is plain: in larger ones lines are visible."""
 
-MOST_IN_LOOP = 2**14
+MAX_IN_LOOP = 2**14
 """Coordinates of points computed in a loop, which compiles in a third of the time; more run ten
 times as fast where the loop is written out."""
 
-MOST_SKIPPED_POINTS = 2**31
-"""Skipped points at most, so that as many indices remain."""
+MAX_SKIPPED_POINTS = 2**31
+"""Maximum number of skipped points, so that as many indices remain."""
 
-MOST_SKIPPED_BASES = 10_000
-"""Skipped bases at most."""
+MAX_SKIPPED_BASES = 10_000
+"""Maximum number of skipped bases: in bases beyond, which are
+over 100 000, the points of most runs have a single digit and lie on a line."""
 
 
 class HaltonState(NamedTuple):
@@ -67,14 +68,14 @@ class Halton(Search[HaltonState]):
     def __post_init__(self) -> None:
         if self.scramble is not None and not isinstance(self.scramble, bool):
             raise ValueError(f"scramble must be True, False or None; got {self.scramble!r}")
-        for name, most in (
-            ("skip_points", MOST_SKIPPED_POINTS),
-            ("skip_bases", MOST_SKIPPED_BASES),
+        for name, limit in (
+            ("skip_points", MAX_SKIPPED_POINTS),
+            ("skip_bases", MAX_SKIPPED_BASES),
         ):
             count = getattr(self, name)
             check_count(name, count, 0)
-            if count > most:
-                raise ValueError(f"{name} must be at most {most}; got {count!r}")
+            if count > limit:
+                raise ValueError(f"{name} must be at most {limit}; got {count!r}")
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> HaltonState:
         return HaltonState(key, jnp.uint32(1 + self.skip_points))
@@ -107,7 +108,7 @@ def halton_points(
     bases = np.array(primes(skip_bases + dim)[skip_bases:], np.uint32)
     digits = np.array([_digits(int(base)) for base in bases], int)
     maps = None if key is None else _digit_maps(key, bases, int(np.max(digits, initial=0)))
-    if len(index) * dim <= MOST_IN_LOOP:
+    if len(index) * dim <= MAX_IN_LOOP:
         return _radical_inverse_in_loop(index, bases, digits, maps)
     blocks = [jnp.zeros((len(index), 0), jnp.float32)]
     # Bases whose indices have equally many digits go together: one loop for many large ones.
@@ -153,7 +154,7 @@ def _radical_inverse(
             figure = (maps[0][k] * figure + maps[1][k]) % bases
         figures.append(figure)
         rest = quotient
-    # From the least digit on (Horner): every rounding error is divided by the base at once.
+    # From the lowest digit on (Horner): every rounding error is divided by the base at once.
     inverse = jnp.zeros(rest.shape, jnp.float32)
     for figure in reversed(figures):
         inverse = (inverse + figure.astype(jnp.float32)) / bases.astype(np.float32)
@@ -170,7 +171,7 @@ def _radical_inverse_in_loop(
 
     On some processors to the last bit; on others the compiler joins other products and sums.
     """
-    most = int(np.max(digits, initial=0))
+    width = int(np.max(digits, initial=0))
     shape = (len(index), len(bases))
 
     def divide(rest: Array, digit_map: tuple[Array, Array] | None) -> tuple[Array, Array]:
@@ -181,7 +182,7 @@ def _radical_inverse_in_loop(
         return quotient, figure
 
     rest = jnp.broadcast_to(index[:, None], shape)
-    _, figures = jax.lax.scan(divide, rest, maps, length=most)
+    _, figures = jax.lax.scan(divide, rest, maps, length=width)
     # As XLA writes a division by a constant, in which LLVM joins product and sum.
     share = np.float32(1) / bases.astype(np.float32)
 
@@ -189,7 +190,7 @@ def _radical_inverse_in_loop(
         figure, there = step
         return jnp.where(there, total * share + figure.astype(jnp.float32), total), None
 
-    there = jnp.asarray(np.arange(most)[:, None] < digits)
+    there = jnp.asarray(np.arange(width)[:, None] < digits)
     zero = jnp.zeros(shape, jnp.float32)
     total, _ = jax.lax.scan(add, zero, (figures, there), reverse=True)
     return jnp.minimum(total * share, np.float32(1 - 2**-24))

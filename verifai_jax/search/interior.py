@@ -23,19 +23,22 @@ from verifai_jax.search.base import Observations, Plan, choose
 from verifai_jax.search.descent import Descent, DescentState
 
 AT_ONCE = 16
-"""Descents of a round at most; as many as are differentiated in one call."""
+"""Maximum number of descents of a round; as many as are differentiated in one call."""
 
 BEGINS = 1500.0
-"""Simulations before the descents begin."""
+"""Simulations before the descents begin: the budget of the ARCH competition. Beginning at 256, CC4
+took 429 simulations instead of 357, beginning at 64, SB3 took 330 instead of 271
+(`benchmarks/RESULTS.md`)."""
 
+# The numbers below were chosen by hand; no comparison with other values is recorded.
 IDLE = 100.0
 """Simulations without progress of the others after which the share of the descents is greatest."""
 
-MOST_SHARE = 0.6
+MAX_SHARE = 0.6
 """Greatest share of the budget of the descents."""
 
 PROGRESS = 0.99
-"""Share of the least robustness below which a new one is progress."""
+"""Share of the lowest robustness below which a new one is progress."""
 
 TRIED = 100.0
 """Simulations that the descents spend before what they reach is compared."""
@@ -46,7 +49,7 @@ TAKEN = 16
 APART = 0.1
 """Distance in some coordinate from all of these at which a point is a new start."""
 
-LEAST_SHARE = 0.02
+MIN_SHARE = 0.02
 """Share of the budget at least; all there is where gradients say nothing."""
 
 
@@ -57,7 +60,7 @@ class InteriorState(NamedTuple):
     cost: Float[Array, ""]  # simulations of all, one with gradients counted as two
     spent: Float[Array, ""]  # and those of the descents
     idle: Float[Array, ""]  # simulations since the others made progress
-    own: Float[Array, ""]  # the least robustness of the descents, at least 0
+    own: Float[Array, ""]  # the lowest robustness of the descents, 0 or more
     theirs: Float[Array, ""]  # and of the others
     taken: Float[Array, "taken d"]  # the latest points where descents from theirs began or ended
 
@@ -87,7 +90,7 @@ def propose(
 ) -> tuple[Float[Array, "batch d"], InteriorState]:
     """Propose the next points of the descents, and decide whether it is their turn."""
     points, descent = _search(batch).ask(state.descent, cube, batch)
-    turn = state.credit >= _most_credit(state) / 2
+    turn = state.credit >= _max_credit(state) / 2
     descent = choose(turn, descent, state.descent)
     return points, state._replace(descent=descent, turn=turn)
 
@@ -119,11 +122,11 @@ def learn(
     share = _share(state)
     earned = jnp.where(turn, -spent, spent * share / (1.0 - share))
     earned = jnp.where(state.cost < BEGINS, 0.0, earned)
-    most = _most_credit(state)
+    max_credit = _max_credit(state)
     descent, taken = _offer(choose(turn, descent, state.descent), state, *best)
     return _counted(state, score, spent)._replace(
         descent=descent,
-        credit=jnp.clip(state.credit + earned, -most, most).astype(jnp.float32),
+        credit=jnp.clip(state.credit + earned, -max_credit, max_credit).astype(jnp.float32),
         taken=taken,
     )
 
@@ -137,25 +140,25 @@ def waits(state: InteriorState) -> bool:
     """Return whether the next round, and what is learned from it, is none of the descents'."""
     # As numbers: each operation of JAX outside of a program would compile one.
     cost, theirs, credit = (float(each) for each in (state.cost, state.theirs, state.credit))
-    return cost < BEGINS or (theirs <= 0 and credit < _most_credit(state) / 2)
+    return cost < BEGINS or (theirs <= 0 and credit < _max_credit(state) / 2)
 
 
-def _most_credit(state: InteriorState) -> float:
+def _max_credit(state: InteriorState) -> float:
     return 4.0 * len(state.descent.step)
 
 
 def _counted(
     state: InteriorState, score: Float[Array, " n"], spent: Float[Array, ""]
 ) -> InteriorState:
-    """Count the simulations of a round, and note the least robustness."""
-    least, turn = jnp.min(score, initial=jnp.inf), state.turn
-    progress = (least < PROGRESS * state.theirs) & ~turn
+    """Count the simulations of a round, and note the lowest robustness."""
+    lowest, turn = jnp.min(score, initial=jnp.inf), state.turn
+    progress = (lowest < PROGRESS * state.theirs) & ~turn
     return state._replace(
         cost=(state.cost + spent).astype(jnp.float32),
         spent=(state.spent + jnp.where(turn, spent, 0.0)).astype(jnp.float32),
         idle=jnp.where(progress, 0.0, state.idle + jnp.where(turn, 0.0, spent)).astype(jnp.float32),
-        own=jnp.where(turn, jnp.minimum(state.own, least), state.own).astype(jnp.float32),
-        theirs=jnp.where(turn, state.theirs, jnp.minimum(state.theirs, least)).astype(jnp.float32),
+        own=jnp.where(turn, jnp.minimum(state.own, lowest), state.own).astype(jnp.float32),
+        theirs=jnp.where(turn, state.theirs, jnp.minimum(state.theirs, lowest)).astype(jnp.float32),
     )
 
 
@@ -166,19 +169,19 @@ def _offer(
     score: Float[Array, " k"],
 ) -> tuple[DescentState, Float[Array, "taken d"]]:
     """Offer the best point from which no descent began or ended as the next start but one."""
-    place = jnp.argmax(descent.step == 0)
-    ends = state.turn & state.descent.given[place] & (descent.step[place] == 0)
-    begins = state.turn & state.descent.given[place] & (state.descent.step[place] == 0)
+    index = jnp.argmax(descent.step == 0)
+    ends = state.turn & state.descent.given[index] & (descent.step[index] == 0)
+    begins = state.turn & state.descent.given[index] & (state.descent.step[index] == 0)
     taken = jnp.where(
         ends | begins,
-        jnp.concatenate([state.descent.point[place][None], state.taken[:-1]]),
+        jnp.concatenate([state.descent.point[index][None], state.taken[:-1]]),
         state.taken,
     )
     free = not_taken(points, score, taken)
     chosen = jnp.argmin(jnp.where(free, score, jnp.inf))
-    offers = (descent.step[place] == 0) & free[chosen] & (descent.starts % 2 == 0)
-    near = descent.near.at[place].set(jnp.where(offers, score[chosen], jnp.inf))
-    return descent._replace(offered=descent.offered.at[place].set(points[chosen]), near=near), taken
+    offers = (descent.step[index] == 0) & free[chosen] & (descent.starts % 2 == 0)
+    near = descent.near.at[index].set(jnp.where(offers, score[chosen], jnp.inf))
+    return descent._replace(offered=descent.offered.at[index].set(points[chosen]), near=near), taken
 
 
 def not_taken(
@@ -193,6 +196,6 @@ def _share(state: InteriorState) -> Float[Array, ""]:
     """Return the share of the budget for the descents."""
     near = jnp.minimum(state.theirs / jnp.maximum(state.own, 1e-9), 1.0)
     near = jnp.where(state.spent < TRIED, 1.0, near)
-    share = MOST_SHARE * jnp.minimum(state.idle / IDLE, 1.0) * near**2
-    share = jnp.where(state.descent.useless >= 2, LEAST_SHARE, jnp.maximum(share, LEAST_SHARE))
+    share = MAX_SHARE * jnp.minimum(state.idle / IDLE, 1.0) * near**2
+    share = jnp.where(state.descent.useless >= 2, MIN_SHARE, jnp.maximum(share, MIN_SHARE))
     return jnp.where(state.theirs > 0, share, 0.0).astype(jnp.float32)

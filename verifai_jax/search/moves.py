@@ -7,7 +7,8 @@ from jaxtyping import Array, Bool, Float
 from verifai_jax.core.cube import Cube
 
 MAX_CELLS = 8
-"""Ordered cells up to which a coordinate is discrete; more are stepped over as if continuous."""
+"""Ordered cells up to which a coordinate is discrete; more are stepped over as if continuous.
+Chosen by hand; no comparison with other values is recorded."""
 
 
 def has_fine_cells(cube: Cube) -> Bool[np.ndarray, " discrete"]:

@@ -3,9 +3,9 @@
 The members are complementary: gradients of clauses jump to corners and along where clauses meet,
 mutations need few simulations and no gradients, cross-entropy fills the region of failures in large
 batches. A bandit learns on the way which one helps: it gives each a share of the simulations by the
-rate at which its points come among the best so far, discounted, and none less than a little; a
-member whose gradients turn out zero or not finite gets next to nothing at once. Every point is told
-to all, and descents start from the best points of all as often as from new ones.
+rate at which its points come among the best so far, discounted, and never less than a little; a
+member whose gradients turn out zero or not finite gets next to nothing at once. All learn
+of every point, and descents start from the best points of all as often as from new ones.
 
 Where these have found no failure for long, a fourth member joins them, with an account of its own:
 descents into the interior of the space (`interior`, `descent`).
@@ -44,34 +44,43 @@ GRADIENT, MUTATION, CROSS_ENTROPY = range(3)
 """Numbers of the members."""
 
 PRIOR_GAINS = np.array([4.0, 2.0, 0.5])
-"""Gains of each member before there is evidence."""
+"""Gains of each member before there is evidence: as if descents had succeeded always, mutations
+every second time, and cross-entropy, which needs large batches, one time in eight. Chosen by hand;
+no comparison with other values is recorded."""
 
 PRIOR_COSTS = np.array([4.0, 4.0, 4.0])
-"""Cost of these gains, in simulations."""
+"""Cost of these gains, in simulations: few, so that evidence soon decides."""
 
 DISCOUNT = 0.98
-"""Discount of evidence, for each simulation since."""
+"""Discount of evidence, for each simulation since: that of 50 simulations ago counts a third.
+Chosen by hand; no comparison with other values is recorded."""
 
-LEAST_SHARE = 0.05
-"""Least share of the budget of a member."""
+MIN_SHARE = 0.05
+"""Minimum share of the budget of a member, so that its evidence never ends. Chosen by hand; no
+comparison with other values is recorded."""
 
 OPENING = 6
-"""Descents before the budget is shared by evidence."""
+"""Descents before the budget is shared by evidence. With two instead, SB3 to SB5 together took 0.99
+times as many simulations; with twelve, and one of four with the whole cube, the
+landscape of ripples cost half as much again (`benchmarks/RESULTS.md`)."""
 
 MANY = 32
-"""Simulations of a round beyond which descents wait until failures are rare."""
+"""Simulations of a round beyond which descents wait until failures are rare: such rounds simulate
+thousands in the seconds that gradients take to compile."""
 
 PATIENT = 4
-"""Rounds in a row without a failure after which they are."""
+"""Rounds in a row without a failure after which they are rare. Chosen by hand; no comparison with
+other values is recorded."""
 
 NEVER = 1 << 30
-"""Simulations since the last failure where none is waited for."""
+"""Simulations since the last failure that stand for any number of them: more than a run has."""
 
 AMONG = 4
-"""Number of best points among which a new one is a gain."""
+"""Number of best points among which a new one is a gain: those that mutations have as parents."""
 
 TAKEN = 32
-"""Points that are remembered as starts and ends of descents."""
+"""Points that are remembered as starts and ends of descents; as many as mutations keep to start
+from."""
 
 
 class PortfolioState(NamedTuple):
@@ -290,11 +299,11 @@ class Portfolio(Search[PortfolioState]):
         assert before is not None
         begins = before.fresh & before.given & state.differentiates & turn
         ends = updated.fresh & ~before.fresh & turn
-        place = jnp.cumsum(begins | ends) - 1
-        place = jnp.where(begins | ends, place, TAKEN)
+        index = jnp.cumsum(begins | ends) - 1
+        index = jnp.where(begins | ends, index, TAKEN)
         latest = jnp.where(begins[:, None], before.offered, before.point)
         count = jnp.sum(begins | ends)
-        taken = jnp.roll(state.taken, count, axis=0).at[place].set(latest, mode="drop")
+        taken = jnp.roll(state.taken, count, axis=0).at[index].set(latest, mode="drop")
 
         points, score = state.mutation.points, state.mutation.score
         free = not_taken(points, score, taken)
@@ -332,8 +341,8 @@ class Portfolio(Search[PortfolioState]):
         # Whoever suggests a start wants a descent from it.
         state = state._replace(barren=jnp.int32(NEVER))
         # The descents from there have their turn at once, whatever the shares are.
-        least = jnp.where(jnp.any(jnp.isfinite(gradient.near)), len(gradient.fresh), -jnp.inf)
-        credit = state.credit.at[GRADIENT].max(least.astype(jnp.float32))
+        min_share = jnp.where(jnp.any(jnp.isfinite(gradient.near)), len(gradient.fresh), -jnp.inf)
+        credit = state.credit.at[GRADIENT].max(min_share.astype(jnp.float32))
         return state._replace(gradient=gradient, credit=credit)
 
     def _shares(self, state: PortfolioState) -> Float[Array, " members"]:
@@ -341,13 +350,13 @@ class Portfolio(Search[PortfolioState]):
         rate = rate.astype(jnp.float32)
         if state.gradient is None:
             rate = rate.at[GRADIENT].set(0.0)
-            least = np.array([0.0, LEAST_SHARE, LEAST_SHARE], np.float32)
+            min_share = np.array([0.0, MIN_SHARE, MIN_SHARE], np.float32)
         else:
             dead = state.gradient.useless >= 2
             rate = rate.at[GRADIENT].multiply(jnp.where(dead, 0.0, 1.0))
-            least = jnp.stack([jnp.where(dead, 0.02, LEAST_SHARE), LEAST_SHARE, LEAST_SHARE])
+            min_share = jnp.stack([jnp.where(dead, 0.02, MIN_SHARE), MIN_SHARE, MIN_SHARE])
         share = rate / jnp.maximum(jnp.sum(rate), 1e-9)
-        share = jnp.maximum(share, least)
+        share = jnp.maximum(share, min_share)
         return (share / jnp.sum(share)).astype(jnp.float32)
 
     def _members(self, rows: Int[Array, " members"], batch: int) -> Int[Array, " batch"]:
@@ -380,10 +389,10 @@ class PortfolioStage(Wrapper[PortfolioState]):
         if state.interior is None:
             return learned
         rows = jnp.sum(state.rows)
-        told = jnp.arange(len(observations.rho)) < rows
+        simulated = jnp.arange(len(observations.rho)) < rows
         score = _common(observations).score
         spent = rows * jnp.where(state.differentiates, 2.0, 1.0)
-        waiting = wait(state.interior, jnp.where(told, score, jnp.inf), spent)
+        waiting = wait(state.interior, jnp.where(simulated, score, jnp.inf), spent)
         return learned._replace(interior=waiting)
 
     def start_from(

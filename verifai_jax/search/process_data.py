@@ -14,7 +14,8 @@ from verifai_jax.core.cube import Cube
 from verifai_jax.search.gaussian_process import GaussianProcess, TrainingData
 
 CAP = 30.0
-"""Quartiles of the robustness, above which the process does not tell values apart."""
+"""Quartiles of the robustness above which all values are the same to the process, so that a few
+huge ones do not hide the rest. Chosen by hand; no comparison with other values is recorded."""
 
 
 def process_of(cube: Cube) -> GaussianProcess:

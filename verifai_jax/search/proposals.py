@@ -8,8 +8,8 @@
 A constraint (`where=`) refuses points; only accepted ones are simulated. A search that does not
 learn is asked until there are enough, so that the accepted points are a subsequence of its own,
 whatever the batch. One that learns is asked again for the refused rows only, which leaves each
-row with the distribution it would have, given acceptance; rows that stay refused are told as not
-valid. A point that was simulated before is not simulated again (`repetition`).
+row with the distribution it would have, given acceptance; rows that stay refused are not
+valid in what it learns. A point that was simulated before is not simulated again (`repetition`).
 """
 
 import math
@@ -33,10 +33,12 @@ from verifai_jax.search.contract import check_points, is_user_defined
 from verifai_jax.search.repetition import Repetition
 
 TRIES = 32
-"""Asks in one round at most until every row of a search that learns is accepted."""
+"""Maximum number of asks in one round until every row of a search that learns is accepted. Where
+one point in ten is allowed, 32 asks leave a row refused in one of thirty cases."""
 
-MOST_REFUSED = 2000
-"""Asks in a row without a single accepted point, after which a run ends."""
+MAX_REFUSED = 2000
+"""Asks in a row without a single accepted point, after which a run ends: in rounds of 16 these
+are 32 000 points, among which one allowed in ten thousand would be met."""
 
 
 class ConstraintError(ValueError):
@@ -51,7 +53,7 @@ class Proposals:
     - `stage`: the search, or its parts that take part in the next round.
     - `cut`: whether the last `next` left out points that a search that learns had proposed.
 
-    `improve` may replace points of a round by others, of which the search is told instead.
+    `improve` may replace points of a round by others, of which the search learns instead.
     """
 
     def __init__(
@@ -114,12 +116,12 @@ class Proposals:
             return self._program.temperature(self._state)
         return np.asarray(self._plan.temperature)[self._rows]
 
-    def next(self, most: int) -> Float[Array, "m d"] | Float[np.ndarray, "m d"]:
+    def next(self, max_points: int) -> Float[Array, "m d"] | Float[np.ndarray, "m d"]:
         """Return the next points; none if the constraint refuses all rows of a round.
 
         **Arguments:**
 
-        - `most`: number of points at most.
+        - `max_points`: maximum number of points.
 
         **Returns:** points of the unit cube, `[m, d]`.
 
@@ -127,7 +129,9 @@ class Proposals:
         """
         self.begin_stage()
         points = (
-            self._next_to_learn_from(most) if self.search.learns else self._next_of_sequence(most)
+            self._next_to_learn_from(max_points)
+            if self.search.learns
+            else self._next_of_sequence(max_points)
         )
         self.accepted += len(points)
         return points
@@ -150,7 +154,7 @@ class Proposals:
         - `valid`: False for simulations without a verdict.
         - `gradient`: of the smooth robustness, for a search that wants it.
         - `clauses`, `clause_gradients`: for a search that wants clauses; see `Observations`.
-        - `marks`: for a search that wants them, as many as the constructor was told.
+        - `marks`: for a search that wants them, as many as the constructor was given.
         - `outcomes`: for a search that wants them.
         """
         if not self.search.learns:
@@ -314,30 +318,32 @@ class Proposals:
         padded = np.pad(points, ((0, missing), (0, 0)), mode="edge") if missing else points
         return np.asarray(self._accepts(padded))[: len(points)]
 
-    def _next_of_sequence(self, most: int) -> Float[Array, "m d"] | Float[np.ndarray, "m d"]:
+    def _next_of_sequence(self, max_points: int) -> Float[Array, "m d"] | Float[np.ndarray, "m d"]:
         """Return the next accepted points of a search that does not learn."""
         ready, barren = len(self._queue), 0
         parts: list[np.ndarray | Array] = [self._queue]
-        while ready < most and not (self.total is not None and self.proposed >= self.total):
+        while ready < max_points and not (self.total is not None and self.proposed >= self.total):
             points = self._ask()
             self.proposed += len(points)
             if self._accepts is not None:
                 points = np.asarray(points)[self._accepted_rows(points)]
             barren = 0 if len(points) else barren + 1
-            if barren >= MOST_REFUSED:
+            if barren >= MAX_REFUSED:
                 self._give_up()
             parts.append(points)
             ready += len(points)
         whole = parts[-1] if ready == len(parts[-1]) else np.concatenate(parts)
-        if ready <= most:
+        if ready <= max_points:
             # As the search gave it: a full round needs no copy.
             self._queue = np.zeros((0, self.cube.dim), np.float32)
             return whole
         whole = np.asarray(whole)
-        self._queue = whole[most:]
-        return whole[:most]
+        self._queue = whole[max_points:]
+        return whole[:max_points]
 
-    def _next_to_learn_from(self, most: int) -> Float[Array, "m d"] | Float[np.ndarray, "m d"]:
+    def _next_to_learn_from(
+        self, max_points: int
+    ) -> Float[Array, "m d"] | Float[np.ndarray, "m d"]:
         """Return the points of one round of a search that learns."""
         points = self._ask()
         if self._improve is not None:
@@ -350,7 +356,7 @@ class Proposals:
         self.proposed += planned
         wanted = np.arange(len(points)) < planned
         asked = points
-        points, told = self._unrepeated(points, wanted)
+        points, learned = self._unrepeated(points, wanted)
         accepted = self._accepted_rows(points) & wanted
         for _ in range(TRIES - 1):
             if accepted.sum() == planned or self.total is not None:
@@ -358,19 +364,19 @@ class Proposals:
             others = self._ask()
             fresh = wanted & ~accepted
             if np.array_equal(np.asarray(others)[fresh], np.asarray(asked)[fresh]):
-                break  # This search proposes the same until it is told something.
+                break  # This search proposes the same until it learns something.
             self.proposed += int(fresh.sum())
             asked = others
-            parts = zip(self._unrepeated(others, fresh), (points, told), strict=True)
-            points, told = (jnp.where(fresh[:, None], new, old) for new, old in parts)
+            parts = zip(self._unrepeated(others, fresh), (points, learned), strict=True)
+            points, learned = (jnp.where(fresh[:, None], new, old) for new, old in parts)
             accepted = accepted | (self._accepted_rows(points) & wanted)
         self._barren = 0 if accepted.any() else self._barren + 1
-        if self._barren >= MOST_REFUSED:
+        if self._barren >= MAX_REFUSED:
             self._give_up()
-        missing = self.batch - len(told)
-        self._points = np.pad(told, ((0, missing), (0, 0)), mode="edge") if missing else told
-        self._rows = np.flatnonzero(accepted)[:most]
-        self.cut = int(accepted.sum()) > most
+        missing = self.batch - len(learned)
+        self._points = np.pad(learned, ((0, missing), (0, 0)), mode="edge") if missing else learned
+        self._rows = np.flatnonzero(accepted)[:max_points]
+        self.cut = int(accepted.sum()) > max_points
         simulated = points if len(self._rows) == len(points) else np.asarray(points)[self._rows]
         if self._repetition is not None and not self.cut:
             self._repetition.add(np.asarray(simulated))
@@ -397,7 +403,7 @@ class Proposals:
 
     def _give_up(self) -> NoReturn:
         raise ConstraintError(
-            f"where refused all that search {self.search!r} has proposed for {MOST_REFUSED} "
+            f"where refused all that search {self.search!r} has proposed for {MAX_REFUSED} "
             f"rounds; it accepted {self.accepted} of {self.proposed} points in all. Make the space "
             "narrower, so that more of it is allowed, or use another search"
         )

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Key, UInt64
 from verifai_jax.core.cube import Cube
 
 MEMORY = 1 << 16
-"""Points that are remembered at most, the first of a run: later ones are seldom repeated."""
+"""Maximum number of remembered points, the first of a run: later ones are seldom repeated."""
 
 NUDGE = 2.0**-16
 """Greatest distance, in unit coordinates, by which a repeated point is moved. Derivatives there are

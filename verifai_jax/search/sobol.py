@@ -23,10 +23,10 @@ from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Search
 
 BITS = 32
-"""Bits of the index of a point."""
+"""Bits of the index of a point: JAX has no wider integers by default."""
 
-MOST_DIMENSIONS = 21201
-"""Coordinates for which direction numbers are known."""
+MAX_DIMENSIONS = 21201
+"""Coordinates for which direction numbers are known: those of Joe and Kuo, which SciPy has."""
 
 
 class SobolState(NamedTuple):
@@ -61,9 +61,9 @@ class Sobol(Search[SobolState]):
 
     def check(self, cube: Cube) -> None:
         """Raise `ValueError` for more than 21201 coordinates."""
-        if cube.dim > MOST_DIMENSIONS:
+        if cube.dim > MAX_DIMENSIONS:
             raise ValueError(
-                f"search sobol works on at most {MOST_DIMENSIONS} unit coordinates; this space has "
+                f"search sobol works on at most {MAX_DIMENSIONS} unit coordinates; this space has "
                 f"{cube.dim}. Use 'uniform'"
             )
 

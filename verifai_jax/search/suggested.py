@@ -37,11 +37,11 @@ class Suggested(Wrapper[PyTree]):
     - `suggest`: called with a question, returns a list of suggestions: features by name, as a
       person writes them, or by the columns of the table. An empty list is no suggestion.
     - `search`: the one that goes on from them; it must learn.
-    - `times`: questions of a run at most, the first of them before any simulation.
-    - `every`: simulations from one question to the next, at least.
+    - `times`: maximum number of questions of a run, the first of them before any simulation.
+    - `every`: minimum number of simulations from one question to the next.
     - `points`: suggestions that are wanted of a question.
-    - `rows`: rows of the table that a question holds at most, the last ones.
-    - `worst`: rows with the least robustness that a question holds with their traces. Each is
+    - `rows`: maximum number of rows of the table that a question holds, the last ones.
+    - `worst`: rows with the lowest robustness that a question holds with their traces. Each is
       simulated once more for it.
     - `units`: of features, by name, such as `{"mass": "kg"}`; for the question alone.
     - `context`: whatever else the function should know; for the question alone.

@@ -25,8 +25,10 @@ from jaxtyping import Array, Bool, Float, Key
 
 from verifai_jax.search.gaussian_process import SMALLEST, finite_factor, matern
 
+# The numbers without another reason were chosen by hand; no comparison with other values is
+# recorded.
 COMPONENTS = 24
-"""Principal components at most."""
+"""Maximum number of principal components."""
 NEGLIGIBLE = 1e-5
 """Share of the variance below which a component is left out."""
 WAVES = 256
@@ -39,8 +41,8 @@ PARTS = np.array([0.0, 0.0, -2.0, -1.0], np.float32)
 """Prior means of the logarithms of the variances: constant, linear, quadratic, Matern."""
 NOISE = -8.0
 """Prior mean of the logarithm of the noise's variance."""
-LEAST_NOISE = -10.0
-"""Least of it, which keeps 32-bit factors finite."""
+MIN_NOISE = -10.0
+"""Minimum of it, which keeps 32-bit factors finite."""
 
 
 class TraceHyper(NamedTuple):
@@ -178,9 +180,9 @@ def draw(
     uniform = jax.random.uniform(key, (sum(sizes),), jnp.float32)
     uniform = jax.lax.optimization_barrier(uniform)
     normal = ndtri(jnp.maximum(uniform, SMALLEST))
-    places = np.cumsum(sizes)[:-1].tolist()
-    products, spectrum, _, amplitudes = jnp.split(normal, places)
-    phases = jnp.split(uniform, places)[2]
+    indices = np.cumsum(sizes)[:-1].tolist()
+    products, spectrum, _, amplitudes = jnp.split(normal, indices)
+    phases = jnp.split(uniform, indices)[2]
     spectrum = spectrum.reshape(width + 5, WAVES)
     # The spectral density of Matern-5/2 is a t distribution with five degrees of freedom.
     size = jnp.sqrt(5 / jnp.maximum(jnp.sum(spectrum[width:] ** 2, axis=0), 1e-6))
@@ -319,5 +321,5 @@ def _bounded(hyper: TraceHyper) -> TraceHyper:
     return TraceHyper(
         jnp.clip(hyper.lengths, -4.0, 6.0),
         jnp.clip(hyper.parts, -8.0, 5.0),
-        jnp.clip(hyper.noise, LEAST_NOISE, 0.0),
+        jnp.clip(hyper.noise, MIN_NOISE, 0.0),
     )

@@ -3,8 +3,8 @@
 A robustness is one number of a simulation; its trace is thousands. Where simulations are dear this
 search learns the traces (`trace_model`), and asks the monitor, on the model and with gradients,
 where the property would be broken. Whoever runs it gives it the traces and the monitor
-(`falsification/surrogates.py`); told of robustness alone it is `TuRBO`, whose points are among its
-own in any case, in case the model is wrong.
+(`falsification/surrogates.py`); learning from robustness alone it is `TuRBO`, whose points are
+among its own in any case, in case the model is wrong.
 """
 
 from dataclasses import dataclass, replace
@@ -14,6 +14,8 @@ from verifai_jax.search.turbo import TuRBO, TuRBOState
 from verifai_jax.search.wrapper import Wrapper
 
 MAX_BATCH = 8
+"""Points in a round by default: in rounds of eight it was compared with other searches
+(`benchmarks/RESULTS.md`, "Slow black boxes")."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ class TraceSurrogate(TraceOptions, Wrapper[TuRBOState]):
 
     - `initial`: points of the prior before the model has a say.
     - `share`: of the points that the model proposes; the others are those of `TuRBO`.
-    - `capacity`: rows that the model knows at most, the best half and the last ones.
+    - `capacity`: maximum number of rows that the model knows, the best half and the last ones.
     - `starts`: descents for each proposal, the best one of which is simulated.
     - `steps`: steps of a descent.
 

@@ -33,22 +33,24 @@ from verifai_jax.search.process_data import (
     training_data,
 )
 
-MOST_PATHS = 32
-"""Functions drawn for a batch; larger batches take several points from each."""
+MAX_PATHS = 32
+"""Functions drawn for a batch; larger batches take several points from each. As in `bayes`."""
 WAVES = 256
-"""Random waves of such a function."""
+"""Random waves of such a function. As in `bayes`."""
 FIT_POINTS, FIT_STEPS = 192, 12
-"""Points that hyper-parameters are fitted to, and steps of Adam in a fit."""
+"""Points that hyper-parameters are fitted to, and steps of Adam in a fit. Chosen by hand; no
+comparison with other values is recorded."""
 COORDINATES = 20
-"""Coordinates in which a candidate differs from the best point, on average."""
+"""Coordinates in which a candidate differs from the best point, on average; that of the paper."""
 SIDES = (2.0**-7, 0.8, 1.6)
-"""Least, first and greatest side of the box, in cubes; those of the paper."""
+"""Smallest, first and largest side of the box, in cubes; those of the paper."""
 PROGRESS = 1e-3
-"""Share of the least robustness by which a point must be below it, to be progress."""
+"""Share of the lowest robustness by which a point must be below it, to be progress; that of the
+authors' program."""
 KNOWN = 1 - 1e-5
-"""Correlation with an observation, above which a point need not be simulated."""
+"""Correlation with an observation, above which a point need not be simulated. As in `bayes`."""
 LARGEST = 1e30
-"""Robustness above which nothing is told apart."""
+"""Robustness above which nothing differs: sums of such stay finite in float32."""
 
 
 class TuRBOState(NamedTuple):
@@ -73,7 +75,7 @@ class TuRBO(Search[TuRBOState]):
 
     **Arguments:**
 
-    - `capacity`: points that the process knows at most, since the last restart. When there are more
+    - `capacity`: maximum number of points that the process knows, since the last restart. Of more
       it keeps the best half and a random choice of the others.
     - `candidates`: points of the box among which each drawn function is minimized.
     - `initial`: points of the prior at every start.
@@ -119,8 +121,8 @@ class TuRBO(Search[TuRBOState]):
         self, state: TuRBOState, cube: Cube, batch: int
     ) -> tuple[Float[Array, "batch d"], TuRBOState]:
         present = jnp.isfinite(state.score)
-        least = jnp.min(state.score, where=present, initial=jnp.inf)
-        spread = jnp.max(state.score, where=present, initial=0.0) > least
+        lowest = jnp.min(state.score, where=present, initial=jnp.inf)
+        spread = jnp.max(state.score, where=present, initial=0.0) > lowest
         # Without a difference between points there is nothing to learn from them.
         informed = spread & (state.verdicts >= self.initial)
         # Points of the prior are numbered on, whether or not a round uses them.
@@ -149,11 +151,11 @@ class TuRBO(Search[TuRBOState]):
         low, high = _box(state, cube, best)
         count = max(self.candidates, 2 * batch)
         random = draw_uniform(placing, (count, 2 * d))
-        pick, place = random[:, :d], random[:, d:]
+        pick, position = random[:, :d], random[:, d:]
         moves = pick < min(COORDINATES / d, 1.0)
         moves |= pick == jnp.min(pick, axis=1, keepdims=True)
-        candidates = snap(jnp.where(moves, low + (high - low) * place, best), cube)
-        paths = process.paths(posterior, drawing, min(batch, MOST_PATHS), WAVES)
+        candidates = snap(jnp.where(moves, low + (high - low) * position, best), cube)
+        paths = process.paths(posterior, drawing, min(batch, MAX_PATHS), WAVES)
         terms = process.basis(posterior, paths, encode(candidates, cube))
         known = jnp.max(terms[:, WAVES:], axis=1) > KNOWN * jnp.exp(state.hyper.variance)
         values = (terms @ paths.weights).T  # [paths, candidates]
@@ -163,8 +165,8 @@ class TuRBO(Search[TuRBOState]):
         ) -> tuple[Bool[Array, " candidates"], Int[Array, ""]]:
             # Simulated already, or in this batch: only if there is nothing else.
             value = values[row % len(values)] + 100.0 * taken
-            least = jnp.argmin(value)
-            return taken.at[least].set(True), least
+            chosen = jnp.argmin(value)
+            return taken.at[chosen].set(True), chosen
 
         _, chosen = jax.lax.scan(choose, known, jnp.arange(batch))
         return candidates[chosen]
@@ -209,8 +211,8 @@ class TuRBO(Search[TuRBOState]):
 
     def warm_start(self, state: TuRBOState, cube: Cube, observations: Observations) -> TuRBOState:
         # Points that it did not ask for say nothing of the region.
-        told = self.tell(state, cube, observations)
-        return told._replace(
+        warmed = self.tell(state, cube, observations)
+        return warmed._replace(
             side=jnp.float32(SIDES[1]), successes=jnp.int32(0), failures=jnp.int32(0)
         )
 
@@ -224,7 +226,7 @@ class TuRBO(Search[TuRBOState]):
 def _box(
     state: TuRBOState, cube: Cube, best: Float[Array, " d"]
 ) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
-    """Return the least and the greatest corner of the trust region.
+    """Return the lowest and the highest corner of the trust region.
 
     Sides are in proportion to the length scales, with the volume of a cube. A discrete coordinate
     can always reach the cells next to its own, and one without an order all of its cells.
