@@ -238,9 +238,9 @@ class Arithmetic(Expression):
     arguments: tuple[Expression, ...]
 
     def __post_init__(self) -> None:
-        n, least = len(self.arguments), FUNCTIONS.get(self.name)
-        if least is not None and (n != 1 if least == 1 else n < least):
-            wanted = "one argument" if least == 1 else "two arguments or more"
+        n, fewest = len(self.arguments), FUNCTIONS.get(self.name)
+        if fewest is not None and (n != 1 if fewest == 1 else n < fewest):
+            wanted = "one argument" if fewest == 1 else "two arguments or more"
             raise ValueError(f"{self.name} takes {wanted}; got {n}")
         values = [constant_value(argument) for argument in self.arguments]
         if self.name == "/" and values[1] == 0.0:

@@ -1,4 +1,4 @@
-"""The picture of an explanation: the formula's tree beside what each part does over time.
+"""The picture of an explanation: the formula's tree, and next to it what each part does over time.
 
     draw(explain(formula, trace), path="why.png")
 
@@ -23,7 +23,8 @@ from verifai_jax.mtl.semantics import hard
 from verifai_jax.mtl.setting import prepare
 
 HOLDS, FAILS, PATH, QUIET = "#0a8f6a", "#cf3f21", "#1b2a41", "#7b8794"
-_MOST_ROWS = 14
+_MAX_ROWS = 14
+"""Rows of a picture: more of them are too low to be read on one page."""
 
 
 def draw(explanation: Explanation, path: str | Path | None = None) -> Figure:
@@ -115,7 +116,7 @@ def draw(explanation: Explanation, path: str | Path | None = None) -> Figure:
 def _rows(tree: Node) -> list[tuple[int, Node]]:
     """Choose the nodes to show: all, or the deciding path with its neighbours if too many."""
     rows = tree.flat()
-    if len(rows) <= _MOST_ROWS:
+    if len(rows) <= _MAX_ROWS:
         return rows
 
     def near(node: Node, depth: int) -> list[tuple[int, Node]]:
@@ -128,8 +129,8 @@ def _rows(tree: Node) -> list[tuple[int, Node]]:
     return near(tree, 0)
 
 
-def _shortened(text: str, most: int) -> str:
-    return text if len(text) <= most else text[: most - 3] + "..."
+def _shortened(text: str, length: int) -> str:
+    return text if len(text) <= length else text[: length - 3] + "..."
 
 
 def _label(figure: Figure, axis: Axes, depth: int, node: Node, width: float) -> None:

@@ -17,7 +17,7 @@ NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
 """Names of signals, constants and definitions that need no quotes."""
 
 FUNCTIONS = {"abs": 1, "sqrt": 1, "sin": 1, "cos": 1, "norm": 1, "min": 2, "max": 2}
-"""Functions of expressions, by the least number of their arguments."""
+"""Functions of expressions, with the smallest number of their arguments."""
 
 NUMBERS = {"pi": math.pi}
 """Numbers that a text may name without defining them; a signal of that name stands in quotes."""
