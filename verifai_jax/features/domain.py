@@ -259,7 +259,7 @@ class Domain(ForUsers, abc.ABC):
 
     @property
     def tailed(self) -> tuple[bool, ...]:
-        """Whether values thin out towards an end, for each unit coordinate."""
+        """For each unit coordinate, True if its values thin out towards an end."""
         inner = tuple(tailed for _, part in self.parts("") for tailed in part.tailed)
         return (False,) * (self.size - len(inner)) + inner
 
