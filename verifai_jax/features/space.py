@@ -586,7 +586,8 @@ class FeatureSpace(ForUsers):
         """Return features with the constant, fixed ones and events that were left out."""
         if not isinstance(features, Mapping):
             return features
-        known = {n: d.held_at for n, d in self.root.fields if d.held_at is not None}
+        held = ((name, domain.held_at) for name, domain in self.root.fields)
+        known = {name: value for name, value in held if value is not None}
         known |= {n: d.nominal for n, d in self.root.fields if d.nominal is not None}
         return {**known, **features}
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from operator import methodcaller
 
+from verifai_jax.core.errors import unknown_name
 from verifai_jax.mtl.formula import Formula, Predicate, Term, formula
 from verifai_jax.mtl.node import postorder
 from verifai_jax.mtl.words import FUNCTIONS, NUMBERS, name_text, number_text
@@ -238,6 +239,8 @@ class Arithmetic(Expression):
     arguments: tuple[Expression, ...]
 
     def __post_init__(self) -> None:
+        if self.name not in (*PRECEDENCE, *FUNCTIONS):
+            raise unknown_name("function", self.name, FUNCTIONS)
         n, fewest = len(self.arguments), FUNCTIONS.get(self.name)
         if fewest is not None and (n != 1 if fewest == 1 else n < fewest):
             wanted = "one argument" if fewest == 1 else "two arguments or more"

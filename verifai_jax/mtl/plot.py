@@ -15,7 +15,6 @@ import numpy as np
 
 from verifai_jax.core.figure import Axes, Figure, new_figure
 from verifai_jax.core.text import format_seconds
-from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._explain import Explanation, Node, heading
 from verifai_jax.mtl.evaluate import Evaluator
 from verifai_jax.mtl.formula import Term
@@ -219,13 +218,9 @@ def _predicate(axis: Axes, explanation: Explanation, node: Node, clock: np.ndarr
             alpha=(0.16 if good else 0.3) if node.decides else 0.1,
             lw=0,
         )
-    match node.formula:
-        case ast.Predicate(_, left, right):
-            main, bound = side(left), side(right)
-        case ast.Atom(e):
-            main, bound = side(e), np.zeros(len(clock))
-        case _:  # TRUE and FALSE have nothing to plot.
-            main = bound = np.zeros(len(clock))
+    # An expression by itself is compared with zero, and TRUE and FALSE have nothing to plot.
+    sides = [side(term) for term in node.formula.terms()]
+    main, bound = (*sides, *[np.zeros(len(clock))] * (2 - len(sides)))
     style: dict[str, Any] = {"color": PATH if node.decides else QUIET, "drawstyle": "default"}
     axis.plot(clock, main, lw=1.7, **style)
     axis.plot(clock, bound, lw=1.2, ls=(0, (4, 2)), **style)

@@ -26,6 +26,25 @@ ANGLES = {"deg": math.pi / 180, "rad": 1.0}
 """Units that may follow a number in an expression, in rad."""
 
 
+class Comparison(NamedTuple):
+    """A comparison of two expressions in LaTeX and in English, and the one that is its negation."""
+
+    latex: str
+    english: str
+    opposite: str
+
+
+COMPARISONS = {
+    "<=": Comparison(r"\leq", "is at most", ">"),
+    "<": Comparison("<", "is below", ">="),
+    ">=": Comparison(r"\geq", "is at least", "<"),
+    ">": Comparison(">", "is above", "<="),
+    "==": Comparison("=", "equals", "!="),
+    "!=": Comparison(r"\neq", "differs from", "=="),
+}
+"""Every comparison by its symbol."""
+
+
 @dataclass(frozen=True)
 class Operator:
     """All that is known of an operator but its meaning, which its node in `formula` has.
