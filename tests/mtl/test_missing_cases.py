@@ -14,6 +14,7 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl import parse
 from verifai_jax.mtl.clauses import goals_of
 from verifai_jax.mtl.english import formula_words
+from verifai_jax.mtl.expression import Arithmetic, expression
 from verifai_jax.mtl.rewriting import nnf, simplify
 
 TRACE = Trace({"x": np.arange(4.0)}, dt=1.0)
@@ -79,3 +80,11 @@ def test_what_is_no_trace_is_told_how_to_become_one():
     ):
         mtl.robustness("x > 0", [1.0, 2.0])
     assert float(mtl.robustness("x > 0", Trace({"x": np.array([1.0, 2.0])}, dt=0.1))) == 1.0
+
+
+def test_a_comparison_or_a_function_that_there_is_not_is_refused():
+    x = mtl.signal("x")
+    with pytest.raises(ValueError, match=r"unknown comparison '=<'; .*Known: <=, <, >=, >, ==, !="):
+        ast.Predicate("=<", x, expression(1.0))
+    with pytest.raises(ValueError, match=r"unknown function 'tan'; .*Known: abs, sqrt, sin, cos"):
+        Arithmetic("tan", (x,))

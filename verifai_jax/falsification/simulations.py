@@ -80,7 +80,7 @@ class Simulations:
             batch,
             gradient=search.wants.gradient,
             # Of goals that have one each, that is the robustness, which costs less.
-            clauses=search.wants.clauses and goals_of(problem.formulas.values()).most > 1,
+            clauses=search.wants.clauses and goals_of(problem.formulas.values()).max_clauses > 1,
             journal=journal,
             keep_traces=keep_traces,
             given=given,

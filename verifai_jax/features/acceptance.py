@@ -12,18 +12,19 @@ from verifai_jax.core.text import format_percent
 from verifai_jax.core.user_errors import explain_user_error
 
 SAMPLES = 65_536
-"""Samples of the prior at most."""
+"""Greatest number of samples of the prior: if it accepts none of them, at most 0.005 % of the prior
+is allowed (95 % confidence)."""
 
 BLOCK = 4096
-"""Samples of the prior at a time."""
+"""Samples of the prior at a time, so that one shape compiles."""
 
 ENOUGH = 1000
-"""Accepted samples after which the rate is known well enough."""
+"""Accepted samples after which the rate is known well enough: to about 3 % of itself."""
 
 ON_HOST = 16
 """Samples at a time of a constraint that Python decides, which may take 40 ms for each."""
 
-PATIENCE, AT_MOST = 1.0, 60.0
+PATIENCE, LIMIT = 1.0, 60.0
 """Seconds after which one accepted sample of such a constraint is enough, and after which none ends
 the measurement."""
 
@@ -68,13 +69,13 @@ def acceptance_rate(
     while tried < SAMPLES and accepted < ENOUGH:
         accepted += int(np.sum(accepts(random.random((block, dim), np.float32))))
         tried += block
-        if on_host and time.perf_counter() - began > (PATIENCE if accepted else AT_MOST):
+        if on_host and time.perf_counter() - began > (PATIENCE if accepted else LIMIT):
             break
     if not accepted:
-        most = -np.log(0.05) / tried
+        bound = -np.log(0.05) / tried
         raise ValueError(
             f"where accepted none of {tried} samples of the space, so fewer than "
-            f"{format_percent(most)} of it are allowed (95 % confidence): make the domains "
+            f"{format_percent(bound)} of it are allowed (95 % confidence): make the domains "
             "narrower, or check the condition"
         )
     return accepted / tried

@@ -26,7 +26,7 @@ class Array(Domain):
     **Arguments:**
 
     - `domain`: of each value.
-    - `length`: their number, or a pair with the least and the greatest number.
+    - `length`: their number, or a pair with the smallest and the greatest number.
 
     **Raises:** `ValueError` for a length that is not a positive integer, or a pair that is not
     `0 <= least <= most` with `most >= 1`; `TypeError` for something that is no domain.
@@ -141,26 +141,26 @@ class Items:
     """The value of an array of variable length: all places, of which the first `length` are valid.
 
     - `values`: stacked along a leading axis as in an `Array` of the greatest length, so that every
-      simulation has the same shapes. Places behind the length hold the middle of the item's domain.
+      simulation has the same shapes. Entries after the length hold the middle of the item's domain.
     - `length`: the number of items that there are.
 
-    `features["cars"]["x"]` are the `x` of all places; multiply by `mask`, or use `jnp.where`.
+    `features["cars"]["x"]` are the `x` of all entries; multiply by `mask`, or use `jnp.where`.
     """
 
     values: PyTree
     length: Int[jax.Array, "*n"] | PyTree  # Any leaf while JAX maps over it.
 
     @property
-    def mask(self) -> Bool[jax.Array, "*n places"]:
+    def mask(self) -> Bool[jax.Array, "*n entries"]:
         """True at the places that hold an item."""
-        places = jax.tree.leaves(self.values)[0].shape[jnp.ndim(self.length)]
-        return jnp.arange(places) < jnp.asarray(self.length)[..., None]
+        count = jax.tree.leaves(self.values)[0].shape[jnp.ndim(self.length)]
+        return jnp.arange(count) < jnp.asarray(self.length)[..., None]
 
     def __getitem__(self, name: str | int) -> PyTree:
         return self.values[name]
 
     def cleared(self, absent: PyTree) -> "Items":
-        """Return the same items, with `absent` at the places behind the length."""
+        """Return the same items, with `absent` as the entries after the length."""
         mask, axes = self.mask, jnp.ndim(self.length) + 1
 
         def clear(leaf: jax.Array, rest: jax.Array) -> jax.Array:
@@ -233,7 +233,7 @@ class VariableArray(Domain):
     def coerce(self, value: PyTree) -> "Items":
         if isinstance(value, Items):
             items = Items(self.domain.coerce(value.values), jnp.asarray(value.length, jnp.int32))
-            # Whatever stands behind the length must not make two of the same value.
+            # Whatever stands after the length must not make two of the same value.
             return items.cleared(self._absent)
         items = [self.domain.coerce(item) for item in _items(value, "the array")]
         length = jnp.asarray(len(items), jnp.int32)
@@ -303,8 +303,8 @@ class VariableArray(Domain):
         order = jnp.argsort(~stays, stable=True)
         units = u[1:].reshape(self.most, self.domain.size)[order]
         fewer = jnp.maximum(jnp.sum(stays), self.least)
-        place = centre(fewer - self.least, self.levels[0]).astype(u.dtype)
-        return self.settled(jnp.concatenate([place, jnp.ravel(units)]))
+        unit = centre(fewer - self.least, self.levels[0]).astype(u.dtype)
+        return self.settled(jnp.concatenate([unit, jnp.ravel(units)]))
 
     def settled(self, u: Float[jax.Array, " size"]) -> Float[jax.Array, " size"]:
         if not self._varies:
@@ -332,7 +332,7 @@ class VariableArray(Domain):
 
     @property
     def _absent(self) -> PyTree:
-        """The value of a place behind the length."""
+        """The value of an entry after the length."""
         return self.domain.from_unit(jnp.full(self.domain.size, 0.5))
 
     @property
@@ -390,7 +390,7 @@ def _repeated_signals(domain: Domain, times: int) -> tuple[tuple[int, ...], ...]
 
 
 def _repeated(domain: Domain, count: int) -> tuple[int, ...]:
-    return tuple(i * domain.size + place for i in range(count) for place in domain.lengths)
+    return tuple(i * domain.size + index for i in range(count) for index in domain.lengths)
 
 
 def _emptied(entries: np.ndarray, absent: np.ndarray) -> np.ndarray:

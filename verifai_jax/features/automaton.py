@@ -77,7 +77,7 @@ class Automaton(Domain):
                 'events must be a dictionary {("state", "name"): dict(to=..., wait=...), ...}; '
                 f"got {events!r}"
             )
-        transitions = tuple(read_event(place, event) for place, event in events.items())
+        transitions = tuple(read_event(entry, event) for entry, event in events.items())
         sources = {each.source for each in transitions}
         if start not in sources:
             raise unknown_name("state to start in", start, sources)
@@ -213,8 +213,8 @@ class Automaton(Domain):
         kinds, waits = jnp.asarray(value.kinds), as_real(value.waits)
         taken, nodes = self._follow(kinds)
         edges = jnp.asarray(self._tables.interval_middles)
-        place = jnp.where(taken >= 0, edges[nodes, taken], 0.5).astype(waits.dtype)
-        columns = [place[:, None]]
+        unit = jnp.where(taken >= 0, edges[nodes, taken], 0.5).astype(waits.dtype)
+        columns = [unit[:, None]]
         for groups, values, width in zip(
             (self._tables.waits, *self._tables.users.values()),
             (waits, *(value.parameters[name] for name in self._tables.users)),
@@ -240,10 +240,10 @@ class Automaton(Domain):
 
     def settled(self, u: Float[jax.Array, " size"]) -> Float[jax.Array, " size"]:
         taken, nodes, slots = self._walk(u)
-        place = jnp.asarray(self._tables.interval_middles)[nodes, taken].astype(u.dtype)
+        unit = jnp.asarray(self._tables.interval_middles)[nodes, taken].astype(u.dtype)
         used = jnp.asarray(self._tables.uses)[taken] & (taken >= 0)[:, None]
         slots = jnp.where(used, slots, 0.5)
-        slots = slots.at[:, 0].set(jnp.where(taken >= 0, place, 0.5))
+        slots = slots.at[:, 0].set(jnp.where(taken >= 0, unit, 0.5))
         length = self._wanted(taken, nodes)
         return self._joined(u, length, slots)
 
@@ -275,8 +275,8 @@ class Automaton(Domain):
             after = jnp.where(stays, following[node, number], node)
             return after, (stays, middles[node, number])
 
-        _, (stays, place) = jax.lax.scan(step, jnp.int32(0), (kinds, drop))
-        slots = slots.at[:, 0].set(jnp.where(stays, place.astype(u.dtype), 0.5))
+        _, (stays, unit) = jax.lax.scan(step, jnp.int32(0), (kinds, drop))
+        slots = slots.at[:, 0].set(jnp.where(stays, unit.astype(u.dtype), 0.5))
         slots = jnp.where(stays[:, None], slots, 0.5)
         order = jnp.argsort(~stays, stable=True)
         length = jnp.maximum(jnp.sum(stays), self.least)
@@ -286,11 +286,11 @@ class Automaton(Domain):
         whole = jnp.ravel(slots)
         if not self._varies:
             return whole
-        place = centre(length - self.least, self.levels[0]).astype(u.dtype)
-        return jnp.concatenate([place, whole])
+        unit = centre(length - self.least, self.levels[0]).astype(u.dtype)
+        return jnp.concatenate([unit, whole])
 
     def _walk(self, u: Float[jax.Array, " size"]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return the transition at each place, -1 behind the end, its node, and coordinates."""
+        """Return the transition of each event, -1 after the end, its node, and coordinates."""
         length = jnp.int32(self.most)
         if self._varies:
             length = self.least + cell(u[0], self.levels[0])
@@ -299,14 +299,14 @@ class Automaton(Domain):
         following = jnp.asarray(self.graph.following)
 
         def step(node: Any, event: Any) -> Any:
-            pick, place = event
+            pick, index = event
             number = jnp.sum(edges[node] <= pick.astype(jnp.float32)).astype(jnp.int32)
             number = jnp.minimum(number, last[node])
-            number = jnp.where(place < length, number, ABSENT)
+            number = jnp.where(index < length, number, ABSENT)
             return jnp.where(number >= 0, following[node, number], node), (number, node)
 
-        places = jnp.arange(self.most, dtype=jnp.int32)
-        _, (taken, nodes) = jax.lax.scan(step, jnp.int32(0), (slots[:, 0], places))
+        indices = jnp.arange(self.most, dtype=jnp.int32)
+        _, (taken, nodes) = jax.lax.scan(step, jnp.int32(0), (slots[:, 0], indices))
         return taken, nodes, slots
 
     def _follow(self, kinds: Int[jax.Array, " places"]) -> tuple[jax.Array, jax.Array]:

@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from verifai_jax.core.lifting import is_lifting, lifted
 from verifai_jax.features.domain import (
-    LEAST_REAL,
-    MOST_LEVELS,
-    MOST_REAL,
+    MAX_LEVELS,
+    MAX_REAL,
+    MIN_REAL,
     Domain,
     Numbers,
     Row,
@@ -42,7 +42,8 @@ from verifai_jax.features.english import numbers
 from verifai_jax.features.facts import Facts, integer_facts
 
 NARROW = 16
-"""Roundings across a box up to which the map from the unit cube may step over an end."""
+"""Roundings across a box up to which the map from the unit cube may step over an end. Only in
+a box of a few roundings can rounding do that, and 16 leave a margin."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -85,7 +86,7 @@ class Box(Domain):
                 )
             if low > high:
                 raise ValueError(f"low must be below high in a Box; {shown}")
-            if max(high - low, abs(low), abs(high)) > MOST_REAL or high - low < LEAST_REAL:
+            if max(high - low, abs(low), abs(high)) > MAX_REAL or high - low < MIN_REAL:
                 raise ValueError(f"a Box must fit into float32, as must its width; {shown}")
         first, last = self.ends(np.float32)
         if np.any(first > last):
@@ -242,9 +243,9 @@ class DiscreteBox(Domain):
             object.__setattr__(self, name, whole)
         if np.any(np.asarray(self.low) > np.asarray(self.high)):
             raise ValueError(f"low must not be above high in a DiscreteBox; {shown}")
-        if max(self.levels) > MOST_LEVELS:
+        if max(self.levels) > MAX_LEVELS:
             raise ValueError(
-                f"a DiscreteBox has at most {MOST_LEVELS} values, which a float32 coordinate can "
+                f"a DiscreteBox has at most {MAX_LEVELS} values, which a float32 coordinate can "
                 f"tell apart (use a Box and round); {shown}"
             )
 
@@ -270,8 +271,8 @@ class DiscreteBox(Domain):
 
     def from_unit(self, u: Float[Array, " size"]) -> Int[Array, "*entries"]:
         low, count = self._limits()
-        places = (u.reshape(low.shape) * count).astype(jnp.int32)
-        return jnp.clip(places, 0, count - 1) + low
+        cells = (u.reshape(low.shape) * count).astype(jnp.int32)
+        return jnp.clip(cells, 0, count - 1) + low
 
     def to_unit(self, value: Numbers) -> Float[Array, " size"]:
         low, count = self._limits()

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float, PyTree, Shaped
 from verifai_jax.core.checks import check_name
 from verifai_jax.core.text import format_percent
 from verifai_jax.features.domain import (
-    MOST_LEVELS,
-    MOST_REAL,
+    MAX_LEVELS,
+    MAX_REAL,
     Domain,
     Numbers,
     Row,
@@ -35,7 +35,7 @@ from verifai_jax.features.domain import (
 from verifai_jax.features.english import number
 from verifai_jax.features.facts import Facts
 
-MOST_CHOICES = 12
+MAX_CHOICES = 12
 """Choices that English lists one by one: more make no sentence that anybody reads."""
 
 
@@ -67,16 +67,16 @@ class Categorical(Domain):
             raise ValueError(
                 f"choices are given one by one, Categorical('a', 'b'); got {choices[0]!r}"
             )
-        if len(self.choices) > MOST_LEVELS:
-            raise ValueError(f"a Categorical has at most {MOST_LEVELS} choices")
+        if len(self.choices) > MAX_LEVELS:
+            raise ValueError(f"a Categorical has at most {MAX_LEVELS} choices")
         known: set[object] = set()
         for choice in self.choices:
             if str(choice):
                 check_name("a choice", str(choice))  # As the table shows it.
             keys: set[object] = {str(choice)}  # All that the table shows of most objects.
             if isinstance(choice, int | float):
-                most = 2**31 - 1 if isinstance(choice, int) else MOST_REAL
-                if not abs(choice) <= most:
+                limit = 2**31 - 1 if isinstance(choice, int) else MAX_REAL
+                if not abs(choice) <= limit:
                     raise ValueError(
                         "choices that are numbers must be finite, integers must fit into 32 bits; "
                         f"got {choice!r}"
@@ -103,9 +103,9 @@ class Categorical(Domain):
                 "weights must be positive (leave out a choice that never comes); "
                 f"got {short(numbers)}"
             )
-        if min(numbers) < 1 / MOST_LEVELS:
+        if min(numbers) < 1 / MAX_LEVELS:
             raise ValueError(
-                f"a weight must be at least {1 / MOST_LEVELS:z.1g}, which a float32 coordinate can "
+                f"a weight must be at least {1 / MAX_LEVELS:z.1g}, which a float32 coordinate can "
                 f"tell from nothing; got {short(numbers)}"
             )
         if abs(math.fsum(numbers) - 1) > 1e-6:
@@ -116,7 +116,7 @@ class Categorical(Domain):
 
     @cached_property
     def numeric(self) -> bool:
-        """True if a value is the choice itself rather than its place in `choices`."""
+        """True if a value is the choice itself rather than its index in `choices`."""
         return self._dtype.kind != "O"
 
     @cached_property
@@ -180,12 +180,12 @@ class Categorical(Domain):
         if _is_index(value):
             return on_device(value if isinstance(value, jax.Array) else np.asarray(value))
         values = np.asarray(value, dtype=object)
-        places = []
+        indices = []
         for choice in values.ravel():
-            if (place := self._place(choice)) is None:
+            if (index := self._index_of(choice)) is None:
                 raise ValueError(f"{choice!r} is none of {format_choices(self.choices)}")
-            places.append(place)
-        return on_device(np.array(places, np.int32).reshape(values.shape))
+            indices.append(index)
+        return on_device(np.array(indices, np.int32).reshape(values.shape))
 
     def check(self, value: object, name: str) -> None:
         known = f"one of {format_choices(self.choices)}"
@@ -203,7 +203,7 @@ class Categorical(Domain):
         elif index:
             if isinstance(value, int) and 0 <= value < len(self.choices):
                 return
-        elif self._place(value) is not None:
+        elif self._index_of(value) is not None:
             return
         raise ValueError(f"{name} must be {known}; got {value!r}{closest}")
 
@@ -225,29 +225,29 @@ class Categorical(Domain):
     def from_columns(self, row: Row, name: str) -> Shaped[Array, ""]:
         shown = as_scalar(row[name])
         if not self.numeric:
-            if (place := self._choice(shown)) is not None:
-                return on_device(np.asarray(place, np.int32))
+            if (index := self._choice(shown)) is not None:
+                return on_device(np.asarray(index, np.int32))
         else:
-            place = self._nearest(shown) if isinstance(shown, bool | int | float) else None
-            if place is not None:
-                return self.coerce(self.choices[place])
+            index = self._nearest(shown) if isinstance(shown, bool | int | float) else None
+            if index is not None:
+                return self.coerce(self.choices[index])
         raise ValueError(f"{name} must be one of {format_choices(self.choices)}; got {shown!r}")
 
-    def _place(self, value: object) -> int | None:
+    def _index_of(self, value: object) -> int | None:
         """Return the index of what a person writes, a choice or the text that the table shows.
 
         An integer is an index, as systems see it, only where no choice can be read as a number.
         """
         value = as_scalar(value)
-        place = self._choice(value)
-        if place is None and type(value) is int and not self._has_numbers:
+        index = self._choice(value)
+        if index is None and type(value) is int and not self._has_numbers:
             return value if 0 <= value < len(self.choices) else None
-        return place
+        return index
 
     def _choice(self, value: object) -> int | None:
         """Return the index of a choice, or of the text that the table shows of it."""
         if type(value) is float and value.is_integer() and str(value) not in self._shown:
-            value = int(value)  # So pandas reads integers beside empty entries.
+            value = int(value)  # So pandas reads integers of a column with empty entries.
         found = np.flatnonzero(self._shown == str(value))
         if len(found):
             return int(found[0])
@@ -260,10 +260,10 @@ class Categorical(Domain):
         return any(_reads_as_number(choice) for choice in self.choices)
 
     def _nearest(self, value: float) -> int | None:
-        """Return the place of the choice that is this number in float32."""
+        """Return the index of the choice that is this number in float32."""
         numbers = self._shown.astype(np.float64)
-        place = int(np.argmin(np.abs(numbers - value)))
-        return place if np.float32(numbers[place]) == np.float32(value) else None
+        index = int(np.argmin(np.abs(numbers - value)))
+        return index if np.float32(numbers[index]) == np.float32(value) else None
 
     def words(self) -> str:
         chances = self.probabilities
@@ -273,8 +273,8 @@ class Categorical(Domain):
                 f"{choice} ({format_percent(float(chance))})"
                 for choice, chance in zip(choices, chances, strict=True)
             ]
-        listed = ", ".join(choices[:MOST_CHOICES])
-        more = f", and {len(choices) - MOST_CHOICES} more" if len(choices) > MOST_CHOICES else ""
+        listed = ", ".join(choices[:MAX_CHOICES])
+        more = f", and {len(choices) - MAX_CHOICES} more" if len(choices) > MAX_CHOICES else ""
         return f"one of {listed}{more}" + ("" if chances is not None else ", all equally probable")
 
     @property
@@ -316,7 +316,7 @@ def _reads_as_number(choice: object) -> bool:
 class Constant(Domain):
     """One value that never varies: a number, a bool, an array of numbers, or a text.
 
-    It takes no unit coordinate and no column of the table. A system sees a text as the place 0, as
+    It takes no unit coordinate and no column of the table. A system sees a text as the index 0, as
     in a `Categorical` with one choice.
 
     **Arguments:**

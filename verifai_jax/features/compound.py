@@ -61,19 +61,19 @@ class Struct(Domain):
 
     @property
     def lengths(self) -> tuple[int, ...]:
-        places, start = [], 0
+        indices, start = [], 0
         for _, domain in self.fields:
-            places += [start + i for i in domain.lengths]
+            indices += [start + i for i in domain.lengths]
             start += domain.size
-        return tuple(places)
+        return tuple(indices)
 
     @cached_property
     def signals(self) -> tuple[tuple[int, ...], ...]:
-        places, start = [], 0
+        indices, start = [], 0
         for _, domain in self.fields:
-            places += [tuple(start + i for i in signal) for signal in domain.signals]
+            indices += [tuple(start + i for i in signal) for signal in domain.signals]
             start += domain.size
-        return tuple(places)
+        return tuple(indices)
 
     def coordinates(self, name: str) -> tuple[str, ...]:
         return tuple(
@@ -147,12 +147,12 @@ class Struct(Domain):
 
     @property
     def sequences(self) -> tuple[tuple[int, int, int, int], ...]:
-        places, start = [], 0
+        indices, start = [], 0
         for _, domain in self.fields:
             for length, first, width, count in domain.sequences:
-                places.append((start + length, start + first, width, count))
+                indices.append((start + length, start + first, width, count))
             start += domain.size
-        return tuple(places)
+        return tuple(indices)
 
     @property
     def items(self) -> int:

@@ -17,8 +17,8 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from verifai_jax.core.precision import in_precision
 from verifai_jax.features.domain import (
-    LEAST_REAL,
-    MOST_REAL,
+    MAX_REAL,
+    MIN_REAL,
     Domain,
     Numbers,
     Row,
@@ -121,7 +121,7 @@ class Continuous(Domain):
 
     def contains(self, numbers: Float[np.ndarray, "*n"]) -> Bool[np.ndarray, "*n"]:
         """Return which numbers of double precision are values, up to rounding."""
-        fits = np.abs(numbers) <= MOST_REAL
+        fits = np.abs(numbers) <= MAX_REAL
         return np.asarray(is_inside(numbers, *self.support, self.closed) & fits)
 
     def check(self, value: object, name: str) -> None:
@@ -132,11 +132,11 @@ class Continuous(Domain):
             # A value of double precision that single precision cannot hold is none.
             first, last = (end.item() for end in self.ends(np.float32))
             bounds = _bounds_text(*self.support, self.closed)
-            if MOST_REAL < abs(number) < math.inf and not math.isfinite(sum(self.support)):
+            if MAX_REAL < abs(number) < math.inf and not math.isfinite(sum(self.support)):
                 bounds = "fit into float32"
             raise ValueError(
                 f"{name} must {bounds}; got {short(number.item())}"
-                f"{nearest(number.item(), max(first, -MOST_REAL), min(last, MOST_REAL))}"
+                f"{nearest(number.item(), max(first, -MAX_REAL), min(last, MAX_REAL))}"
             )
 
     def check_reachable(self, value: Numbers, name: str) -> None:
@@ -199,7 +199,7 @@ def check_scale(domain: Domain, mean: float, std: float) -> None:
     if std <= 0:
         hint = f" (a single value is Constant({short(mean)}))" if std == 0 else ""
         raise ValueError(f"the standard deviation must be positive{hint}; got {domain!r}")
-    if std < LEAST_REAL or abs(mean) + 6 * std > MOST_REAL:
+    if std < MIN_REAL or abs(mean) + 6 * std > MAX_REAL:
         raise ValueError(f"its values must fit into float32; got {domain!r}")
 
 
@@ -211,7 +211,7 @@ def check_ends(domain: Domain, low: float, high: float) -> None:
         )
     if low > high:
         raise ValueError(f"low must be below high; got {domain!r}")
-    if max(abs(low), abs(high)) > MOST_REAL or np.float32(low) == np.float32(high):
+    if max(abs(low), abs(high)) > MAX_REAL or np.float32(low) == np.float32(high):
         raise ValueError(f"low and high must be different float32 numbers; got {domain!r}")
 
 
@@ -226,7 +226,7 @@ def check_positive(domain: Domain, *names: str) -> None:
 
 def check_logs(domain: Domain, middle: float, greatest: float) -> None:
     """Refuse positive values beyond float32, by the logarithms of the median and a greatest one."""
-    if not (math.log(LEAST_REAL) <= middle and greatest < math.log(MOST_REAL)):
+    if not (math.log(MIN_REAL) <= middle and greatest < math.log(MAX_REAL)):
         raise ValueError(f"its values must fit into float32; got {domain!r}")
 
 
@@ -258,6 +258,6 @@ def normal_score(u: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.where(left, z, -z)
 
 
-def at_least(x: Float[Array, ""], least: float) -> Float[Array, ""]:
-    """Return `x`, or `least` where it is below, with the derivative of `x`."""
-    return replace_where(x, x < least, least)
+def at_least(x: Float[Array, ""], bound: float) -> Float[Array, ""]:
+    """Return `x`, or `bound` where it is below, with the derivative of `x`."""
+    return replace_where(x, x < bound, bound)

@@ -25,16 +25,17 @@ from verifai_jax.features.continuous import (
     normal_score,
     scipy_special,
 )
-from verifai_jax.features.domain import LEAST_REAL, Tuning, short
+from verifai_jax.features.domain import MIN_REAL, Tuning, short
 from verifai_jax.features.ends import replace_where
 from verifai_jax.features.english import number
 
 CENTRAL = 4.0
 """Standard deviations from the mean within which float32 coordinates are closely spaced."""
 HALF_LOG_2PI = math.log(2 * math.pi) / 2
-"""Of the density of a normal distribution."""
+"""Half the logarithm of two pi, from the density of a normal distribution."""
 DEEPEST = 1e-29
-"""Share of a normal distribution that has to lie between the ends of a truncated one."""
+"""Share of a normal distribution that has to lie between the ends of a truncated one: times the
+outermost probability of a coordinate, 2^-26, it is still a normal number of float32."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -223,8 +224,8 @@ class LogUniform(Continuous):
         check_numbers(self, "low", "high")
         if self.low <= 0:
             raise ValueError(f"low of a LogUniform must be positive; got {self!r}")
-        if self.low < LEAST_REAL:
-            raise ValueError(f"low of a LogUniform must be at least {LEAST_REAL:zg}; got {self!r}")
+        if self.low < MIN_REAL:
+            raise ValueError(f"low of a LogUniform must be at least {MIN_REAL:zg}; got {self!r}")
         check_ends(self, self.low, self.high)
 
     @property
@@ -245,7 +246,7 @@ class LogUniform(Continuous):
         return end * jnp.exp(jnp.where(left, u, u - 1) * self._width)
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
-        value = jnp.maximum(value, LEAST_REAL)
+        value = jnp.maximum(value, MIN_REAL)
         from_low = jnp.log(value / self.low) / self._width
         from_high = jnp.log(value / self.high) / self._width
         middle = math.sqrt(self.low) * math.sqrt(self.high)

@@ -38,13 +38,13 @@ from verifai_jax.core.notebook import ForUsers
 from verifai_jax.core.text import one_line
 from verifai_jax.features.facts import Facts, drawn_facts
 
-MOST_LEVELS = 2**20
+MAX_LEVELS = 2**20
 """Cells of a coordinate at most: narrower ones are not distinct in a float32 coordinate."""
 
-LEAST_REAL = float(np.finfo(np.float32).tiny)
+MIN_REAL = float(np.finfo(np.float32).tiny)
 """Smallest normal float32 number: XLA treats smaller ones as zero."""
 
-MOST_REAL = float(np.finfo(np.float32).max)
+MAX_REAL = float(np.finfo(np.float32).max)
 """Largest float32 number."""
 
 Numbers: TypeAlias = float | Sequence | np.generic | np.ndarray | jax.Array
@@ -193,18 +193,18 @@ class Domain(ForUsers, abc.ABC):
     def without(
         self, u: Float[Array, " size"], drop: Bool[Array, " items"]
     ) -> Float[Array, " size"]:
-        """Return the coordinates of the value without some of its items, those behind closed up.
+        """Return the coordinates of the value without some of its items; those after them move up.
 
         Items that cannot be without those that go, go too.
         """
         return u
 
     def settled(self, u: Float[Array, " size"]) -> Float[Array, " size"]:
-        """Return coordinates of the same value, those without a meaning in it at one place."""
+        """Return coordinates of the same value, those without a meaning in it at one point."""
         return u
 
     def used(self, u: Float[Array, " size"]) -> Bool[Array, " size"]:
-        """Return which coordinates mean something: all but those of items that there are not."""
+        """Return which coordinates mean something: all but those of absent items."""
         return jnp.ones(self.size, bool)
 
     @property
@@ -261,7 +261,7 @@ class Domain(ForUsers, abc.ABC):
 
     @property
     def tailed(self) -> tuple[bool, ...]:
-        """Whether values thin out towards an end, for each unit coordinate."""
+        """For each unit coordinate, True if its values thin out towards an end."""
         inner = tuple(tailed for _, part in self.parts("") for tailed in part.tailed)
         return (False,) * (self.size - len(inner)) + inner
 

@@ -20,47 +20,47 @@ Guard = Callable[[Past], bool]
 """A function that says whether an event may happen after a past."""
 
 
-def read_event(place: object, event: object) -> Transition:
+def read_event(entry: object, event: object) -> Transition:
     """Return the transition that one entry of an automaton's `events` describes.
 
     **Arguments:**
 
-    - `place`: the key of the entry, `(state, name)`.
+    - `entry`: its key, `(state, name)`.
     - `event`: its dictionary; see `Automaton`.
 
     **Raises:** `ValueError` or `TypeError`, which name the event and what is wrong with it.
     """
     if not (
-        isinstance(place, tuple) and len(place) == 2 and all(isinstance(x, str) for x in place)
+        isinstance(entry, tuple) and len(entry) == 2 and all(isinstance(x, str) for x in entry)
     ):
         raise ValueError(
-            f'events are named by (state, name), as ("cruise", "brake"); got {place!r}'
+            f'events are named by (state, name), as ("cruise", "brake"); got {entry!r}'
         )
     if not isinstance(event, Mapping):
         raise ValueError(
-            f"event {place!r} must be a dictionary, dict(to=..., wait=...); got {event!r}"
+            f"event {entry!r} must be a dictionary, dict(to=..., wait=...); got {event!r}"
         )
-    source, name = place
+    source, name = entry
     wait = event.get("wait")
     if not isinstance(wait, Domain) or wait.lengths or wait.signals:
         raise ValueError(
-            f"event {place!r} needs wait=, the domain of the seconds since the event before, such "
+            f"event {entry!r} needs wait=, the domain of the seconds since the event before, such "
             f"as Box(0.5, 4); got {wait!r}"
         )
     parameters = {key: value for key, value in event.items() if key not in OPTIONS}
     for key, value in parameters.items():
         if not isinstance(value, Domain):
             raise TypeError(
-                f"{key!r} of event {place!r} must be a domain, such as Box(0, 1); got {value!r}"
+                f"{key!r} of event {entry!r} must be a domain, such as Box(0, 1); got {value!r}"
                 f"{nearest_names(key, OPTIONS)}"
             )
         if key in TAKEN or not key.strip():
-            raise ValueError(f"a parameter of event {place!r} cannot be called {key!r}")
+            raise ValueError(f"a parameter of event {entry!r} cannot be called {key!r}")
     guard: Any = event.get("guard")
     if guard is not None and not callable(guard):
-        raise ValueError(f"guard of event {place!r} must be a function of the past; got {guard!r}")
+        raise ValueError(f"guard of event {entry!r} must be a function of the past; got {guard!r}")
     if not isinstance(event.get("to", source), str):
-        raise ValueError(f"to of event {place!r} must be the name of a state; got {event['to']!r}")
+        raise ValueError(f"to of event {entry!r} must be the name of a state; got {event['to']!r}")
     after = event.get("after", ())
     at_most = event.get("at_most")
     return Transition(
@@ -70,10 +70,10 @@ def read_event(place: object, event: object) -> Transition:
         wait=wait,
         parameters=tuple(parameters.items()),
         weight=float(
-            check_positive(f"weight of event {place!r}", event.get("weight", 1.0), finite=True)
+            check_positive(f"weight of event {entry!r}", event.get("weight", 1.0), finite=True)
         ),
         after=(after,) if isinstance(after, str) else tuple(after),
-        at_most=None if at_most is None else check_count(f"at_most of event {place!r}", at_most),
+        at_most=None if at_most is None else check_count(f"at_most of event {entry!r}", at_most),
         guard=cast(Guard | None, guard),
     )
 

@@ -2,7 +2,7 @@
 
     tables = EventTables(transitions, graph)
     tables.by_kind[node, kind]                      # the transition that a kind of event is there
-    tables.followed(kinds)                          # the transition at each place of many sequences
+    tables.followed(kinds)                          # the transition of each event of many sequences
 
 All follow from the transitions and from the graph of what can follow what.
 """

@@ -1,4 +1,4 @@
-"""What a domain knows of its table columns before any row: their order, bounds and choices.
+"""Facts of the table columns of a domain, known before any row: their order, bounds and choices.
 
 Box(0, 2).facts("x")       # {"x": {"ordered": True, "bounds": (0, 2), "range": (0, 2), ...}}
 

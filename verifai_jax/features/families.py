@@ -27,7 +27,7 @@ from verifai_jax.features.continuous import (
     sides,
 )
 from verifai_jax.features.distributions import HALF_LOG_2PI, Normal
-from verifai_jax.features.domain import LEAST_REAL, short
+from verifai_jax.features.domain import MIN_REAL, short
 from verifai_jax.features.ends import replace_where
 from verifai_jax.features.english import number
 
@@ -87,7 +87,7 @@ class LogNormal(Positive):
         return jnp.exp(self.mean + self.std * normal_score(u))
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
-        return ndtr((jnp.log(jnp.maximum(value, LEAST_REAL)) - self.mean) / self.std)
+        return ndtr((jnp.log(jnp.maximum(value, MIN_REAL)) - self.mean) / self.std)
 
     def log_density(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         value, x = _positive(value)
@@ -138,7 +138,7 @@ class Weibull(Positive):
         return self.scale * jnp.exp(jnp.log(hazard(u)) / self.shape)
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
-        x = jnp.maximum(value / self.scale, LEAST_REAL)
+        x = jnp.maximum(value / self.scale, MIN_REAL)
         return -jnp.expm1(-jnp.exp(self.shape * jnp.log(x)))
 
     def log_density(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:

@@ -4,7 +4,7 @@
     rows = given_rows(space, features)                  # [n, dim + width], points and values
     space.unflatten_given(rows[0, :1], rows[0, 1:])     # {"x": 5.0}, not what the point stands for
 
-A point of the unit cube in float32 cannot address every value, so a given value travels beside its
+A point of the unit cube in float32 cannot address every value, so a given value travels with its
 point. The point serves searches, which know nothing else; the value is what is simulated.
 """
 
@@ -33,7 +33,7 @@ Rows: TypeAlias = "pd.DataFrame | pd.Series | Iterable[Any] | Mapping[str, Any]"
 """Features of simulations: the feature columns of a table, a row of one, or dictionaries."""
 
 TABLE_COLUMNS = ("row", "rho", "violated", "status", "verdict", "suggested", "message")
-"""Columns of a table beside its features, which a dictionary made of a row may hold."""
+"""Columns of a table other than its features, which a dictionary made of a row may hold."""
 
 
 def given_features(space: FeatureSpace, rows: Rows, precision: str = "float32") -> dict[str, Any]:
@@ -84,7 +84,7 @@ def given_rows(space: FeatureSpace, features: Mapping[str, Any]) -> Float[np.nda
     - `space`: of the features.
     - `features`: `[n, ...]`, as `given_features` gives them.
 
-    **Returns:** the points of the unit cube nearest to the features, and behind each the real
+    **Returns:** the points of the unit cube nearest to the features, and after each the real
     numbers among its features; see `FeatureSpace.unflatten_given`.
     """
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(features)]

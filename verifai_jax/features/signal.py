@@ -30,6 +30,8 @@ from verifai_jax.features.continuous import Continuous
 from verifai_jax.features.domain import Domain, Row, as_numbers, indexed, on_device, short
 
 DEFAULT_KNOTS = 16
+"""Control points of a signal that says nothing else: enough for a few swings, and few enough to be
+searched."""
 
 Course = tuple[str, float | None, tuple[float, ...] | None, float | None]
 """Hold, duration, times and width."""
@@ -54,12 +56,12 @@ class Signal(Domain):
       `"pulse"` holds each for `width` seconds from its time on, and is 0 otherwise.
     - `duration`: in seconds; that of the simulation when left out (`ode` knows it).
     - `times`: of the control points in seconds, increasing. The first and the last value hold
-      before and behind them.
+      before and after them.
     - `width`: of a pulse in seconds; half the shortest distance of two when left out.
 
     **Raises:** `ValueError` for a domain that is not continuous, an unknown `hold`, too few knots
     (1 for constant and pulse, 2 for linear and pchip), a duration or width that is not positive,
-    and times that do not increase, lie behind the duration or are not as many as the knots.
+    and times that do not increase, lie after the duration or are not as many as the knots.
     """
 
     arguments = ("domain", "knots", "hold", "duration")
@@ -79,7 +81,7 @@ class Signal(Domain):
             )
         if self.hold not in HOLDS:
             raise unknown_name("hold", self.hold, HOLDS)
-        least, knots = 1 if self.hold in HELD else 2, self.knots
+        fewest, knots = 1 if self.hold in HELD else 2, self.knots
         times = None if self.times is None else check_times(self.times)
         if times is not None:
             # The default cannot be told from a 16 that was given.
@@ -89,9 +91,9 @@ class Signal(Domain):
                     f"{len(times)} times"
                 )
             knots = len(times)
-        if isinstance(knots, bool) or not isinstance(knots, int | np.integer) or knots < least:
+        if isinstance(knots, bool) or not isinstance(knots, int | np.integer) or knots < fewest:
             raise ValueError(
-                f"a Signal with {self.hold} hold needs at least {least} knots; got {knots!r}"
+                f"a Signal with {self.hold} hold needs at least {fewest} knots; got {knots!r}"
             )
         check_width(self.hold, times, self.width)
         object.__setattr__(self, "knots", int(knots))

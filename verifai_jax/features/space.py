@@ -39,6 +39,18 @@ if TYPE_CHECKING:
 class FeatureSpace(ForUsers):
     """Named domains over `dim` unit coordinates; uniform coordinates are the prior on features.
 
+    A simulation has three forms: a *point* of the unit cube, its *features* by name as a system
+    sees them, and a *row* of a table. These convert one form into another:
+
+    - point `[dim]` to features: `unflatten`; points `[n, dim]`: `features_at`, compiled.
+    - features to point `[dim]`: `flatten`, and compiled `point_of`; features `[n, ...]` to points
+      `[n, dim]`: `points_at`, compiled.
+    - features `[n, ...]` to columns `[n]` of a table: `rows`.
+    - row to features: `from_row`; columns `[n]` to features `[n, ...]`: `features_of`.
+    - a table to points `[n, dim]`: `points`.
+    - what a person writes to features: `coerce`, which checks it, and `convert`, which JAX may
+      trace.
+
     **Arguments:**
 
     - `domains`: name -> `Domain`, in the order in which coordinates and columns come.
@@ -93,7 +105,7 @@ class FeatureSpace(ForUsers):
 
     @cached_property
     def weights(self) -> tuple[tuple[float, ...] | None, ...]:
-        """Probabilities of the cells of each coordinate; None where they are equal."""
+        """Probabilities of the cells of each coordinate; None for equal ones."""
         return self.root.weights
 
     @cached_property
@@ -152,7 +164,7 @@ class FeatureSpace(ForUsers):
         return self.root.columns("")
 
     def unflatten(self, u: Numbers) -> dict[str, Any]:
-        """Return the features at a point of the unit cube; real ones in the dtype of `u`.
+        """Convert a point `[dim]` of the unit cube to features; real ones have the dtype of `u`.
 
         Pure JAX; `jax.vmap` it for batches.
 
@@ -173,7 +185,7 @@ class FeatureSpace(ForUsers):
         return self.root.from_unit(u)
 
     def flatten(self, features: Mapping[str, Any]) -> Float[Array, " dim"]:
-        """Return the point of the unit cube with these features; cell centres where discrete.
+        """Convert features to the point `[dim]` of the unit cube; discrete ones to cell centres.
 
         Pure JAX on the values that `unflatten` gives; takes plain Python values too. Nothing is
         checked.
@@ -188,17 +200,17 @@ class FeatureSpace(ForUsers):
 
     @cached_property
     def features_at(self) -> Callable[[Numbers], dict[str, Any]]:
-        """`unflatten` as a compiled function of points `[n, dim]`, compiled once for each `n`."""
+        """Points `[n, dim]` to features `[n, ...]`: `unflatten`, compiled once for each `n`."""
         return jax.jit(jax.vmap(self.unflatten))
 
     @cached_property
     def point_of(self) -> Callable[[Mapping[str, Any]], Float[Array, " dim"]]:
-        """`flatten` as a compiled function of the features of one simulation."""
+        """Features of one simulation to a point `[dim]`: `flatten`, compiled."""
         return jax.jit(self.flatten)
 
     @cached_property
     def points_at(self) -> Callable[[Mapping[str, Any]], Float[Array, "n dim"]]:
-        """`flatten` as a compiled function of features `[n, ...]`, compiled once for each `n`."""
+        """Features `[n, ...]` to points `[n, dim]`: `flatten`, compiled once for each `n`."""
         return jax.jit(jax.vmap(self.flatten))
 
     @cached_property
@@ -240,7 +252,7 @@ class FeatureSpace(ForUsers):
         )
 
     def points(self, rows: "pd.DataFrame") -> Float[np.ndarray, "n dim"]:
-        """Return the points of the unit cube that the rows of a table came from.
+        """Convert a table to the points `[n, dim]` of the unit cube that its rows came from.
 
         **Raises:** `KeyError` for a missing column; `ValueError` for an entry of the wrong kind.
         """
@@ -252,7 +264,7 @@ class FeatureSpace(ForUsers):
     def features_of(
         self, rows: Mapping[str, Numbers], precision: str = "float32"
     ) -> dict[str, Any]:
-        """Return the features `[n, ...]` that rows of a table hold: `from_row` of each, stacked.
+        """Convert columns `[n]` of a table to features `[n, ...]`: `from_row` of each row, stacked.
 
         **Arguments:**
 
@@ -302,10 +314,10 @@ class FeatureSpace(ForUsers):
         if missing:
             raise ValueError(f"feature {missing[0]!r} is missing; got {', '.join(features)}")
         converted = self.root.coerce(complete)
-        places = jax.tree_util.tree_flatten_with_path(self.feature_form)[0]
-        for (place, form), leaf in zip(places, jax.tree.leaves(converted), strict=True):
+        leaves = jax.tree_util.tree_flatten_with_path(self.feature_form)[0]
+        for (path, form), leaf in zip(leaves, jax.tree.leaves(converted), strict=True):
             if form.shape != jnp.shape(leaf):
-                name = jax.tree_util.keystr(place, simple=True, separator=".")
+                name = jax.tree_util.keystr(path, simple=True, separator=".")
                 raise ValueError(
                     f"feature {name!r} must have shape {list(form.shape)}; "
                     f"got {list(jnp.shape(leaf))}"
@@ -417,7 +429,7 @@ class FeatureSpace(ForUsers):
     ) -> Float[Array, ""]:
         """Return the distance between two points of the space: Euclidean over unit coordinates.
 
-        That is by probability in continuous coordinates, by difference of places (from 0 to 1)
+        That is by probability in continuous coordinates, by difference of ranks (from 0 to 1)
         in integers and lengths, and 0 or 1 between choices; an absent item counts as one in the
         middle of its domain. A metric; pure JAX on the values that `unflatten` gives.
 
@@ -535,11 +547,11 @@ class FeatureSpace(ForUsers):
         return cls(dict(root.fields), where)
 
     def rows(self, features: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Return columns `[n]` of the table for a batch of features (leaves `[n, ...]`)."""
+        """Convert features `[n, ...]` to columns `[n]` of a table, by name."""
         return self.root.to_columns(features, "")
 
     def from_row(self, row: Row) -> dict[str, Any]:
-        """Return the features that a row of the table (pandas or a mapping) holds, exactly.
+        """Convert a row of a table (of pandas, or a mapping) to its features, exactly.
 
         Other columns are ignored; a value outside its domain is taken as it is.
 
@@ -574,7 +586,8 @@ class FeatureSpace(ForUsers):
         """Return features with the constant, fixed ones and events that were left out."""
         if not isinstance(features, Mapping):
             return features
-        known = {n: d.held_at for n, d in self.root.fields if d.held_at is not None}
+        held = ((name, domain.held_at) for name, domain in self.root.fields)
+        known = {name: value for name, value in held if value is not None}
         known |= {n: d.nominal for n, d in self.root.fields if d.nominal is not None}
         return {**known, **features}
 

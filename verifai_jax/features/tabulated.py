@@ -28,15 +28,16 @@ from verifai_jax.features.continuous import (
     normal_score,
     scipy_special,
 )
-from verifai_jax.features.domain import LEAST_REAL, MOST_REAL, as_numbers, short
+from verifai_jax.features.domain import MAX_REAL, MIN_REAL, as_numbers, short
 from verifai_jax.features.ends import replace_where
 from verifai_jax.features.english import number, quantile_words
 from verifai_jax.features.families import Positive
 
 KNOTS = 1025
 """Entries of a table: a cubic between two of them is off by 1e-9 of a deviation or less."""
-MOST_DATA = 2**16
-"""Different numbers of an empirical distribution at most."""
+MAX_DATA = 2**16
+"""Greatest number of different values of an empirical distribution: a coordinate in float32 can
+address them all, and the table is a constant of a compiled program."""
 
 
 class _Table(NamedTuple):
@@ -48,9 +49,9 @@ class _Table(NamedTuple):
     def at(self, z: Float[Array, ""]) -> Float[Array, ""]:
         """Return the value at a normal score."""
         step = 2 * REACH / (KNOTS - 1)
-        place = (jnp.clip(z, -REACH, REACH) + REACH) / step
-        i = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, KNOTS - 2)
-        t = place - i
+        position = (jnp.clip(z, -REACH, REACH) + REACH) / step
+        i = jnp.clip(jnp.floor(position).astype(jnp.int32), 0, KNOTS - 2)
+        t = position - i
         values, slopes = (jnp.asarray(part, z.dtype) for part in self)
         low, high = values[i], values[i + 1]
         # From the nearer knot, of which the rest is a small part.
@@ -139,8 +140,8 @@ class Gamma(Positive):
         return math.exp(self._median) * jnp.exp(self._table.at(normal_score(u)))
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
-        share = jnp.maximum(value, LEAST_REAL) / math.exp(self._median)
-        return ndtr(self._table.score(jnp.log(jnp.maximum(share, LEAST_REAL))))
+        share = jnp.maximum(value, MIN_REAL) / math.exp(self._median)
+        return ndtr(self._table.score(jnp.log(jnp.maximum(share, MIN_REAL))))
 
     def log_density(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         value = np.asarray(value, np.float64)
@@ -233,8 +234,8 @@ class Beta(Continuous):
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
         width = self.high - self.low
-        below = jnp.maximum((value - self.low) / width, LEAST_REAL)
-        above = jnp.maximum((self.high - value) / width, LEAST_REAL)
+        below = jnp.maximum((value - self.low) / width, MIN_REAL)
+        above = jnp.maximum((self.high - value) / width, MIN_REAL)
         return ndtr(self._table.score(jnp.log(below) - jnp.log(above)))
 
     def log_density(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
@@ -290,16 +291,16 @@ class Empirical(Continuous):
     def __init__(self, data: Iterable[float]) -> None:
         given = list(data) if not hasattr(data, "__array__") else data
         numbers = np.ravel(as_numbers(given, "the data of an Empirical"))
-        if not np.all(np.isfinite(numbers)) or np.any(np.abs(numbers) > MOST_REAL):
+        if not np.all(np.isfinite(numbers)) or np.any(np.abs(numbers) > MAX_REAL):
             raise ValueError("the data of an Empirical must be finite numbers of float32")
         # Those that float32 cannot tell apart are one.
         order = np.sort(numbers)
         _, first, counts = np.unique(
             order.astype(np.float32), return_index=True, return_counts=True
         )
-        if not 2 <= len(first) <= MOST_DATA:
+        if not 2 <= len(first) <= MAX_DATA:
             raise ValueError(
-                f"an Empirical needs 2 to {MOST_DATA} different numbers (a single value is a "
+                f"an Empirical needs 2 to {MAX_DATA} different numbers (a single value is a "
                 f"Constant, a few are a Categorical with weights); got {len(first)}"
             )
         middles = first + (counts - 1) / 2

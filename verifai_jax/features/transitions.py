@@ -1,6 +1,6 @@
 """The graph of an automaton, with guards unfolded: who follows whom, by which probability.
 
-    graph = unfold("cruise", transitions, most=6)
+    graph = unfold("cruise", transitions, 6)
     graph.edges[node]                                   # cumulative probabilities of transitions
     graph.pairs                                         # all that can follow each other
 
@@ -18,13 +18,14 @@ from jaxtyping import Bool, Float, Int
 
 from verifai_jax.features.domain import Domain
 
-MOST_NODES = 50_000
-"""States, with the pasts that guards tell apart, of an automaton at most."""
+MAX_NODES = 50_000
+"""Greatest number of states of an automaton, each with the pasts that guards tell apart: its tables
+have a row for each and a column for each transition."""
 
 NEARLY = 0.82
 """Similarity of two names from which one is taken for the other, misspelt: one letter in six."""
 
-LEAST_SHARE = 2.0**-20
+MIN_SHARE = 2.0**-20
 """Least probability of a transition: a narrower interval is no distinct one in float32."""
 
 
@@ -92,7 +93,7 @@ class Transition:
 
     @property
     def label(self) -> str:
-        """The transition in words, such as `cruise -cut_in-> crowded`."""
+        """The transition as a person writes it, such as `cruise -cut_in-> crowded`."""
         return f"{self.source} -{self.name}-> {self.to}"
 
 
@@ -119,10 +120,10 @@ class Graph:
     transitions: tuple[int, ...]
     pairs: tuple[tuple[int, int], ...]
 
-    def longest(self, most: int) -> int:
-        """Return the events of the longest sequence, of at most `most`."""
+    def longest(self, limit: int) -> int:
+        """Return the events of the longest sequence, of at most `limit`."""
         nodes = {0}
-        for length in range(most):
+        for length in range(limit):
             nodes = {
                 int(self.following[node, number])
                 for node in nodes
@@ -130,7 +131,7 @@ class Graph:
             }
             if not nodes:
                 return length
-        return most
+        return limit
 
 
 def check_states(start: str, transitions: tuple[Transition, ...]) -> None:
@@ -166,8 +167,8 @@ def _is_numbered(one: str, other: str) -> bool:
     return re.sub(r"\d+", "", one) == re.sub(r"\d+", "", other)
 
 
-def unfold(start: str, transitions: tuple[Transition, ...], most: int) -> Graph:
-    """Return the graph of all sequences of at most `most` events.
+def unfold(start: str, transitions: tuple[Transition, ...], limit: int) -> Graph:
+    """Return the graph of all sequences of at most `limit` events.
 
     **Raises:** `ValueError` for guards that tell too many pasts apart, weights too unequal, or a
     start that no event can leave.
@@ -179,7 +180,7 @@ def unfold(start: str, transitions: tuple[Transition, ...], most: int) -> Graph:
     taken: set[int] = set()
     pairs: set[tuple[int, int]] = set()
     # Breadth first, so that a node is met at the least number of events that lead to it.
-    for depth in range(most + 1):
+    for depth in range(limit + 1):
         found: list[tuple[str, Past]] = []
         for state, past in frontier:
             node = nodes[state, past]
@@ -189,25 +190,25 @@ def unfold(start: str, transitions: tuple[Transition, ...], most: int) -> Graph:
                     continue
                 target = (each.to, past.then(each.name) if guarded else Past())
                 if target not in nodes:
-                    if depth == most:
+                    if depth == limit:
                         ways[number] = 0
                         continue
                     nodes[target] = len(nodes)
                     found.append(target)
-                    if len(nodes) > MOST_NODES:
+                    if len(nodes) > MAX_NODES:
                         raise ValueError(
-                            f"the guards tell more than {MOST_NODES} pasts of at most {most} "
+                            f"the guards tell more than {MAX_NODES} pasts of at most {limit} "
                             "events apart; allow fewer events, or let fewer have guards"
                         )
                 ways[number] = nodes[target]
             following.append(ways)
         frontier = found
-    depths = _least_depths(following)
+    depths = _min_depths(following)
     for node, ways in enumerate(following):
         for number, target in ways.items():
-            if depths[node] < most:
+            if depths[node] < limit:
                 taken.add(number)
-                if depths[node] < most - 1:
+                if depths[node] < limit - 1:
                     pairs |= {(number, second) for second in following[target]}
     names = list(nodes)
     if not following[0]:
@@ -215,7 +216,7 @@ def unfold(start: str, transitions: tuple[Transition, ...], most: int) -> Graph:
     return _tables(names, transitions, following, taken, pairs)
 
 
-def _least_depths(following: list[dict[int, int]]) -> list[int]:
+def _min_depths(following: list[dict[int, int]]) -> list[int]:
     depths = [0] + [len(following) + 1] * (len(following) - 1)
     frontier = [0]
     while frontier:
@@ -244,12 +245,12 @@ def _tables(
     weights = np.where(enabled, [each.weight for each in transitions], 0.0)
     total = weights.sum(axis=1, keepdims=True)
     shares = weights / np.where(total > 0, total, 1.0)
-    if enabled.any() and shares[enabled].min() < LEAST_SHARE:
-        node, number = (int(i) for i in np.argwhere(enabled & (shares < LEAST_SHARE))[0])
+    if enabled.any() and shares[enabled].min() < MIN_SHARE:
+        node, number = (int(i) for i in np.argwhere(enabled & (shares < MIN_SHARE))[0])
         raise ValueError(
             f"the weight of {transitions[number].label}, {transitions[number].weight:zg}, is too "
             f"small beside the others of its state: its probability must be at least "
-            f"{LEAST_SHARE:z.1g}; leave out what never happens"
+            f"{MIN_SHARE:z.1g}; leave out what never happens"
         )
     last = np.where(
         enabled.any(axis=1), shape[1] - 1 - np.argmax(enabled[:, ::-1], axis=1), -1

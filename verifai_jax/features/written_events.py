@@ -180,8 +180,8 @@ class WrittenEvents:
             columns[dotted(item, "wait")] = np.where(kinds[:, i] >= 0, waits[:, i], np.nan)
             for parameter, groups in tables.users.items():
                 column = dotted(item, parameter)
-                place = np.asarray(values.parameters[parameter])[:, i]
-                columns |= _own_entries(groups, place, taken[:, i], column)
+                entries = np.asarray(values.parameters[parameter])[:, i]
+                columns |= _own_entries(groups, entries, taken[:, i], column)
         return columns
 
     def from_columns(self, row: Row, name: str) -> Events:
@@ -229,8 +229,8 @@ def _own_entries(
     """Return columns of a parameter, empty in rows whose event does not have it."""
     parts = [(domain.to_columns(values, column), users) for domain, users in groups.items()]
     found = {}
-    for place, name in enumerate(parts[0][0]):
-        entries = [(list(part.values())[place], users) for part, users in parts]
+    for index, name in enumerate(parts[0][0]):
+        entries = [(list(part.values())[index], users) for part, users in parts]
         numeric = all(part.dtype.kind in "iufb" for part, _ in entries)
         real = entries[0][0].dtype if entries[0][0].dtype.kind == "f" else np.float64
         whole = np.full(len(taken), np.nan if numeric else "", real if numeric else object)

@@ -53,8 +53,8 @@ class Node:
     def flat(self) -> list[tuple[int, "Node"]]:
         """Return itself and all nodes below with their depths, parents first.
 
-        A node that stands in several places (as both sides of `<->` do) is followed by what is
-        below it in the first of them only.
+        A node that occurs several times (as both sides of `<->` do) is followed by what is below it
+        at its first occurrence only.
         """
         rows: list[tuple[int, Node]] = []
         listed: set[int] = set()
@@ -306,11 +306,11 @@ class _Walk:
             stop = max(i + a, *(len(self.series[p]) - 1 for p in f.operands()))
         return range(i + a, (stop if math.isinf(b) else min(i + int(b), stop)) + 1)
 
-    def best(self, p: Formula, window: range, least: bool) -> list[tuple[Formula, int]]:
+    def best(self, p: Formula, window: range, lowest: bool) -> list[tuple[Formula, int]]:
         if not window:
             return []
         values = [self.at(p, j) for j in window]
-        return [(p, window[int(np.argmin(values) if least else np.argmax(values))])]
+        return [(p, window[int(np.argmin(values) if lowest else np.argmax(values))])]
 
     def witness(
         self, p: Formula, q: Formula, window: range, i: int, step: int
@@ -318,7 +318,7 @@ class _Walk:
         """Find where until (since) is most nearly fulfilled: the witness and the weakest link."""
         if not window:
             return []
-        best, place = -math.inf, None
+        best, found = -math.inf, None
         weakest, link = math.inf, i
         ordered = window if step > 0 else reversed(window)
         k = i
@@ -328,10 +328,10 @@ class _Walk:
                     weakest, link = self.at(p, k), k
                 k += step
             value = min(self.at(q, j), weakest)
-            if place is None or value > best:
-                best, place = value, (j, link)
-        assert place is not None
-        return [(p, place[1]), (q, place[0])] if place[0] != i else [(q, i)]
+            if found is None or value > best:
+                best, found = value, (j, link)
+        assert found is not None
+        return [(p, found[1]), (q, found[0])] if found[0] != i else [(q, i)]
 
 
 def _critical(

@@ -7,9 +7,7 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.expression import PRECEDENCE, Arithmetic, Component, Number, Signal
 from verifai_jax.mtl.formula import Formula, Term, surface
 from verifai_jax.mtl.node import missing_case
-from verifai_jax.mtl.words import OPERATORS, number_text
-
-_COMPARISON_LATEX = {">=": r"\geq", "<=": r"\leq", "==": "=", "!=": r"\neq"}
+from verifai_jax.mtl.words import COMPARISONS, OPERATORS, number_text
 
 
 def latex(f: Formula) -> str:
@@ -18,7 +16,7 @@ def latex(f: Formula) -> str:
         case ast.Constant(value):
             return r"\top" if value else r"\bot"
         case ast.Predicate(comparison, left, right):
-            symbol = _COMPARISON_LATEX.get(comparison, comparison)
+            symbol = COMPARISONS[comparison].latex
             return f"{_expression_latex(left)} {symbol} {_expression_latex(right)}"
         case ast.Atom(e):
             return _expression_latex(e)

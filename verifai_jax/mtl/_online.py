@@ -74,7 +74,7 @@ class Online:
         return _step(self, state, own)
 
     def interval(self, state: State) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Return the least and greatest robustness at time 0 that further samples allow."""
+        """Return the lowest and the greatest robustness at time 0 that further samples allow."""
         return _end_with(self, state, -math.inf), _end_with(self, state, math.inf)
 
     def finish(self, state: State) -> Float[Array, ""]:
@@ -198,7 +198,7 @@ class _Machine:
     # Streams
 
     def delay(self, f: Formula) -> int:
-        """Count the samples by which a stream lags behind."""
+        """Count the samples by which a stream is late."""
         if f not in self._delays:
             self._delays[f] = self._delay(f)
         return self._delays[f]
@@ -245,7 +245,7 @@ class _Machine:
     def stream(self, path: str, f: Formula, sign: int) -> Array:
         """Return the value of `f` at the instant `now - delay(f)`; anything before time 0.
 
-        A part that stands in several places is followed once, in the cells of the first of them.
+        A part that occurs several times is followed once, in the cells of its first occurrence.
         """
         if (f, sign) not in self._streams:
             self._streams[f, sign] = self._stream(path, f, sign)
@@ -304,16 +304,16 @@ class _Machine:
         return jnp.where(self.now - self.delay(p) >= 0, value, nothing)
 
     def window(
-        self, path: str, value: Array, a: int, b: float, nothing: float, least: bool
+        self, path: str, value: Array, a: int, b: float, nothing: float, lowest: bool
     ) -> Array:
-        """Return the least (greatest) of a stream's values from `b` to `a` samples ago."""
+        """Return the lowest (else greatest) value of a stream from `b` to `a` samples ago."""
         if math.isfinite(b):
             window = self.push(path, value, nothing, int(b) + 1)[: int(b) - a + 1]
-            return window.min() if least else window.max()
+            return window.min() if lowest else window.max()
         if a:
             value = self.push(path + "w", value, nothing, a + 1)[0]
         before = self.cell(path, value, nothing)
-        self.fresh[path] = jnp.minimum(before, value) if least else jnp.maximum(before, value)
+        self.fresh[path] = jnp.minimum(before, value) if lowest else jnp.maximum(before, value)
         return self.fresh[path]
 
     def since(self, path: str, p: Formula, q: Formula, a: int, b: float, sign: int) -> Array:
@@ -339,7 +339,7 @@ class _Machine:
     def value_at_start(self, path: str, f: Formula, sign: int) -> Array:
         """Return the value of `f` at time 0 if every stream stays as it is from now on.
 
-        A part that stands in several places is followed once, in the cells of the first of them.
+        A part that occurs several times is followed once, in the cells of its first occurrence.
         """
         if (f, sign) not in self._starts:
             self._starts[f, sign] = self._value_at_start(path, f, sign)
@@ -367,11 +367,11 @@ class _Machine:
         return jnp.asarray(math.inf if f.value else -math.inf)
 
     def accumulate(
-        self, path: str, value: Array, index: Array, a: int, b: float, least: bool
+        self, path: str, value: Array, index: Array, a: int, b: float, lowest: bool
     ) -> Array:
-        """Return the least (greatest) of a stream over the instants `a` to `b`."""
-        before = self.cell(path, value, math.inf if least else -math.inf)
-        both = jnp.minimum(before, value) if least else jnp.maximum(before, value)
+        """Return the lowest (else greatest) value of a stream over the instants `a` to `b`."""
+        before = self.cell(path, value, math.inf if lowest else -math.inf)
+        both = jnp.minimum(before, value) if lowest else jnp.maximum(before, value)
         counts = (index >= a) & (index <= b)
         self.fresh[path] = jnp.where(counts, both, before)
         # What is still to come in the window is what the stream gives now.

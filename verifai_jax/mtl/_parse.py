@@ -30,16 +30,17 @@ _UNITS = {
     "h": Decimal(3600),
     "d": Decimal(86400),
 }
-MOST_TOKENS = 10_000
-"""Words and symbols that a formula's text may have."""
+MAX_TOKENS = 10_000
+"""Words and symbols that a formula's text may have. Far more than a person writes: a file that
+is given by mistake is refused before it is parsed."""
 
-MOST_DEEP = 100
+MAX_DEPTH = 100
 """Operators, or parentheses, that may stand within each other: far from where Python gives up."""
 
-MOST_OFFERED = 300
+MAX_OFFERED = 300
 """Characters of a text that an error offers at most; a longer one would be cut when it is shown."""
 
-MOST_DEEP_TEMPORAL = 40
+MAX_TEMPORAL_DEPTH = 40
 """Temporal operators that may stand within each other: each is a loop of its own to compile."""
 
 _TOKEN = re.compile(r'"[^"\n]*"|[\w.]+|\S')
@@ -63,7 +64,7 @@ def parse(
     other, and so do operators, of which `<->`, `xor`, weak until and release are made of several;
     temporal operators stand at most 40 deep.
 
-    **Raises:** `FormulaSyntaxError`, with a caret under the place and what is expected there.
+    **Raises:** `FormulaSyntaxError`, with a caret under the error and what is expected there.
     """
     known: dict[str, Formula] = {}
     constants = dict(constants or {})
@@ -103,10 +104,10 @@ def _check_size(text: str) -> None:
     for number, token in enumerate(_TOKEN.finditer(text)):
         depth += (token[0] == "(") - (token[0] == ")")
         reason = ""
-        if number >= MOST_TOKENS:
-            reason = f"a formula has at most {MOST_TOKENS} words and symbols"
-        elif depth > MOST_DEEP:
-            reason = f"parentheses stand at most {MOST_DEEP} deep within each other"
+        if number >= MAX_TOKENS:
+            reason = f"a formula has at most {MAX_TOKENS} words and symbols"
+        elif depth > MAX_DEPTH:
+            reason = f"parentheses stand at most {MAX_DEPTH} deep within each other"
         if reason:
             raise FormulaSyntaxError(
                 f"{reason}: name its parts by definitions", text, token.start()
@@ -115,7 +116,7 @@ def _check_size(text: str) -> None:
 
 @dataclass
 class _Part:
-    """The meaning of a part of the text, and its place there."""
+    """The meaning of a part of the text, and where it stands there."""
 
     value: Formula | Expression
     start: int
@@ -166,7 +167,7 @@ class _Builder:
 
     def _reads(self, text: str) -> bool:
         """Return whether a text that is to be offered is a formula; nothing is offered in turn."""
-        if not self.offers or len(text) > MOST_OFFERED:
+        if not self.offers or len(text) > MAX_OFFERED:
             return False
         try:
             _read(text, self.constants, self.known, offers=False)
@@ -219,12 +220,12 @@ class _Builder:
             raise self._fail(str(error), *self._span(tree)) from None
         if isinstance(part.value, Formula):
             limits = {
-                "operators": (part.value.depth, MOST_DEEP),
-                "temporal operators": (part.value.temporal_depth, MOST_DEEP_TEMPORAL),
+                "operators": (part.value.depth, MAX_DEPTH),
+                "temporal operators": (part.value.temporal_depth, MAX_TEMPORAL_DEPTH),
             }
-            for kind, (depth, most) in limits.items():
-                if depth > most:
-                    reason = f"{kind} stand at most {most} deep within each other"
+            for kind, (depth, limit) in limits.items():
+                if depth > limit:
+                    reason = f"{kind} stand at most {limit} deep within each other"
                     raise self._fail(reason, part.start, part.start + 1)
         return part
 
@@ -275,7 +276,7 @@ class _Builder:
         return _Part(value, *self._span(tree), rule="join")
 
     def _refuse_powers(self, tree: Tree) -> None:
-        """Refuse `x^2 < 1`, where `^` stands beside arithmetic: it means exclusive or.
+        """Refuse `x^2 < 1`, where `^` stands next to arithmetic: it means exclusive or.
 
         Between two comparisons it can mean nothing else, as these do not chain.
         """
@@ -477,8 +478,8 @@ class _Builder:
 
     def _minus(self, tree: Tree) -> _Part:
         part = self._build(tree.children[1])
-        if part.signs >= MOST_DEEP:
-            reason = f"at most {MOST_DEEP} minus signs stand in front of each other"
+        if part.signs >= MAX_DEPTH:
+            reason = f"at most {MAX_DEPTH} minus signs stand in front of each other"
             raise self._fail(reason, part.start, part.start + 1)
         value = -self._expression(part)
         return _Part(value, *self._span(tree), signs=part.signs + 1)

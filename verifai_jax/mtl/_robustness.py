@@ -72,7 +72,7 @@ def robustness_signal(
     """Compute the robustness at every sample of the trace; see `robustness`. Reverse mode only.
 
     NaN, no verdict, where `end` leaves none: under `"strict"` at samples from which the formula
-    looks beyond the end, and under `"truncate"` and `"strict"` behind the last valid sample.
+    looks beyond the end, and under `"truncate"` and `"strict"` after the last valid sample.
     """
     setting, signals, tau, valid = prepare(formula, trace, semantics, end, compat)
     return _everywhere_compiled(setting, signals, tau, valid)[:: setting.stride]
@@ -149,7 +149,7 @@ def _open(setting: Setting, valid: Array | None, value: Array) -> Any:
 
 
 class _Root:
-    """The value at time 0, and optionally its gradient: the work behind `robustness`."""
+    """The value at time 0, and optionally its gradient: what `robustness` computes."""
 
     def __init__(self, setting: Setting, gradient: bool) -> None:
         self.setting = setting

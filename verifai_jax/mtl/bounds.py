@@ -53,9 +53,9 @@ def constant_bounds(predicate: Formula) -> tuple[Term, list[float]] | None:
 
 
 def _solved(inner: Expression, signal: str, limit: Expression) -> list[Expression]:
-    """Return the values of the signal at which `inner` is `limit`; none where it is not linear.
+    """Return the values of the signal at which `inner` is `limit`.
 
-    An absolute value has two.
+    An absolute value has two; an expression that is not linear gives none.
     """
     limits = [limit]
     try:

@@ -5,8 +5,8 @@
     goals.values(trace, smooth(0.05))                   # differentiable, temperature without unit
 
 A formula is broken by breaking one of its goals (the parts of a conjunction), and a goal by
-breaking all of its clauses (the parts of a disjunction). Told apart, a search can lower one clause
-without losing another, where the maximum of both only tells of one. Predicates are divided by how
+breaking all of its clauses (the parts of a disjunction). With a number for each, a search can lower
+one clause without losing another; the maximum of both shows only one. Predicates are divided by how
 much they vary along the trace, so that clauses in miles per hour and in revolutions per minute can
 be compared; that keeps all signs.
 """
@@ -30,7 +30,8 @@ from verifai_jax.mtl.semantics import Semantics, hard
 from verifai_jax.mtl.setting import prepare
 
 GOALS = 16
-"""Goals told apart at most; what a conjunction has beyond is the last one."""
+"""Greatest number of goals; the last one has all that a conjunction has beyond. Each costs an
+evaluation of its clauses in every simulation."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Goals:
     goals: tuple[tuple[Formula, ...], ...]
 
     @property
-    def most(self) -> int:
+    def max_clauses(self) -> int:
         """Clauses of the goal that has the most."""
         return max(len(goal) for goal in self.goals)
 
@@ -82,7 +83,7 @@ class Goals:
         rows = []
         for goal in self.goals:
             found = [robustness(clause, scaled, semantics, end=end) for clause in goal]
-            absent = [jnp.full_like(found[0], ABSENT)] * (self.most - len(goal))
+            absent = [jnp.full_like(found[0], ABSENT)] * (self.max_clauses - len(goal))
             rows.append(jnp.stack([*found, *absent]))
         # A window without samples gives infinities, of which nothing can be learned.
         return jnp.clip(jnp.stack(rows), ABSENT, -ABSENT)
@@ -131,11 +132,11 @@ def _parts(formula: Formula, kind: type[ast.And] | type[ast.Or]) -> tuple[Formul
 
 
 def _few(
-    parts: tuple[Formula, ...], kind: type[ast.And] | type[ast.Or], most: int
+    parts: tuple[Formula, ...], kind: type[ast.And] | type[ast.Or], count: int
 ) -> tuple[Formula, ...]:
-    if len(parts) <= most:
+    if len(parts) <= count:
         return parts
-    return (*parts[: most - 1], kind(parts[most - 1 :]))
+    return (*parts[: count - 1], kind(parts[count - 1 :]))
 
 
 def _over(formula: Formula, names: dict[Formula, Formula]) -> Formula:

@@ -161,7 +161,7 @@ def moment_of(text: str) -> datetime.datetime:
 
 
 def _moments(texts: list[str | None]) -> np.ndarray | None:
-    """Return the seconds between ISO 8601 texts and the first of them; None where one is none."""
+    """Return the seconds from the first ISO 8601 text to each; None if a text is no moment."""
     moments: list[datetime.datetime | None] = []
     for text in texts:
         try:

@@ -45,7 +45,7 @@ def deciding_instant(
     if not leaves:
         return jnp.int32(0), jnp.int32(0)
 
-    def least(nudges: Float[Array, "leaves time"]) -> Float[Array, ""]:
+    def lowest(nudges: Float[Array, "leaves time"]) -> Float[Array, ""]:
         own = {leaf: nudges[i] for i, leaf in enumerate(leaves)}
         values = []
         for formula in formulas:
@@ -58,6 +58,6 @@ def deciding_instant(
         return jnp.min(jnp.stack(values))
 
     dtype = jnp.result_type(float)
-    influence = jnp.abs(jax.grad(least)(jnp.zeros((len(leaves), trace.length), dtype)))
-    place = jnp.argmax(jnp.nan_to_num(influence)).astype(jnp.int32)
-    return place // trace.length, place % trace.length
+    influence = jnp.abs(jax.grad(lowest)(jnp.zeros((len(leaves), trace.length), dtype)))
+    index = jnp.argmax(jnp.nan_to_num(influence)).astype(jnp.int32)
+    return index // trace.length, index % trace.length

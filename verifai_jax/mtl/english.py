@@ -10,17 +10,7 @@ import math
 from verifai_jax.core.text import format_seconds
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.formula import Formula, Interval, surface
-from verifai_jax.mtl.words import OPERATORS
-
-COMPARISONS = {
-    "<=": "is at most",
-    "<": "is below",
-    ">=": "is at least",
-    ">": "is above",
-    "==": "equals",
-    "!=": "differs from",
-}
-"""Each comparison of signals as it is read."""
+from verifai_jax.mtl.words import COMPARISONS, OPERATORS
 
 
 def formula_words(formula: Formula) -> str:
@@ -33,7 +23,7 @@ def _words(formula: Formula, inner: bool) -> str:
         case ast.Constant(value):
             return "anything is allowed" if value else "nothing is allowed"
         case ast.Predicate(comparison, left, right):
-            return f"{left} {COMPARISONS.get(comparison, comparison)} {right}"
+            return f"{left} {COMPARISONS[comparison].english} {right}"
         case ast.Atom(expression):
             return f"{expression} is positive"
     word, operands, interval = surface(formula)

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from operator import methodcaller
 
+from verifai_jax.core.errors import unknown_name
 from verifai_jax.mtl.formula import Formula, Predicate, Term, formula
 from verifai_jax.mtl.node import postorder
 from verifai_jax.mtl.words import FUNCTIONS, NUMBERS, name_text, number_text
@@ -238,9 +239,11 @@ class Arithmetic(Expression):
     arguments: tuple[Expression, ...]
 
     def __post_init__(self) -> None:
-        n, least = len(self.arguments), FUNCTIONS.get(self.name)
-        if least is not None and (n != 1 if least == 1 else n < least):
-            wanted = "one argument" if least == 1 else "two arguments or more"
+        if self.name not in (*PRECEDENCE, *FUNCTIONS):
+            raise unknown_name("function", self.name, FUNCTIONS)
+        n, fewest = len(self.arguments), FUNCTIONS.get(self.name)
+        if fewest is not None and (n != 1 if fewest == 1 else n < fewest):
+            wanted = "one argument" if fewest == 1 else "two arguments or more"
             raise ValueError(f"{self.name} takes {wanted}; got {n}")
         values = [constant_value(argument) for argument in self.arguments]
         if self.name == "/" and values[1] == 0.0:

@@ -19,13 +19,14 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import ClassVar, TypeAlias, Union
 
+from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.lazy import late
 from verifai_jax.mtl.node import Node
 from verifai_jax.mtl.tree import EVERYTHING as EVERYTHING
 from verifai_jax.mtl.tree import Interval as Interval
 from verifai_jax.mtl.tree import Term as Term
 from verifai_jax.mtl.tree import Tree
-from verifai_jax.mtl.words import OPERATORS, Text, operator_text
+from verifai_jax.mtl.words import COMPARISONS, OPERATORS, Text, operator_text
 
 Formulaic: TypeAlias = Union["Formula", Term]
 """What stands for a formula: a formula, or an expression that is its own robustness."""
@@ -190,6 +191,8 @@ class Predicate(Leaf):
     right: Term
 
     def __post_init__(self) -> None:
+        if self.comparison not in COMPARISONS:
+            raise unknown_name("comparison", self.comparison, COMPARISONS)
         if not (self.left.signals() or self.right.signals()):
             raise ValueError(
                 f"{self} compares numbers and no signal, so that all traces are alike: compare a "

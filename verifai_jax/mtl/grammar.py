@@ -14,38 +14,39 @@ BINARY = tuple(word for word, o in OPERATORS.items() if o.side and o.operands ==
 """Temporal operators between two operands."""
 
 
-_SHOWN = 400
-"""Characters of a text that an error shows at most."""
-_MOST_REASON = 800
-"""Characters of what an error says, which may quote parts of the text."""
+_MAX_SHOWN = 400
+"""Greatest number of characters of a text that an error shows: a few lines of a terminal."""
+_MAX_REASON = 800
+"""Greatest number of characters of what an error says, which may quote parts of the text: twice
+what is shown of a text, so that a quotation and the advice fit."""
 
 
 class FormulaSyntaxError(ValueError):
-    """A text that is not a formula; the message shows the place and what to write instead.
+    """A text that is not a formula; the message shows where and what to write instead.
 
-    `position` is the offset of the place in the text.
+    `position` is the offset of the error in the text.
     """
 
     def __init__(self, reason: str, text: str, position: int, width: int = 1) -> None:
         self.position = position
-        if len(reason) > _MOST_REASON:
-            half = _MOST_REASON // 2
+        if len(reason) > _MAX_REASON:
+            half = _MAX_REASON // 2
             reason = f"{reason[:half]} ... {reason[-half:]}"
         before = text[:position]
         line = before.count("\n")
         shown = text.split("\n")[line]
         column = position - (before.rfind("\n") + 1)
-        if len(shown) > _SHOWN:
-            # Around the place alone: a text may be as long as a book.
-            cut = max(0, column - _SHOWN // 2)
-            shown, column = shown[cut : cut + _SHOWN], column - cut
+        if len(shown) > _MAX_SHOWN:
+            # Around the error alone: a text may be as long as a book.
+            cut = max(0, column - _MAX_SHOWN // 2)
+            shown, column = shown[cut : cut + _MAX_SHOWN], column - cut
         carets = "^" * max(1, min(width, len(shown) - column))
         super().__init__(f"{reason}\n  {shown}\n  {' ' * column}{carets}")
 
 
 @runtime_checkable
-class Place(Protocol):
-    """A place in the text, from `start_pos` to before `end_pos`."""
+class Extent(Protocol):
+    """A part of the text, from `start_pos` to before `end_pos`."""
 
     start_pos: int
     end_pos: int
@@ -57,7 +58,7 @@ class Tree(Protocol):
 
     data: str
     children: list[Any]
-    meta: Place
+    meta: Extent
 
 
 @functools.cache
@@ -163,7 +164,7 @@ _GROUPS = (
 
 
 def explain_error(error: Exception, text: str) -> FormulaSyntaxError:
-    """Turn an error of the parser into one that shows the place and the words expected there."""
+    """Turn an error of the parser into one that shows where it is and the words expected there."""
     import lark
 
     if not text.strip():

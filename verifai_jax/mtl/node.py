@@ -1,6 +1,6 @@
 """The nodes of formulas and expressions: compared, hashed and walked without recursion.
 
-A sub-tree may stand in several places (`f <-> g` holds each side twice), so nothing here takes
+A sub-tree may occur several times (`f <-> g` holds each side twice), so nothing here takes
 longer than there are different nodes, however many paths lead to them.
 """
 

@@ -1,4 +1,4 @@
-"""The picture of an explanation: the formula's tree beside what each part does over time.
+"""The picture of an explanation: the formula's tree, and next to it what each part does over time.
 
     draw(explain(formula, trace), path="why.png")
 
@@ -24,7 +24,8 @@ from verifai_jax.mtl.semantics import hard
 from verifai_jax.mtl.setting import prepare
 
 HOLDS, FAILS, PATH, QUIET = "#0a8f6a", "#cf3f21", "#1b2a41", "#7b8794"
-_MOST_ROWS = 14
+_MAX_ROWS = 14
+"""Rows of a picture: more of them are too low to be read on one page."""
 
 
 def draw(explanation: Explanation, path: str | Path | None = None) -> Figure:
@@ -117,7 +118,7 @@ def draw(explanation: Explanation, path: str | Path | None = None) -> Figure:
 def _rows(tree: Node) -> list[tuple[int, Node]]:
     """Choose the nodes to show: all, or the deciding path with its neighbours if too many."""
     rows = tree.flat()
-    if len(rows) <= _MOST_ROWS:
+    if len(rows) <= _MAX_ROWS:
         return rows
 
     def near(node: Node, depth: int) -> list[tuple[int, Node]]:
@@ -130,8 +131,8 @@ def _rows(tree: Node) -> list[tuple[int, Node]]:
     return near(tree, 0)
 
 
-def _shortened(text: str, most: int) -> str:
-    return text if len(text) <= most else text[: most - 3] + "..."
+def _shortened(text: str, length: int) -> str:
+    return text if len(text) <= length else text[: length - 3] + "..."
 
 
 def _label(figure: Figure, axis: Axes, depth: int, node: Node, width: float) -> None:
@@ -220,13 +221,9 @@ def _predicate(axis: Axes, explanation: Explanation, node: Node, clock: np.ndarr
             alpha=(0.16 if good else 0.3) if node.decides else 0.1,
             lw=0,
         )
-    match node.formula:
-        case ast.Predicate(_, left, right):
-            main, bound = side(left), side(right)
-        case ast.Atom(e):
-            main, bound = side(e), np.zeros(len(clock))
-        case _:  # TRUE and FALSE have nothing to plot.
-            main = bound = np.zeros(len(clock))
+    # An expression by itself is compared with zero, and TRUE and FALSE have nothing to plot.
+    sides = [side(term) for term in node.formula.terms()]
+    main, bound = (*sides, *[np.zeros(len(clock))] * (2 - len(sides)))
     style: dict[str, Any] = {"color": PATH if node.decides else QUIET, "drawstyle": "default"}
     axis.plot(clock, main, lw=1.7, **style)
     axis.plot(clock, bound, lw=1.2, ls=(0, (4, 2)), **style)

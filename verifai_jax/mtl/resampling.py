@@ -17,8 +17,8 @@ from verifai_jax.mtl.setting import since_first
 
 Method = Literal["hold", "linear"]
 
-MOST_SAMPLES = 100_000_000
-"""Samples that a resampled trace may have; its signals still fit into memory."""
+MAX_SAMPLES = 100_000_000
+"""Samples that a resampled trace may have: a signal of so many takes 800 MB in double precision."""
 
 
 def resample(trace: Trace, dt: float, method: Method) -> Trace:
@@ -50,11 +50,11 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
     tolerance = 1e-6 * dt + resolution
     with np.errstate(over="ignore"):
         steps = np.floor((elapsed[-1] * (1 + 1e-9) + 1e-9 * dt + resolution) / dt)
-    if not steps < MOST_SAMPLES:
+    if not steps < MAX_SAMPLES:
         raise ValueError(
             f"resampling {format_seconds(elapsed[-1])} every {format_seconds(dt)} makes "
             f"{steps + 1:z.3g} samples, "
-            f"more than {MOST_SAMPLES}: take a longer period"
+            f"more than {MAX_SAMPLES}: take a longer period"
         )
     clock = dt * np.arange(int(steps) + 1)
     index = np.searchsorted(elapsed, clock + tolerance, side="right") - 1
@@ -79,10 +79,10 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
             inner[name] = _filled(values, elapsed)[passed]
     between = None
     if len(passed):
-        places = _places(cell[passed], len(clock))
-        times = np.concatenate([clock, elapsed[passed]])[places]
+        positions = _positions(cell[passed], len(clock))
+        times = np.concatenate([clock, elapsed[passed]])[positions]
         between = Trace(
-            {name: np.concatenate([signals[name], inner[name]])[places] for name in signals},
+            {name: np.concatenate([signals[name], inner[name]])[positions] for name in signals},
             times=times,
         )
     return Trace(signals, dt=float(dt), status=trace.status, between=between, notes=notes)
@@ -99,25 +99,25 @@ def _recorded(trace: Trace) -> Trace:
     return Trace(signals, times=fine.clock()[new], status=trace.status, notes=trace.notes)
 
 
-def _places(cells: Int[np.ndarray, " passed"], count: int) -> Int[np.ndarray, " places"]:
-    """Return which sample stands in each place between those of the clock, as many in each period.
+def _positions(cells: Int[np.ndarray, " passed"], count: int) -> Int[np.ndarray, " positions"]:
+    """Return which sample stands at each position, with as many positions in each period.
 
     - `cells`: the period in which each of the samples lies that the clock passes over.
     - `count`: samples of the clock; they have the first numbers, those passed over the next.
     """
     rank = np.arange(len(cells)) - np.searchsorted(cells, cells)
     # A power of two, less one, so that recordings share compiled monitors.
-    most = (1 << int(rank.max() + 1).bit_length()) - 1
-    if count * (most + 1) > MOST_SAMPLES:
+    each = (1 << int(rank.max() + 1).bit_length()) - 1
+    if count * (each + 1) > MAX_SAMPLES:
         raise ValueError(
             f"resampling to {count} samples has up to {int(rank.max()) + 1} recorded samples "
             "between two of them, more than can be judged: take a shorter period, or cut the "
             "recording into parts"
         )
-    places = np.repeat(np.arange(count)[:, None], most, axis=1)
-    places[cells, rank] = count + np.arange(len(cells))
+    positions = np.repeat(np.arange(count)[:, None], each, axis=1)
+    positions[cells, rank] = count + np.arange(len(cells))
     # The sample before is repeated where fewer lie in a period.
-    return np.maximum.accumulate(places, axis=1).reshape(-1)
+    return np.maximum.accumulate(positions, axis=1).reshape(-1)
 
 
 def _missing(values: np.ndarray) -> np.ndarray:
@@ -127,7 +127,7 @@ def _missing(values: np.ndarray) -> np.ndarray:
 
 
 def _held(values: np.ndarray) -> np.ndarray:
-    """Return each column with its last value in place of a missing one; none before the first."""
+    """Return each column with its last value for a missing one; nothing before the first."""
     if not _missing(values).any():
         return values
     columns = values.reshape(len(values), -1)

@@ -9,6 +9,7 @@ from decimal import Decimal
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.formula import FALSE, TRUE, Formula, Interval
 from verifai_jax.mtl.node import missing_case, postorder
+from verifai_jax.mtl.words import COMPARISONS
 
 
 def nnf(f: Formula) -> Formula:
@@ -20,9 +21,6 @@ def nnf(f: Formula) -> Formula:
     since.
     """
     return _nnf(f, True, {})
-
-
-_OPPOSITE = {">": "<=", ">=": "<", "<": ">=", "<=": ">", "==": "!=", "!=": "=="}
 
 
 def _nnf(f: Formula, positive: bool, known: dict[tuple[Formula, bool], Formula]) -> Formula:
@@ -37,7 +35,7 @@ def _nnf_node(f: Formula, positive: bool, known: dict[tuple[Formula, bool], Form
         case ast.Constant(value):
             return TRUE if value == positive else FALSE
         case ast.Predicate(comparison, left, right):
-            return f if positive else ast.Predicate(_OPPOSITE[comparison], left, right)
+            return f if positive else ast.Predicate(COMPARISONS[comparison].opposite, left, right)
         case ast.Atom():
             return f if positive else ast.Not(f)
         case ast.Not(operand):

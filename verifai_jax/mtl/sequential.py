@@ -230,7 +230,7 @@ windowed_smooth.defvjp(_windowed_smooth_forward, _windowed_smooth_backward)
 # Until, and since the other way round
 
 Residuals = tuple[Array | None, Array | None, Any, Array | float | None]
-"""Both arguments of until (None where hard), what to keep of each step, the temperature."""
+"""Both arguments of until (None for hard semantics), what to keep of each step, the temperature."""
 
 SmoothResiduals = tuple[Array, Array, Array, Number]
 """The same at a temperature."""

@@ -77,7 +77,7 @@ class Tree(Node):
 
     @property
     def operator(self) -> Operator:
-        """What the table says of its operator. **Raises:** `MissingCaseError` without an entry."""
+        """The entry of its operator in the table. **Raises:** `MissingCaseError` without one."""
         if self.word not in OPERATORS:
             raise missing_case("the operator", self)
         return OPERATORS[self.word]

@@ -17,13 +17,32 @@ NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
 """Names of signals, constants and definitions that need no quotes."""
 
 FUNCTIONS = {"abs": 1, "sqrt": 1, "sin": 1, "cos": 1, "norm": 1, "min": 2, "max": 2}
-"""Functions of expressions, by the least number of their arguments."""
+"""Functions of expressions, with the smallest number of their arguments."""
 
 NUMBERS = {"pi": math.pi}
 """Numbers that a text may name without defining them; a signal of that name stands in quotes."""
 
 ANGLES = {"deg": math.pi / 180, "rad": 1.0}
 """Units that may follow a number in an expression, in rad."""
+
+
+class Comparison(NamedTuple):
+    """A comparison of two expressions in LaTeX and in English, and the one that is its negation."""
+
+    latex: str
+    english: str
+    opposite: str
+
+
+COMPARISONS = {
+    "<=": Comparison(r"\leq", "is at most", ">"),
+    "<": Comparison("<", "is below", ">="),
+    ">=": Comparison(r"\geq", "is at least", "<"),
+    ">": Comparison(">", "is above", "<="),
+    "==": Comparison("=", "equals", "!="),
+    "!=": Comparison(r"\neq", "differs from", "=="),
+}
+"""Every comparison by its symbol."""
 
 
 @dataclass(frozen=True)

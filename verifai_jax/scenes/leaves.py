@@ -27,7 +27,7 @@ from verifai_jax.features import (
     Normal,
     TruncatedNormal,
 )
-from verifai_jax.features.domain import MOST_LEVELS, Domain
+from verifai_jax.features.domain import MAX_LEVELS, Domain
 from verifai_jax.scenes.graph import field, is_random, kind_of, law
 
 Given: TypeAlias = Callable[[Any], Any]
@@ -423,7 +423,7 @@ def _discrete(
     options: Sequence[Any] | None,
 ) -> Leaf | None:
     first, last = math.ceil(low), math.floor(high)
-    if last - first >= MOST_LEVELS:
+    if last - first >= MAX_LEVELS:
         return Place(node, name, {f"{name}.share": Box(0, 1)})
     values = tuple(range(first, last + 1))
     if weights is not None:
