@@ -3,12 +3,11 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from verifai_jax.core.figure import Figure
+from verifai_jax.core.figure import Drawn
 from verifai_jax.core.lazy import late
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.problem.problem import Problem
@@ -184,7 +183,7 @@ class RepairEstimates(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Repair(InNotebook):
+class Repair(Drawn, InNotebook):
     """Result of `repair`: parameters changed as little as removes the failures.
 
     **Fields:** `before` and `parameters`: the nominal and the repaired ones, features by name or a
@@ -197,6 +196,9 @@ class Repair(InNotebook):
     `"max_seconds"`, `"rounds"`, `"no verdict"` or `"interrupted"`; `arrays`: whether the
     parameters are a pytree; `notes`; `seed`.
     """
+
+    _picture = "repair", "plot_repair"
+    """The worst robustness that each attack found."""
 
     name: str
     before: Any
@@ -309,17 +311,6 @@ class Repair(InNotebook):
             shown = "unchanged" if same else f"-> {format_value(value)}"
             pairs.append(f"{name} {format_value(self.before[name])} {shown}")
         return ", ".join(pairs)
-
-    def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw the worst robustness that each attack found.
-
-        **Arguments:**
-
-        - `path`: of a picture to write; none when left out.
-
-        **Returns:** the figure.
-        """
-        return late("verifai_jax.plotting.repair", "plot_repair")(self, path)
 
 
 def _worse(before: HeldOut | None, after: HeldOut | None) -> bool:
