@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Key
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.progress import count_done
+from verifai_jax.core.shapes import power_of_two
 from verifai_jax.evaluation.engine import Engine, engine_for
 from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
 from verifai_jax.evaluation.host_engine import HostEngine
@@ -170,7 +171,7 @@ class Evaluator:
         if not isinstance(engine, HostEngine) or engine.system.can_simulate_batch:
             return most
         # Their features are those of the whole batch, bit for bit.
-        engine.least = 1 << (most - 1).bit_length()
+        engine.least = power_of_two(most)
         return min(most, ALIKE)
 
     def _check_raising(self, verdicts: Verdicts) -> None:
