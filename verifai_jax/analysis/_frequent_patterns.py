@@ -26,7 +26,7 @@ from verifai_jax.analysis.data.columns import Column
 from verifai_jax.analysis.data.samples import Samples, Source, Which
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.figure import Drawn
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.text import counted, format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
@@ -128,7 +128,7 @@ class FrequentPatterns(Drawn):
         sizes = [len(one) for one in self.combinations]
         single = sizes.count(1)
         lines = [
-            f"{_counted(single, 'value')} and {_counted(len(sizes) - single, 'combination')} in at "
+            f"{counted(single, 'value')} and {counted(len(sizes) - single, 'combination')} in at "
             f"least {self.minimum:z.3g} of {self.samples.kind}"
         ]
         for column, value in list(self.top.items())[:8]:
@@ -327,7 +327,3 @@ def _cells(
         inside = np.clip(np.searchsorted(edges, numbers, side="right") - 1, 0, bins - 1)
         prior = tuple(np.bincount(inside, minlength=bins) / len(numbers))
     return labels, codes, prior
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count:,} {what}{'' if count == 1 else 's'}"
