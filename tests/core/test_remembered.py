@@ -1,7 +1,5 @@
 """Programs are recalled where what they follow from is the same, to the last bit."""
 
-import subprocess
-import sys
 from typing import NamedTuple
 
 import jax
@@ -194,28 +192,3 @@ def test_gradients_begin_first_where_they_are_recalled(folder):
     Engine(falling(), 4, gradient=True, clauses=True).compile()
     assert begun()
     assert not Engine(falling(), 4)._compiling
-
-
-LAPACK = """
-import sys
-import jax, jax.numpy as jnp, numpy as np
-from verifai_jax.core.remembered import lower_or_recall
-
-forms = (jax.ShapeDtypeStruct((8, 3, 3), jnp.float32),)
-matrices = np.tile(2 * np.eye(3, dtype=np.float32), (8, 1, 1))
-for name, function in (("plain", lambda m: 2 * m), ("lapack", jnp.linalg.cholesky)):
-    program = lower_or_recall(name, function, forms).compile()
-    result = np.asarray(program(matrices))[:, 0, 0]
-    print(name, result.min().round(3), "scipy.linalg" in sys.modules)
-"""
-
-
-@pytest.mark.thorough
-def test_lapack_is_loaded_by_recalled_programs_that_use_it_alone(folder):
-    shown = []
-    for _ in range(2):
-        command = [sys.executable, "-c", LAPACK]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-        shown.append(done.stdout)
-    assert shown[1] == "plain 4.0 False\nlapack 1.414 True\n"
-    assert sorted(path.name for path in folder.iterdir()) == ["lapack", "plain"]

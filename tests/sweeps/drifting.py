@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import verifai_jax as vj
+from verifai_jax.certification.result import Certificate, Certificates
 from verifai_jax.rl import Continuous, Discrete, Policy, Progress
 from verifai_jax.rl.algorithm import check_values, static_field
 from verifai_jax.statistics.binomial import clopper_pearson
-from verifai_jax.sweeps.safety import PolicySafety, SafetyReport
 from verifai_jax.sweeps.study import Study
 from verifai_jax.sweeps.trainer import Trainer
 
@@ -149,9 +149,12 @@ def quick_certificates(
         verdict = "safe@0.01" if rate.high < p else "unsafe" if rate.low > p else "undecided"
         worst = {"x0": float(work["x0"][place])}
         found.append(
-            PolicySafety(
-                failures, samples, rate.estimate, rate.low, rate.high,
-                float(work["worst"][place]), worst, verdict,
+            Certificate(
+                len(found), failures, samples, 0, rate, verdict, 0, 0,
+                float(work["worst"][place]), worst, {},
             )
         )  # fmt: skip
-    return SafetyReport(None, found)
+    return Certificates(
+        tuple(found), "drifting", p, confidence, None, None, 0.0, seed, samples,
+        samples * len(found), "decided", 0.0,
+    )  # fmt: skip

@@ -16,7 +16,7 @@ from verifai_jax.sweeps.study import Study
 
 @pytest.mark.thorough
 def test_finished_work_of_another_study_is_not_gone_on_with(tmp_path, monkeypatch):
-    monkeypatch.setattr(driver, "certify_policies", quick_certificates)
+    monkeypatch.setattr(driver, "certify", quick_certificates)
     study, options = drifting(), {"configurations": 1, "samples": 8, "folder": tmp_path / "work"}
     whole = sweep(study, **options)
     (part,) = whole.record.sources

@@ -26,7 +26,7 @@ from verifai_jax.sweeps.trainer import StudyError
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    monkeypatch.setattr(driver, "certify_policies", quick_certificates)
+    monkeypatch.setattr(driver, "certify", quick_certificates)
 
 
 def same_tables(one, other, but=("training_seconds",)):
@@ -53,7 +53,7 @@ def same_policies(one, other):
 @pytest.fixture(scope="module")
 def whole():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(driver, "certify_policies", quick_certificates)
+        patch.setattr(driver, "certify", quick_certificates)
         return sweep(drifting(seeds=2), configurations=5, samples=64)
 
 

@@ -7,7 +7,6 @@ found.untried               values and pairs of values that no row has
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,8 +18,7 @@ from verifai_jax.analysis.data.marginals import Marginal, marginals
 from verifai_jax.analysis.data.samples import Samples, Source
 from verifai_jax.analysis.holes import MOST_TREE, largest_hole, uniform_points
 from verifai_jax.core.checks import check_count
-from verifai_jax.core.figure import Figure
-from verifai_jax.core.lazy import late
+from verifai_jax.core.figure import Drawn
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_features, format_percent
 
@@ -40,7 +38,7 @@ MOST_NAMED = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Coverage(InNotebook):
+class Coverage(Drawn, InNotebook):
     """Coverage of the feature space by the rows of a table.
 
     **Fields:** `table`: one row a feature, with the number of its `cells`, the share of them
@@ -53,6 +51,9 @@ class Coverage(InNotebook):
     uniform samples; `hole`: the features in its middle; all None without ordered features;
     `samples`.
     """
+
+    _picture = "coverage", "plot_coverage"
+    """How often each cell is occupied, and the least occupied pair."""
 
     table: pd.DataFrame
     untried: pd.DataFrame
@@ -68,17 +69,6 @@ class Coverage(InNotebook):
         """Share of all pairs of cells that some row lies in; of cells with a single feature."""
         column = "pairs" if len(self.table) > 1 else "occupied"
         return float(np.nanmean(self.table[column].to_numpy(float)))
-
-    def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw how often each cell is occupied, and the least occupied pair.
-
-        **Arguments:**
-
-        - `path`: of a picture to write; none when left out.
-
-        **Returns:** the figure.
-        """
-        return late("verifai_jax.plotting.coverage", "plot_coverage")(self, path)
 
     def __repr__(self) -> str:
         return str(self)

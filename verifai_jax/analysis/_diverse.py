@@ -12,7 +12,6 @@ some chosen one, and the least distance between chosen ones is half the greatest
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -27,20 +26,22 @@ from verifai_jax.analysis.data.samples import (
     distances,
 )
 from verifai_jax.core.checks import check_count
-from verifai_jax.core.figure import Figure
-from verifai_jax.core.lazy import late
+from verifai_jax.core.figure import Drawn
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)
-class Diverse:
+class Diverse(Drawn):
     """Rows chosen from `samples`, in the order in which they were added.
 
     **Fields:** `rows` `[k]`: row numbers of the table; `distances` `[k]`: how far each was from the
     nearest one before, in the coordinates of `samples.points`, infinite for the first;
     `radius`: how far the row is that is farthest from all chosen ones.
     """
+
+    _picture = "diverse", "plot_diverse"
+    """The rows among all, in their order, and the distances."""
 
     samples: Samples
     rows: Int[np.ndarray, " k"]
@@ -52,17 +53,6 @@ class Diverse:
         """The rows of the error table, with their `distance` (`distance_` if a feature is it)."""
         own = pd.DataFrame({"distance": self.distances}, index=pd.Index(self.rows))
         return beside(self.samples.at(self.rows), own)
-
-    def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw the rows among all, in their order, and the distances.
-
-        **Arguments:**
-
-        - `path`: of a picture to write; none when left out.
-
-        **Returns:** the figure.
-        """
-        return late("verifai_jax.plotting.diverse", "plot_diverse")(self, path)
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -16,7 +16,6 @@ from functools import cached_property
 from itertools import combinations as subsets
 from itertools import pairwise
 from math import prod
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -26,9 +25,8 @@ from jaxtyping import Bool, Int
 from verifai_jax.analysis.data.columns import Column
 from verifai_jax.analysis.data.samples import Samples, Source, Which
 from verifai_jax.core.checks import check_count
-from verifai_jax.core.figure import Figure
-from verifai_jax.core.lazy import late
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.figure import Drawn
+from verifai_jax.core.text import counted, format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
@@ -46,7 +44,7 @@ class Item:
 
 
 @dataclass(frozen=True, eq=False)
-class FrequentPatterns:
+class FrequentPatterns(Drawn):
     """Frequent combinations of values among `samples`.
 
     **Fields:** `items`: the single values, also those that never occur; `combinations`: each a
@@ -54,6 +52,9 @@ class FrequentPatterns:
     `against`: what the shares are compared with, `"table"`, `"prior"` or `"nothing"`; `expected`:
     the shares compared with.
     """
+
+    _picture = "frequent_patterns", "plot_frequent_patterns"
+    """The shares of the most distinctive combinations, and those expected."""
 
     samples: Samples
     items: tuple[Item, ...]
@@ -123,22 +124,11 @@ class FrequentPatterns:
             )
         return self.samples.rows[self._present[list(self.combinations[place])].all(axis=0)]
 
-    def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw the shares of the most distinctive combinations, and those expected.
-
-        **Arguments:**
-
-        - `path`: of a picture to write; none when left out.
-
-        **Returns:** the figure.
-        """
-        return late("verifai_jax.plotting.frequent_patterns", "plot_frequent_patterns")(self, path)
-
     def __str__(self) -> str:
         sizes = [len(one) for one in self.combinations]
         single = sizes.count(1)
         lines = [
-            f"{_counted(single, 'value')} and {_counted(len(sizes) - single, 'combination')} in at "
+            f"{counted(single, 'value')} and {counted(len(sizes) - single, 'combination')} in at "
             f"least {self.minimum:z.3g} of {self.samples.kind}"
         ]
         for column, value in list(self.top.items())[:8]:
@@ -337,7 +327,3 @@ def _cells(
         inside = np.clip(np.searchsorted(edges, numbers, side="right") - 1, 0, bins - 1)
         prior = tuple(np.bincount(inside, minlength=bins) / len(numbers))
     return labels, codes, prior
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count:,} {what}{'' if count == 1 else 's'}"

@@ -7,7 +7,6 @@ found.is_reliable("failing")    whether the model behind it can predict at all
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from verifai_jax.analysis.data.samples import Samples, Source
 from verifai_jax.core.checks import check_count
-from verifai_jax.core.figure import Figure
-from verifai_jax.core.lazy import late
+from verifai_jax.core.figure import Drawn
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.progress import shows_progress
 
@@ -40,7 +38,7 @@ MOST_NAMED = 6
 
 
 @dataclass(frozen=True, eq=False)
-class Importance(InNotebook):
+class Importance(Drawn, InNotebook):
     """Losses of a model of the table when a feature is shuffled.
 
     **Fields:** `table`: one row a feature, the most important first; `failing` is the loss in the
@@ -49,6 +47,9 @@ class Importance(InNotebook):
     repetitions away; NaN where there is no model. `scores`: of the models on rows that they were
     not trained on; `missing`: why there is no model of the one or the other; `name` of the run.
     """
+
+    _picture = "bars", "plot_importance"
+    """The losses as bars."""
 
     table: pd.DataFrame
     scores: dict[str, float]
@@ -63,17 +64,6 @@ class Importance(InNotebook):
     def ranked(self) -> list[str]:
         """Features from the most to the least important, by the model that can be trusted."""
         return [str(name) for name in self.table.index]
-
-    def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw the losses as bars.
-
-        **Arguments:**
-
-        - `path`: of a picture to write; none when left out.
-
-        **Returns:** the figure.
-        """
-        return late("verifai_jax.plotting.bars", "plot_importance")(self, path)
 
     def __repr__(self) -> str:
         return str(self)

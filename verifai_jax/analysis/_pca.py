@@ -13,7 +13,6 @@ artificial intelligence-based systems, CAV 2019.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -33,8 +32,7 @@ from verifai_jax.analysis.data.samples import (
     generator,
 )
 from verifai_jax.core.checks import check_count, check_positive
-from verifai_jax.core.figure import Figure
-from verifai_jax.core.lazy import late
+from verifai_jax.core.figure import Drawn
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 from verifai_jax.features import FeatureSpace
@@ -53,7 +51,7 @@ _REDRAWS = 32
 
 
 @dataclass(frozen=True, eq=False)
-class Components(InNotebook):
+class Components(Drawn, InNotebook):
     """Principal components of the ordered features of `samples`, the strongest first.
 
     **Fields:** `pivot` `[k]`: mean of the rows, in units of the features; `directions` `[m, k]`:
@@ -66,6 +64,9 @@ class Components(InNotebook):
 
     There are only directions in which the rows vary: none if all rows are equal.
     """
+
+    _picture = "pca", "plot_components"
+    """The rows along the first two components, and the loadings."""
 
     samples: Samples
     pivot: Float[np.ndarray, " k"]
@@ -197,17 +198,6 @@ class Components(InNotebook):
 
         tree = KDTree(self.samples.matrix("raw") / self.width)
         return np.asarray(tree.query(values / self.width)[1], np.int64)
-
-    def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw the rows along the first two components, and the loadings.
-
-        **Arguments:**
-
-        - `path`: of a picture to write; none when left out.
-
-        **Returns:** the figure.
-        """
-        return late("verifai_jax.plotting.pca", "plot_components")(self, path)
 
     def __str__(self) -> str:
         lines = [

@@ -11,7 +11,6 @@ support are left out.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,8 +22,7 @@ from verifai_jax.analysis.data.columns import Column
 from verifai_jax.analysis.data.samples import Samples, Source
 from verifai_jax.analysis.trees import propose_regions
 from verifai_jax.core.checks import check_count, check_fraction
-from verifai_jax.core.figure import Figure
-from verifai_jax.core.lazy import late
+from verifai_jax.core.figure import Drawn
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 from verifai_jax.falsification.no_rate import why_no_rate
@@ -85,7 +83,7 @@ class Rule:
 
 
 @dataclass(frozen=True, eq=False)
-class Rules(InNotebook):
+class Rules(Drawn, InNotebook):
     """Rules that together describe where a system fails, the best one first.
 
     **Fields:** `rules`; `coverage` and `precision` of all of them together, 0 and None without a
@@ -93,6 +91,9 @@ class Rules(InNotebook):
     many rows were kept aside; `doubt`: why precision is no rate of failure, empty where it is;
     `samples`: all rows with a verdict.
     """
+
+    _picture = "panels", "plot_rules"
+    """The rules over the two features that they use most."""
 
     rules: tuple[Rule, ...]
     coverage: float
@@ -120,17 +121,6 @@ class Rules(InNotebook):
             for name, value in zip(_COLUMNS, values, strict=True):
                 columns[name].append(value)
         return pd.DataFrame(columns)
-
-    def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw the rules over the two features that they use most.
-
-        **Arguments:**
-
-        - `path`: of a picture to write; none when left out.
-
-        **Returns:** the figure.
-        """
-        return late("verifai_jax.plotting.panels", "plot_rules")(self, path)
 
     def __repr__(self) -> str:
         return str(self)

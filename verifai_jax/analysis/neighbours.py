@@ -10,7 +10,6 @@ Distances are those of `Samples.points`.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,20 +29,22 @@ from verifai_jax.analysis.data.samples import (
 from verifai_jax.analysis.tightest import tightest
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names
-from verifai_jax.core.figure import Figure
-from verifai_jax.core.lazy import late
+from verifai_jax.core.figure import Drawn
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)
-class Neighbours:
+class Neighbours(Drawn):
     """Rows chosen from `samples`.
 
     **Fields:** `rows` `[k]`: row numbers of the table; `distances` `[k]` of each from the centre,
     in the coordinates of `samples.points`, NaN for rows drawn at random; `centre`: the row around
     which they lie, None if that is no row; `how`: how they were chosen, in words.
     """
+
+    _picture = "neighbours", "plot_neighbours"
+    """The rows among the others, over the two features that vary most."""
 
     samples: Samples
     rows: Int[np.ndarray, " k"]
@@ -56,17 +57,6 @@ class Neighbours:
         """The rows of the error table, with their `distance` (`distance_` if a feature is it)."""
         own = pd.DataFrame({"distance": self.distances}, index=pd.Index(self.rows))
         return beside(self.samples.at(self.rows), own)
-
-    def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw the rows among the others, over the two features that vary most.
-
-        **Arguments:**
-
-        - `path`: of a picture to write; none when left out.
-
-        **Returns:** the figure.
-        """
-        return late("verifai_jax.plotting.neighbours", "plot_neighbours")(self, path)
 
     def __len__(self) -> int:
         return len(self.rows)

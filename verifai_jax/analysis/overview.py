@@ -26,8 +26,7 @@ from verifai_jax.analysis.clustering.clusters import clusters
 from verifai_jax.analysis.data.samples import Samples
 from verifai_jax.analysis.data.verdicts import unconfirmed
 from verifai_jax.core.errors import unknown_name
-from verifai_jax.core.figure import Figure
-from verifai_jax.core.lazy import late
+from verifai_jax.core.figure import Drawn
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.core.text import format_features, one_line, printable
 from verifai_jax.core.whole_files import replacing
@@ -65,12 +64,16 @@ class Part:
 
 
 @dataclass(frozen=True, eq=False)
-class Analysis:
+class Analysis(Drawn):
     """All analyses of the error table of a run.
 
     **Fields:** `name` of the run; `parts` in the order of the report; `samples`: the rows with a
     verdict, None if there are none.
     """
+
+    _picture = "overview", "plot_overview"
+    """The failures over the two most important features, with the boxes of the rules, the
+    representatives of clusters, and the importances as bars."""
 
     name: str
     parts: tuple[Part, ...]
@@ -99,19 +102,6 @@ class Analysis:
     def table(self) -> pd.DataFrame:
         """One row a feature: importance, range over the failures, cells covered."""
         return _features(self)
-
-    def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw the failures over the two most important features.
-
-        With the boxes of the rules, the representatives of clusters, and the importances as bars.
-
-        **Arguments:**
-
-        - `path`: of a picture to write; none when left out.
-
-        **Returns:** the figure.
-        """
-        return late("verifai_jax.plotting.overview", "plot_overview")(self, path)
 
     def save(self, folder: str | Path) -> Path:
         """Write `report.md` and pictures to a folder; return the path of the report.

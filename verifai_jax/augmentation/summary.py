@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from verifai_jax.augmentation.outcome import BASE, SHARES, TRAINED, Outcome
-from verifai_jax.core.text import format_percent, one_line
+from verifai_jax.core.text import counted, format_percent, one_line
 from verifai_jax.statistics.paired import PairedDifference
 
 REFERENCES = ("none", "random")
@@ -26,7 +26,7 @@ def summarize(outcome: Outcome) -> str:
         return f"{outcome.name}: interrupted before a network was trained"
     seeds = len(set(table["seed"]))
     lines = [
-        f"{outcome.name}: {_count(len(outcome.arms), 'arm')}, {_count(seeds, 'seed')}; "
+        f"{outcome.name}: {counted(len(outcome.arms), 'arm')}, {counted(seeds, 'seed')}; "
         f"{options['added']:,} inputs to be added to {options['initial']:,}, then "
         f"{options['further_steps']:,} further training steps in every arm"
     ]
@@ -158,7 +158,7 @@ def _fewer_lines(outcome: Outcome) -> list[str]:
             first = rows.iloc[0]
             lines.append(
                 f"  {arm} added fewer than {outcome.options['added']:,} in "
-                f"{_count(len(rows), 'seed')}; seed {first['seed']}: {one_line(str(first['why']))}"
+                f"{counted(len(rows), 'seed')}; seed {first['seed']}: {one_line(str(first['why']))}"
             )
     return lines
 
@@ -169,7 +169,7 @@ def _not_finite_lines(outcome: Outcome) -> list[str]:
         return []
     counts = ", ".join(f"{n} of {arm}" for arm, n in lost["arm"].value_counts(sort=False).items())
     return [
-        f"  not finite   {_count(len(lost), 'network')} ({counts}): left out of all means and "
+        f"  not finite   {counted(len(lost), 'network')} ({counts}): left out of all means and "
         "differences"
     ]
 
@@ -208,7 +208,3 @@ def _span(values: np.ndarray) -> str:
 def _counterexamples(table: pd.DataFrame) -> int:
     violated, status = table["violated"].to_numpy(bool), table["status"].to_numpy(object)
     return int((violated & (status == "ok")).sum())
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number:,} {noun}{'s' * (number != 1)}"

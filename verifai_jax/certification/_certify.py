@@ -22,6 +22,7 @@ from verifai_jax.core.devices import enable_compile_cache
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.progress import say_done, shows_progress
+from verifai_jax.core.shapes import power_of_two
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
@@ -99,7 +100,7 @@ def certify(
     started = time.perf_counter()
     policies = list(policies)
     budget = _check(policies, p, confidence, samples, seed, budget, attack_simulations, tie)
-    lanes = LANES if samples >= LANES else max(8, 1 << (samples - 1).bit_length())
+    lanes = LANES if samples >= LANES else max(8, power_of_two(samples))
     enable_compile_cache()  # Before the search compiles, too.
     blocks = Blocks(
         problem_of,

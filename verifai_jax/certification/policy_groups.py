@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from verifai_jax.core.shapes import power_of_two
 from verifai_jax.rl import Policy
 
 LEAST_WIDTH = 64
@@ -81,7 +82,7 @@ def padded(policy: Any) -> Any:
 
 def shared_width(width: int) -> int:
     """Return the width that a hidden layer of `width` units is padded to."""
-    return max(LEAST_WIDTH, 1 << (width - 1).bit_length())
+    return max(LEAST_WIDTH, power_of_two(width))
 
 
 def structure_of(policy: Any) -> str:

@@ -2,7 +2,10 @@
 
 import functools
 import io
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from verifai_jax.core.lazy import late
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes as Axes
@@ -10,6 +13,27 @@ if TYPE_CHECKING:
 else:
     # Importing matplotlib takes longer than importing everything else here.
     Axes = Figure = object
+
+
+class Drawn:
+    """A result that has a picture.
+
+    - `_picture`: a module of `verifai_jax.plotting`, and its function that draws the result.
+    """
+
+    _picture: ClassVar[tuple[str, str]]
+
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw the result.
+
+        **Arguments:**
+
+        - `path`: file that the picture is written to, if given.
+
+        **Returns:** the Matplotlib figure.
+        """
+        module, function = self._picture
+        return late(f"verifai_jax.plotting.{module}", function)(self, path)
 
 
 def new_figure(**options: Any) -> Figure:

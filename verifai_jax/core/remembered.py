@@ -14,8 +14,7 @@ import contextlib
 import hashlib
 import os
 import tempfile
-from collections.abc import Callable, Iterator
-from contextvars import ContextVar
+from collections.abc import Callable
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -114,48 +113,7 @@ def lower_or_recall(
         results = exported.call(*jax.tree.leaves(arguments))
         return results if form is None else jax.tree.unflatten(form, results)
 
-    with _without_lapack(exported):
-        return jax.jit(recalled, in_shardings=_whole(exported)).lower(*arguments)
-
-
-@contextlib.contextmanager
-def _without_lapack(exported: "jax.export.Exported") -> Iterator[None]:
-    """Return a context in which JAX does not load LAPACK, where the program does not call it.
-
-    Else it does for every exported program, and with LAPACK all of SciPy's linear algebra, which
-    takes as long as what else is done to recall a gradient.
-    """
-    _spare_lapack()
-    token = _spared.set(_CALLS_LAPACK not in exported.mlir_module_serialized)
-    try:
-        yield
-    finally:
-        _spared.reset(token)
-
-
-_CALLS_LAPACK = b"_ffi"
-"""What all functions that jaxlib makes of LAPACK's are called at the end."""
-_spared: ContextVar[bool] = ContextVar("LAPACK is not needed here", default=False)
-
-
-@cache
-def _spare_lapack() -> None:
-    """Let JAX ask before it loads LAPACK.
-
-    It is no public interface: a version of JAX without it loads LAPACK as it does now.
-    """
-    try:
-        from jax._src.export import _export
-
-        load = _export._ensure_backends_initialized
-    except (ImportError, AttributeError):
-        return
-
-    def load_if_needed(platforms: tuple[str, ...]) -> None:
-        if not _spared.get():
-            load(platforms)
-
-    _export._ensure_backends_initialized = load_if_needed
+    return jax.jit(recalled, in_shardings=_whole(exported)).lower(*arguments)
 
 
 def _whole(exported: "jax.export.Exported") -> Any:

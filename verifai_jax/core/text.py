@@ -2,9 +2,20 @@
 
 import math
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+
+
+def listed(names: Sequence[str]) -> str:
+    """Write names as a sentence does: `a`, `a and b`, `a, b and c`."""
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def counted(count: int, noun: str) -> str:
+    """Write a number with its noun: `1 row`, `2 rows`, `1,024 rows of a table`."""
+    noun, of, rest = noun.partition(" of ")
+    return f"{count:,} {noun}{'s' * (count != 1)}{of}{rest}"
 
 
 def format_percent(share: float) -> str:

@@ -10,7 +10,6 @@ robustness with each back at its nominal value, all others as they are, and by i
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -19,9 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.figure import Figure
+from verifai_jax.core.figure import Drawn
 from verifai_jax.core.keys import run_keys
-from verifai_jax.core.lazy import late
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import shows_progress
@@ -41,13 +39,16 @@ MATTERS = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Explained(InNotebook):
+class Explained(Drawn, InNotebook):
     """Reasons of a failure; `str()` is a paragraph, `plot` a picture.
 
     **Fields:** `row`; `formula`: the name of the one that is broken most; `rho` of the row; `why`:
     the predicate, the instant and the path (`mtl.Explanation`); `influences`: the features, the one
     that matters most first; `simulations` spent; `replay`: the trace; `notes`.
     """
+
+    _picture = "counterexamples", "plot_explanation"
+    """The deciding signal with its bound and instant, and the features."""
 
     row: int
     formula: str
@@ -69,17 +70,6 @@ class Explained(InNotebook):
         return tuple(
             i for i in self.influences if i.gone or abs(self.effect(i)) > MATTERS * max(most, 1e-12)
         )
-
-    def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw the deciding signal with its bound and instant, and the features.
-
-        **Arguments:**
-
-        - `path`: of a picture to write; none when left out.
-
-        **Returns:** the figure.
-        """
-        return late("verifai_jax.plotting.counterexamples", "plot_explanation")(self, path)
 
     def __str__(self) -> str:
         name = self.replay.problem.name

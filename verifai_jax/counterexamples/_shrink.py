@@ -12,7 +12,6 @@ and with gradients where there are some.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -21,9 +20,8 @@ from jaxtyping import Array, Float, Key
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options, unknown_name
 from verifai_jax.core.events import Events
-from verifai_jax.core.figure import Figure
+from verifai_jax.core.figure import Drawn
 from verifai_jax.core.keys import run_keys
-from verifai_jax.core.lazy import late
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.core.text import format_seconds
@@ -64,7 +62,7 @@ class Step(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Shrunk(InNotebook):
+class Shrunk(Drawn, InNotebook):
     """The least departure from nominal found to fail.
 
     **Fields:** `features` and `u` `[d]`, their point of the unit cube; `rho`: their robustness, the
@@ -77,6 +75,9 @@ class Shrunk(InNotebook):
     `notes` for people; `duration` of the simulation in seconds; `model_changed` and `finding`: what
     the replay of the row says, as in `Replay`.
     """
+
+    _picture = "counterexamples", "plot_shrunk"
+    """The coordinates that depart, and the signal that breaks the property."""
 
     problem: Problem
     row: int
@@ -115,17 +116,6 @@ class Shrunk(InNotebook):
         """Simulate it again, with the random key of the row, and keep the trace."""
         columns = columns_at(self.problem, self.u)
         return replay(self.problem, columns, self.key, self.row, precision or self.precision)  # pyright: ignore[reportArgumentType]
-
-    def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw the coordinates that depart, and the signal that breaks the property.
-
-        **Arguments:**
-
-        - `path`: of a picture to write; none when left out.
-
-        **Returns:** the figure.
-        """
-        return late("verifai_jax.plotting.counterexamples", "plot_shrunk")(self, path)
 
     def __str__(self) -> str:
         d = len(self.u)

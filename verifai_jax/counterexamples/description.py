@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from verifai_jax.core.text import format_seconds
+from verifai_jax.core.text import format_seconds, listed
 from verifai_jax.counterexamples.influence import Influence, Span
 from verifai_jax.mtl import Explanation, robustness_signal
 from verifai_jax.mtl._explain import heading
@@ -62,7 +62,7 @@ def describe(
         sentences += describe_reversals(matter, rho)
     rest = [i.name for i in influences if i not in matter]
     if rest and matter:
-        sentences.append(f"{_listed(rest)} {'does' if len(rest) == 1 else 'do'} not matter.")
+        sentences.append(f"{listed(rest)} {'does' if len(rest) == 1 else 'do'} not matter.")
     if gradient := describe_gradient(influences):
         sentences.append(gradient)
     sentences += [f"Note: {note}." for note in notes]
@@ -120,7 +120,7 @@ def describe_reversals(matter: Sequence[Influence], rho: float) -> list[str]:
             f"becomes {format_number(i.reverted)}.{_control_points(i, rho)}"
         )
     if len(cures) > 4:
-        sentences.append(f"So it does with {_listed([i.name for i in cures[4:]])}.")
+        sentences.append(f"So it does with {listed([i.name for i in cures[4:]])}.")
     if not cures:
         sentences.append("No single feature back at nominal removes the failure.")
     for i in others[:3]:
@@ -160,7 +160,7 @@ def format_spans(spans: list[Span]) -> str:
         else:
             joined.append(span)
     ends = [(format_seconds(s.begin, 3), format_seconds(s.end, 3)) for s in joined]
-    return _listed([f"from {begin} to {end}" for begin, end in ends])
+    return listed([f"from {begin} to {end}" for begin, end in ends])
 
 
 def describe_gradient(influences: Sequence[Influence]) -> str:
@@ -193,7 +193,3 @@ def _named(i: Influence, *, begins: bool = False) -> str:
 def _usual(i: Influence) -> str:
     values = list(dict.fromkeys(i.nominal))
     return ", ".join(map(format_number, values[:4])) + ", ..." * (len(values) > 4)
-
-
-def _listed(names: list[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.errors import check_names
+from verifai_jax.core.shapes import pad_rows
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
@@ -119,9 +120,7 @@ class Nominal:
     @staticmethod
     def _compiled(function: Callable[..., Any], points: Float[np.ndarray, "n d"]) -> np.ndarray:
         """Return a compiled function of points; of powers of two, so that there are few shapes."""
-        missing = (1 << (len(points) - 1).bit_length()) - len(points)
-        padded = np.pad(points, ((0, missing), (0, 0)), mode="edge")
-        return np.asarray(function(padded))[: len(points)]
+        return np.asarray(function(pad_rows(points)))[: len(points)]
 
     @cached_property
     def lacks(self) -> Bool[np.ndarray, " d"]:

@@ -14,6 +14,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from verifai_jax.core.shapes import power_of_two
 from verifai_jax.counterexamples.candidates import Candidates
 
 EXHAUSTIVE = 8
@@ -64,7 +65,7 @@ def _without(
 ) -> Float[np.ndarray, "n d"]:
     nominal, count = candidates.nominal, len(drops)
     # Powers of two, so that few shapes are compiled.
-    padded = np.zeros((1 << (count - 1).bit_length(), drops.shape[1]), bool)
+    padded = np.zeros((power_of_two(count), drops.shape[1]), bool)
     padded[:count] = drops
     points = np.repeat(u[None].astype(np.float32), len(padded), axis=0)
     return nominal.settle(np.asarray(nominal.space.without_items(points, padded)))[:count]

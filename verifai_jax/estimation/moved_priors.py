@@ -29,7 +29,7 @@ from verifai_jax.estimation.importance import (
 from verifai_jax.estimation.intervals import tail_index
 from verifai_jax.estimation.mixture import Mixture, optimal_shares
 from verifai_jax.estimation.normal_space import Ended, LimitState, fails_at, farthest_first
-from verifai_jax.evaluation.confirmation_verdicts import came_otherwise
+from verifai_jax.evaluation.confirmations import came_otherwise
 
 TWICE = 8
 """Samples of the prior that are simulated twice on the host, to learn whether a system has memory

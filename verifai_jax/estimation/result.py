@@ -13,13 +13,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from verifai_jax.core.figure import Drawn
 from verifai_jax.core.lazy import late
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 from verifai_jax.statistics.binomial import simulations_until
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 METHODS = {
     "monte_carlo": "Monte Carlo",
@@ -29,7 +30,7 @@ METHODS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate(InNotebook):
+class Estimate(Drawn, InNotebook):
     """A failure probability, as `estimate` returns it.
 
     - `name`: name of the problem.
@@ -55,6 +56,9 @@ class Estimate(InNotebook):
     - `sources`: what the model was made of, as a run records it; empty where that is not recorded.
     - `drawn`: data of the pictures.
     """
+
+    _picture = "estimate", "plot_estimate"
+    """The interval, the splitting levels and the weights, as far as there are any."""
 
     name: str
     probability: float | None
@@ -176,14 +180,3 @@ class Estimate(InNotebook):
         **Returns:** the path.
         """
         return late("verifai_jax.reports", "write_report")(self, path, **options)
-
-    def plot(self, path: str | Path | None = None) -> "Figure":
-        """Draw the interval, the splitting levels and the weights, as far as there are any.
-
-        **Arguments:**
-
-        - `path`: file that the picture is written to, if given.
-
-        **Returns:** the Matplotlib figure.
-        """
-        return late("verifai_jax.plotting.estimate", "plot_estimate")(self, path)

@@ -28,6 +28,7 @@ from verifai_jax.core.lifting import CAPACITY, LiftedNumbers
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
 from verifai_jax.core.remembered import is_kept, lower_or_recall, remembered_as
+from verifai_jax.core.shapes import pad_rows
 from verifai_jax.core.steps import as_traced
 from verifai_jax.evaluation.differentiation import Derivative, reverse_refused
 from verifai_jax.evaluation.inputs import CubePoints, Inputs
@@ -228,11 +229,11 @@ class Engine:
             count = len(jax.tree.leaves(rows)[0])
             temperatures = np.asarray(temperature, np.float32)
             if temperatures.ndim:
-                temperatures = _pad(temperatures, self.padded)
+                temperatures = pad_rows(temperatures, self.padded)
             else:
                 temperatures = np.full(self.padded, temperatures)
             # In NumPy: of an array of JAX each first use of this kind compiles a program.
-            rows = jax.tree.map(lambda leaf: _pad(np.asarray(leaf), self.padded), rows)
+            rows = jax.tree.map(lambda leaf: pad_rows(leaf, self.padded), rows)
             program = self._executable(mode)
             numbers = self._vectors[mode]
             if self.alone:
@@ -445,16 +446,10 @@ def chunks_and_lanes(problem: Problem, batch: int, devices: int) -> tuple[int, i
     return chunks, -(-per_device // chunks)
 
 
-def _pad(rows: np.ndarray, count: int) -> np.ndarray:
-    if len(rows) == count:
-        return rows
-    return np.concatenate([rows, np.broadcast_to(rows[-1:], (count - len(rows), *rows.shape[1:]))])
-
-
 def _pad_keys(keys: Key[Array, " lanes"], count: int) -> Key[Array, " count"]:
     if len(keys) == count:
         return keys
-    return as_key(_pad(np.asarray(jax.random.key_data(keys)), count))
+    return as_key(pad_rows(np.asarray(jax.random.key_data(keys)), count))
 
 
 def _one_key(keys: Key[Array, "*lanes"]) -> Key[Array, ""]:

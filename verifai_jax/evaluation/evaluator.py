@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Key
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.progress import count_done
+from verifai_jax.core.shapes import power_of_two
 from verifai_jax.evaluation.engine import Engine, engine_for
 from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
 from verifai_jax.evaluation.host_engine import HostEngine
@@ -88,7 +89,7 @@ class Evaluator:
             )
         if ends_raising and isinstance(self.engine, HostEngine):
             # Features of few points are those of a whole batch, bit for bit.
-            self.engine.least = 1 << (batch - 1).bit_length()
+            self.engine.least = power_of_two(batch)
         self.key: Key[Array, ""] = run_keys(seed)[1]
         self.simulations = 0
 

@@ -30,6 +30,7 @@ from verifai_jax.core.executors import (
     ship,
 )
 from verifai_jax.core.programs import Slot
+from verifai_jax.core.shapes import power_of_two
 from verifai_jax.evaluation.engine import chunks_and_lanes
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
@@ -99,7 +100,7 @@ class ExecutorEngine:
         form = problem.space.feature_form
         self._features: Any = jax.tree.structure(form)
         _, lanes = chunks_and_lanes(problem, batch, len(jax.local_devices()))
-        least = 1 << (batch - 1).bit_length()
+        least = power_of_two(batch)
         backend = problem.system.backend if problem.system.backends else None
         self.mode = BlockMode(lanes, gradient, clauses, precision, least, backend, steering, given)
         self._dtype = np.dtype(precision if given else "float32")

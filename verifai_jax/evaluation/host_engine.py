@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, Integer, Key, PyTree
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
+from verifai_jax.core.shapes import pad_rows, power_of_two
 from verifai_jax.core.text import storable
 from verifai_jax.core.trace import Status, Trace, without_wrapping
 from verifai_jax.core.user_errors import format_user_error
@@ -76,8 +77,8 @@ class HostMonitor:
         In one shape for many `count`. `features` are needed only where something steers.
         """
         signals = {name: without_wrapping(signal) for name, signal in traces.signals.items()}
-        padded = jax.tree.map(_power_of_two, _with_signals(traces, signals))
-        own = jax.tree.map(_power_of_two, features) if self.steering.size else {}
+        padded = jax.tree.map(pad_rows, _with_signals(traces, signals))
+        own = jax.tree.map(pad_rows, features) if self.steering.size else {}
         decided = self._decide(padded, own)
         rho, status, marks, told = (np.asarray(leaf)[:count] for leaf in decided)
         holds = np.ones(rho.shape, bool)
@@ -161,7 +162,7 @@ class HostEngine:
         """
         with in_precision(self.precision):
             u = np.asarray(rows)
-            points = _power_of_two(u)
+            points = pad_rows(u)
             if len(points) < self.least:
                 points = np.concatenate([u, np.repeat(u[-1:], self.least - len(u), axis=0)])
             features, keys, seeds = self._prepare(points, key, np.int32(first))
@@ -423,13 +424,6 @@ def _form(trace: Trace) -> Any:
     return jax.tree.structure(trace), shapes
 
 
-def _power_of_two(leaf: Any) -> np.ndarray:
-    """Repeat the last row until the number of rows is a power of two."""
-    leaf = np.asarray(leaf)
-    missing = (1 << (len(leaf) - 1).bit_length()) - len(leaf)
-    return np.concatenate([leaf, np.repeat(leaf[-1:], missing, axis=0)]) if missing else leaf
-
-
 def on_host_clock(trace: Trace) -> Trace:
     """Return a host system's trace as the compiled monitors need it, checked.
 
@@ -453,7 +447,7 @@ def pad_trace(trace: Trace) -> Trace:
     """
     trace = on_host_clock(trace)
     valid = trace.length if trace.valid is None else int(trace.valid)
-    length = 1 << (trace.length - 1).bit_length()
+    length = power_of_two(trace.length)
     index = np.minimum(np.arange(length), valid - 1)
     signals = {name: np.asarray(signal)[index] for name, signal in trace.signals.items()}
     status = int(Status.OK if trace.status is None else trace.status)

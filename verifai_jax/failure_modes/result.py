@@ -10,9 +10,8 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Array, Key
 
-from verifai_jax.core.figure import Figure
+from verifai_jax.core.figure import Drawn
 from verifai_jax.core.keys import simulation_key
-from verifai_jax.core.lazy import late
 from verifai_jax.core.notebook import InNotebook, picture_html
 from verifai_jax.core.text import format_percent
 from verifai_jax.counterexamples import explain, shrink
@@ -133,7 +132,7 @@ class Mode(InNotebook):
 
 
 @dataclass(frozen=True, eq=False)
-class Modes(InNotebook):
+class Modes(Drawn, InNotebook):
     """All failing regions that were found, the most probable first.
 
     - `name`: of the problem.
@@ -152,6 +151,9 @@ class Modes(InNotebook):
     - `sources`: what the model was made of, as a run records it.
     - `changed`: says that the model of the run from which they began is another one by now.
     """
+
+    _picture = "modes", "plot_modes"
+    """The probabilities with their intervals, and the failures of each mode."""
 
     name: str
     modes: tuple[Mode, ...]
@@ -202,17 +204,6 @@ class Modes(InNotebook):
                 for mode in self.modes
             ]
         )
-
-    def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw the probabilities with their intervals, and the failures of each mode.
-
-        **Arguments:**
-
-        - `path`: file that the picture is written to, if given.
-
-        **Returns:** the Matplotlib figure.
-        """
-        return late("verifai_jax.plotting.modes", "plot_modes")(self, path)
 
     def _notebook_parts(self) -> Iterator[str]:
         if self.modes:

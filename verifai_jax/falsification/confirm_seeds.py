@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
+from verifai_jax.core.shapes import pad_rows
 from verifai_jax.evaluation.confirmer import LIMIT, Confirmer
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.problem.problem import Problem
@@ -104,11 +105,9 @@ class SeedConfirmer:
 
     def _rows(self, u: Float[np.ndarray, "n d"]) -> dict[str, np.ndarray]:
         """Return the rows of the table at these points."""
-        # Powers of two, so that few shapes are compiled.
-        padded = np.pad(u, ((0, (1 << (len(u) - 1).bit_length()) - len(u)), (0, 0)), mode="edge")
         space = self.problem.space
         with in_precision(self.precision):
-            features = space.features_at(padded.astype(self.precision))
+            features = space.features_at(pad_rows(u).astype(self.precision))
             columns = space.rows(jax.tree.map(np.asarray, features))
         return {name: column[: len(u)] for name, column in columns.items()}
 

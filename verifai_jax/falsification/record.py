@@ -20,42 +20,6 @@ RECORD = "run.json"
 FORMAT = 3
 """Number of the format of a run's files; others are refused."""
 
-
-RECORDED = (
-    "name",
-    "formulas",
-    "search",
-    "seed",
-    "batch",
-    "stopped",
-    "compile_seconds",
-    "run_seconds",
-    "version",
-    "prior",
-    "target",
-)
-"""Entries that every record has."""
-ADDED = (
-    "budget",
-    "search_data",
-    "space_data",
-    "acceptance",
-    "precision",
-    "backend",
-    "notes",
-    "lasting_notes",
-    "confirm",
-    "confirm_seconds",
-    "search_seconds",
-    "simulate_seconds",
-    "checks",
-    "first",
-    "guide",
-    "origin",
-    "sources",
-    "derived",
-)
-"""Entries that may be absent, as from the records of 0.1."""
 DECIDING = (
     "features",
     "name",
@@ -97,8 +61,6 @@ def read_record(folder: Path) -> dict[str, Any]:
             f"{one_line(str(record.get('version', 'unknown')), 40)}"
         )
     for name, fits in _FORMS.items():
-        if name not in record and name in ADDED:
-            continue
         if name not in record or not fits(record[name]):
             what = f"has no {name!r}" if name not in record else f"has {name!r} of another form"
             raise ValueError(f"{file} is damaged: it {what}{_rows_beside(folder)}")
@@ -213,9 +175,12 @@ _FORMS: dict[str, Callable[[Any], bool]] = {
     "search_seconds": _is_number,
     "simulate_seconds": _is_number,
     "checks": _is_texts,
+    "first": lambda value: isinstance(value, list),
     "guide": _is_mapping,
     "origin": lambda value: value in ("", *ORIGINS),
     "sources": _is_sources,
     "derived": _is_mapping,
 }
 """What each entry of a record must be."""
+RECORDED = tuple(name for name in _FORMS if name != "features")
+"""Entries of a record that are attributes of its run."""

@@ -42,7 +42,6 @@ from verifai_jax.falsification.model_changes import (
     sources_of_row,
 )
 from verifai_jax.falsification.record import (
-    ADDED,
     DECIDING,
     FORMAT,
     RECORD,
@@ -477,7 +476,7 @@ class Run(InNotebook):
 def write_record(run: Run, folder: Path) -> int:
     """Write everything about a run but its table to `run.json`; return its checksum."""
     record = {"format": FORMAT, "features": list(run.table.features)}
-    for name in (*RECORDED, *ADDED):
+    for name in RECORDED:
         record[name] = getattr(run, name)
     record = sealed(json.loads(json.dumps(record)))
     partial = folder / f"{RECORD}.part"
@@ -582,7 +581,6 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
         checkpoint=checkpoint,
         damage="; ".join(damage),
         **{name: record[name] for name in RECORDED},
-        **{name: record[name] for name in ADDED if name in record},
     )
     return as_made(run)
 

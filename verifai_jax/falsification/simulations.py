@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax.core.executors import Executor
+from verifai_jax.core.shapes import power_of_two
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
@@ -204,7 +205,7 @@ class Simulations:
     def _as_in_a_batch(self, engine: HostEngine, keep_traces: bool) -> Iterator[None]:
         """Let rows that are simulated on their own be those of a whole batch, bit for bit."""
         before = engine.least, engine.keep_traces
-        engine.least = 1 << (self.batch - 1).bit_length()
+        engine.least = power_of_two(self.batch)
         engine.keep_traces = keep_traces
         try:
             yield

@@ -16,7 +16,6 @@ import numpy as np
 from verifai_jax.core.figure import Axes, Figure, new_figure
 from verifai_jax.core.text import format_seconds
 from verifai_jax.core.whole_files import replacing
-from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._explain import Explanation, Node, heading
 from verifai_jax.mtl.evaluate import Evaluator
 from verifai_jax.mtl.formula import Term

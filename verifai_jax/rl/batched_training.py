@@ -30,6 +30,7 @@ from verifai_jax.core.devices import (
     split_sharding,
     spread_over_devices,
 )
+from verifai_jax.core.shapes import power_of_two
 from verifai_jax.rl.algorithm import Algorithm, AlgorithmState, check_fit
 from verifai_jax.rl.policy import Policy
 from verifai_jax.rl.task.task import Task
@@ -316,7 +317,7 @@ def policy_structure(configuration: Configuration) -> tuple[Hashable, Hashable, 
 
 def _structure_of(configuration: Configuration) -> _Structure:
     # A power of two: runs of other lengths share the program.
-    capacity = 1 << max(6, (configuration.updates - 1).bit_length())
+    capacity = max(64, power_of_two(configuration.updates))
     return _Structure(*policy_structure(configuration), capacity)
 
 

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from verifai_jax._version import __version__
+from verifai_jax.certification._certify import certify
 from verifai_jax.certification.attack import check_attack
-from verifai_jax.certification.result import Certificates
+from verifai_jax.certification.result import Certificate, Certificates
 from verifai_jax.core.cache import Arrays, Cache, locked_cache
 from verifai_jax.core.callbacks import Callback, check_callbacks, notify
 from verifai_jax.core.errors import suggests_options
@@ -33,12 +34,15 @@ from verifai_jax.sweeps.optuna import OptunaSampler
 from verifai_jax.sweeps.proposers import WORST, Proposer, make_proposer, objective
 from verifai_jax.sweeps.record import NONFINITE, STOPPED, TRAINED, SweepRecord, error_status
 from verifai_jax.sweeps.result import Sweep
-from verifai_jax.sweeps.rows import Row, tabulate
-from verifai_jax.sweeps.safety import SCREENING, PolicySafety, SafetyReport, certify_policies
+from verifai_jax.sweeps.rows import Row, columns_of, tabulate
 from verifai_jax.sweeps.study import Study
 from verifai_jax.sweeps.training_runs import TrainingRuns
 from verifai_jax.sweeps.validation import check_options
 
+SCREENING = 64
+"""Samples of a policy, and simulations of the attack on it, by which a search or halving chooses.
+
+Certificates take fresh samples."""
 _MOST_BARREN = 64
 """Rounds of a search without a new configuration before proposals end."""
 _FOR_TRAINING = 2 / 3
@@ -195,7 +199,7 @@ class _RunningSweep:
     numbers: dict[str, int] = field(default_factory=dict)
     returns: dict[tuple[int, int], float] = field(default_factory=dict)
     return_range: tuple[float, float] | None = None
-    safety: dict[tuple[int, int], PolicySafety] = field(default_factory=dict)
+    safety: dict[tuple[int, int], Certificate] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.runs = TrainingRuns(self.study, self.cache, self.clock, self.executor)
@@ -354,12 +358,12 @@ class _RunningSweep:
         if self.return_range is None and returns:
             self.return_range = min(returns), max(returns)
         samples = min(SCREENING, self.options["samples"])
-        safety: dict[tuple[int, int], PolicySafety] = {}
+        safety: dict[tuple[int, int], Certificate] = {}
         if finite:
             # Other samples than those of the certificates.
             seed = int(np.random.SeedSequence([self.options["seed"], 1]).generate_state(1)[0])
             policies = [self._policy(place) for place in finite]
-            report = self._certify_policies(
+            certificates = self._certify_policies(
                 policies,
                 samples=samples,
                 budget=samples * len(policies),
@@ -367,10 +371,10 @@ class _RunningSweep:
                 attack_simulations=min(SCREENING, self.options["attack_simulations"]),
                 progress=None,
             )
-            if report.certificates is not None and report.certificates.stopped == "interrupted":
+            if certificates.stopped == "interrupted":
                 # A half-finished screening would change the proposals of a resumed sweep.
                 raise KeyboardInterrupt
-            safety = dict(zip(finite, report.policies, strict=True))
+            safety = dict(zip(finite, certificates.rows, strict=True))
         objectives: dict[int, float | None] = {}
         for number, group in places.items():
             values = [self._objective(place, safety.get(place)) for place in group]
@@ -378,10 +382,11 @@ class _RunningSweep:
             objectives[number] = None if failed else float(np.mean(values))
         return objectives
 
-    def _objective(self, place: tuple[int, int], safety: PolicySafety | None) -> float:
+    def _objective(self, place: tuple[int, int], safety: Certificate | None) -> float:
         if safety is None or self.return_range is None:
             return WORST
-        value = objective(safety.rate, safety.worst, self.returns[place], self.return_range)
+        rate, worst = columns_of(safety)["failure_rate"], safety.worst_robustness
+        value = objective(rate, worst, self.returns[place], self.return_range)
         return WORST if value is None else value
 
     # Certification
@@ -400,7 +405,7 @@ class _RunningSweep:
         with self.clock.stage(CERTIFYING, total, "simulations"):
             # Training may have been out of time before returns were measured.
             self._measure_returns(list(dict.fromkeys(run for run, _ in places)))
-            report = self._certify_policies(
+            certificates = self._certify_policies(
                 [self._policy(place) for place in places],
                 samples=self.options["samples"],
                 budget=self.options["budget"],
@@ -408,28 +413,14 @@ class _RunningSweep:
                 attack_simulations=self.options["attack_simulations"],
                 progress=self.clock.show,
             )
-        self.safety = dict(zip(places, report.policies, strict=True))
+        self.safety = dict(zip(places, certificates.rows, strict=True))
         for place, safety in self.safety.items():
-            numbers = {
-                "failures": safety.failures,
-                "simulations": safety.simulations,
-                "failure_low": safety.low,
-                "failure_high": safety.high,
-                "worst_robustness": safety.worst,
-            }
+            numbers = columns_of(safety)
+            del numbers["failure_rate"], numbers["verdict"]
             self._notify(place, {"nominal_return": self.returns[place], **numbers})
-        return report.certificates
+        return certificates
 
-    def _certify_policies(
-        self,
-        policies: Sequence[Policy],
-        *,
-        samples: int,
-        budget: int | None,
-        seed: int,
-        attack_simulations: int,
-        progress: Callable[[int, int, str], None] | None,
-    ) -> SafetyReport:
+    def _certify_policies(self, policies: Sequence[Policy], **options: Any) -> Certificates:
         def remember(name: str, compute: Callable[[], Arrays]) -> Arrays:
             try:
                 self.clock.check()
@@ -438,19 +429,15 @@ class _RunningSweep:
                 raise KeyboardInterrupt from None
             return self.cache.remember(f"certify/{name}", compute)
 
-        return certify_policies(
+        return certify(
             self.study.problem,
             policies,
             p=self.study.p,
             confidence=self.options["confidence"],
-            samples=samples,
-            seed=seed,
-            budget=budget,
             attack=self.attack,
-            attack_simulations=attack_simulations,
             remember=remember,
-            progress=progress,
             executor=self.executor,
+            **options,
         )
 
     # The record

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.core.errors import check_names
+from verifai_jax.core.shapes import power_of_two
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import Formula, parse, robustness
 from verifai_jax.mtl.formula import Interval
@@ -103,7 +104,7 @@ def curve_robustness(
         # Updates of different lengths; a value holds until the next update has ended.
         trace = resample(trace, dt=float(np.diff(np.asarray(trace.times)).min()), method="hold")
     # Curves are padded to few lengths, each of which compiles once; the last value stays anyway.
-    length = max(_SHORTEST, 1 << (trace.length - 1).bit_length())
+    length = max(_SHORTEST, power_of_two(trace.length))
     values = np.asarray(trace["return"], np.float32)
     padded = np.concatenate([values, np.full(length - len(values), values[-1], np.float32)])
     assert trace.dt is not None

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.figure import Drawn
 from verifai_jax.core.lazy import late
 from verifai_jax.core.sources import Change, list_changes
 from verifai_jax.core.targets import load_target
@@ -47,12 +48,11 @@ from verifai_jax.sweeps.trainer import ALGORITHM
 if TYPE_CHECKING:
     import optuna
     import pandas as pd
-    from matplotlib.figure import Figure
     from optuna.storages import BaseStorage
 
 
 @dataclass(frozen=True, eq=False)
-class Sweep:
+class Sweep(Drawn):
     """The policies of a sweep with their returns and certificates, as `sweep` returns them.
 
     **Fields:**
@@ -67,6 +67,9 @@ class Sweep:
     - `reuse`: how much was cached before: by kind of work (`"train"`, `"return"`, `"certify"`) the
       number of entries that were, and of all; empty for a loaded sweep.
     """
+
+    _picture = "sweep", "plot_sweep"
+    """Return against failure probability, learning curves and importances."""
 
     record: SweepRecord
     study: Study | None = None
@@ -368,17 +371,6 @@ class Sweep:
         **Returns:** the path.
         """
         return late("verifai_jax.reports", "write_report")(self, path, **options)
-
-    def plot(self, path: str | Path | None = None) -> "Figure":
-        """Draw return against failure probability, learning curves and importances.
-
-        **Arguments:**
-
-        - `path`: file that the picture is written to, if given.
-
-        **Returns:** the Matplotlib figure.
-        """
-        return late("verifai_jax.plotting.sweep", "plot_sweep")(self, path)
 
     def save(self, folder: str | Path) -> Path:
         """Write the sweep to a folder: table, policies, curves, record.

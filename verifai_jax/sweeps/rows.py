@@ -2,15 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Shaped
 
+from verifai_jax.certification.result import Certificate
 from verifai_jax.rl.policy import Policy
 from verifai_jax.sweeps.curves import curve_robustness
 from verifai_jax.sweeps.record import AFTER, BEFORE, Curve
-from verifai_jax.sweeps.safety import PolicySafety
 from verifai_jax.sweeps.study import Study
 from verifai_jax.sweeps.training_runs import RunCheckpoint
 
@@ -39,7 +39,7 @@ class Row:
     place: tuple[int, int]
     checkpoint: RunCheckpoint | None = None
     nominal_return: float = float("nan")
-    safety: PolicySafety | None = None
+    safety: Certificate | None = None
 
 
 class Table(NamedTuple):
@@ -77,7 +77,7 @@ def tabulate(rows: Sequence[Row], study: Study) -> Table:
             row.checkpoint.policy if row.checkpoint is not None and row.checkpoint.finite else None
             for row in rows
         ),
-        worst=tuple(None if row.safety is None else row.safety.features for row in rows),
+        worst=tuple(None if row.safety is None else row.safety.worst_features for row in rows),
         curves=curves,
     )
 
@@ -95,15 +95,28 @@ def _cells(row: Row, study: Study) -> dict[str, object]:
         "status": row.status,
         "training_return": nan if checkpoint is None else checkpoint.training_return,
         "nominal_return": row.nominal_return,
-        "failures": 0 if safety is None else safety.failures,
-        "simulations": 0 if safety is None else safety.simulations,
-        "failure_rate": nan if safety is None else safety.rate,
-        "failure_low": nan if safety is None else safety.low,
-        "failure_high": nan if safety is None else safety.high,
-        "worst_robustness": nan if safety is None else safety.worst,
-        "verdict": "" if safety is None else safety.verdict,
+        **columns_of(safety),
         "curve_robustness": curve,
         "training_seconds": nan if checkpoint is None else checkpoint.seconds,
+    }
+
+
+def columns_of(certificate: Certificate | None) -> dict[str, Any]:
+    """Return the columns of a certificate; `failures` counts samples without a verdict too."""
+    nan, rate = float("nan"), None if certificate is None else certificate.rate
+    if certificate is None or rate is None:
+        # An interruption leaves policies without a sample, and so without a verdict.
+        worst = nan if certificate is None else certificate.worst_robustness
+        columns = {"failures": 0, "simulations": 0, "failure_rate": nan, "failure_low": nan}
+        return {**columns, "failure_high": nan, "worst_robustness": worst, "verdict": ""}
+    return {
+        "failures": certificate.failures + certificate.not_finite,
+        "simulations": certificate.simulations,
+        "failure_rate": rate.estimate,
+        "failure_low": rate.low,
+        "failure_high": rate.high,
+        "worst_robustness": certificate.worst_robustness,
+        "verdict": certificate.verdict,
     }
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from verifai_jax.core.text import format_features, format_percent
+from verifai_jax.core.text import counted, format_features, format_percent
 from verifai_jax.statistics.confidence_sequences import verdict_kind
 from verifai_jax.sweeps.ranking import (
     full_return_threshold,
@@ -80,7 +80,7 @@ def format_summary(findings: Findings) -> str:
     if missing := _missing_policies(table):
         lines.append(f"  without policy  {missing}")
     if stopped := sum(str(status) == "stopped" for status in table["status"]):
-        lines.append(f"  halving         stopped {_plural(stopped, 'training')} before the end")
+        lines.append(f"  halving         stopped {counted(stopped, 'training')} before the end")
     correlation = return_safety_correlation(last_checkpoints(table)) if len(table) else np.nan
     if np.isfinite(correlation):
         lines.append(
@@ -108,7 +108,7 @@ def format_headline(findings: Findings) -> str:
     groups: Any = findings.configurations
     if not len(groups):
         return "no configuration was trained"
-    text = f"{_plural(len(groups), 'configuration')}; "
+    text = f"{counted(len(groups), 'configuration')}; "
     threshold = full_return_threshold(groups)
     if not np.isfinite(threshold):
         return text + "none has a policy"
@@ -159,7 +159,7 @@ def format_html(findings: Findings) -> str:
     entries: Any = rows.to_dict("records")
     body = "".join(map(_html_row, map(str, rows.index), entries, repeat(names)))
     left = len(table) - len(rows)
-    more = f"<p>{_plural(left, 'further row')}: <code>.table</code></p>" if left else ""
+    more = f"<p>{counted(left, 'further row')}: <code>.table</code></p>" if left else ""
     summary = html.escape(format_summary(findings))
     return (
         f"<p><b>{html.escape(record.study)}</b>: {html.escape(format_headline(findings))}</p>"
@@ -203,7 +203,7 @@ def _best_lines(findings: Findings) -> list[str]:
     if np.isfinite(best["training_seconds"]):
         price += f" in {best['training_seconds']:z.1f} s of a core"
     if best["simulations"] > 0:
-        price += f", then {_plural(int(best['simulations']), 'simulation')} for the certificate"
+        price += f", then {counted(int(best['simulations']), 'simulation')} for the certificate"
     lines.append(f"                  cost {price}")
     return lines
 
@@ -219,7 +219,7 @@ def _seed_lines(findings: Findings) -> list[str]:
     number, best = safe.index[0], safe.iloc[0].to_dict()
     are = "are" if len(safe) > 1 else "is"
     return [
-        f"  every seed      {_plural(len(safe), 'configuration')} {are} safe with all seeds; the "
+        f"  every seed      {counted(len(safe), 'configuration')} {are} safe with all seeds; the "
         f"best is {number}: nominal return {_format_return(best['nominal_return'])}",
         f"                  {format_hyperparameters(findings, best)}",
     ]
@@ -242,7 +242,7 @@ def _missing_policies(table: "pd.DataFrame") -> str:
     failed = messages.loc[messages.notna()]
     if len(failed):
         first = failed.iloc[0].strip() or "error"
-        errors = _plural(len(failed), "error")
+        errors = counted(len(failed), "error")
         parts.append(f"{errors}, the first in row {failed.index[0]}: {first}")
     return "; ".join(parts)
 
@@ -269,7 +269,7 @@ def _reuse(reuse: Mapping[str, tuple[int, int]]) -> str:
     if not any(cached for cached, _ in reuse.values()):
         return ""
     return ", ".join(
-        f"{cached:,} of {_plural(used, _WORK.get(kind, kind))}"
+        f"{cached:,} of {counted(used, _WORK.get(kind, kind))}"
         for kind, (cached, used) in reuse.items()
     )
 
@@ -282,9 +282,3 @@ def _seconds(seconds: Mapping[str, float]) -> str:
 def _format_return(value: float) -> str:
     """Write a return with four digits, and no exponent where it can be avoided."""
     return f"{value:z,.0f}" if abs(value) >= 1000 else f"{value:z.4g}"
-
-
-def _plural(count: int, noun: str) -> str:
-    """Write a count with its noun: `1 configuration`, `2 configurations`."""
-    noun, of, rest = noun.partition(" of ")
-    return f"{count:,} {noun}{'s' * (count != 1)}{of}{rest}"

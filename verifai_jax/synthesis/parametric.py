@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import in_precision
+from verifai_jax.core.shapes import pad_rows
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.inputs import WithParameters
@@ -336,10 +337,7 @@ def accepted(space: FeatureSpace, rows: Float[np.ndarray, "n d"]) -> Bool[np.nda
     """Return the points that the constraint of the space accepts."""
     if space.where is None or not len(rows):
         return np.ones(len(rows), bool)
-    # A power of two, so that few shapes compile.
-    missing = (1 << max(0, len(rows) - 1).bit_length()) - len(rows)
-    padded = np.pad(rows, ((0, missing), (0, 0)), mode="edge")
-    return np.asarray(space.accepts_points(padded))[: len(rows)]
+    return np.asarray(space.accepts_points(pad_rows(rows)))[: len(rows)]
 
 
 def columns_of(space: FeatureSpace, points: Any) -> dict[str, np.ndarray]:

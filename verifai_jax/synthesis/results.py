@@ -3,12 +3,11 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from verifai_jax.core.figure import Figure
+from verifai_jax.core.figure import Drawn
 from verifai_jax.core.lazy import late
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.problem.problem import Problem
@@ -186,7 +185,7 @@ class RepairEstimates(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Repair(InNotebook):
+class Repair(Drawn, InNotebook):
     """Result of `repair`: parameters changed as little as removes the failures.
 
     **Fields:** `before` and `parameters`: the nominal and the repaired ones, features by name or a
@@ -200,6 +199,9 @@ class Repair(InNotebook):
     parameters are a pytree; `notes`; `seed`; `sources`: what the model was made of, as a run
     records it; `changed`: says that the model of the run from which it began has changed since.
     """
+
+    _picture = "repair", "plot_repair"
+    """The worst robustness that each attack found."""
 
     name: str
     before: Any
@@ -315,17 +317,6 @@ class Repair(InNotebook):
             shown = "unchanged" if same else f"-> {format_value(value)}"
             pairs.append(f"{name} {format_value(self.before[name])} {shown}")
         return ", ".join(pairs)
-
-    def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw the worst robustness that each attack found.
-
-        **Arguments:**
-
-        - `path`: of a picture to write; none when left out.
-
-        **Returns:** the figure.
-        """
-        return late("verifai_jax.plotting.repair", "plot_repair")(self, path)
 
 
 def _worse(before: HeldOut | None, after: HeldOut | None) -> bool:

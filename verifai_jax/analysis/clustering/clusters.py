@@ -12,7 +12,6 @@ k-means (Lloyd, Least squares quantization in PCM, IEEE Transactions on Informat
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -32,8 +31,7 @@ from verifai_jax.analysis.data.samples import (
     generator,
 )
 from verifai_jax.core.checks import check_count, check_positive
-from verifai_jax.core.figure import Figure
-from verifai_jax.core.lazy import late
+from verifai_jax.core.figure import Drawn
 from verifai_jax.core.text import format_features, format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
@@ -48,13 +46,16 @@ _STARTS = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Clusters:
+class Clusters(Drawn):
     """A partition of `samples`.
 
     **Fields:** `assigned` `[n]`: cluster of each row looked at, 0 the largest, -1 noise; `method`;
     `silhouette`: from -1 to 1, how much nearer rows are to their own cluster than to the next, on
     at most 2000 rows; NaN for less than two clusters; `radius` of DBSCAN, else None.
     """
+
+    _picture = "clusters", "plot_clusters"
+    """The clusters over the two columns that tell them apart best."""
 
     samples: Samples
     assigned: Int[np.ndarray, " n"]
@@ -129,17 +130,6 @@ class Clusters:
             )
         table = beside(self.centres, pd.DataFrame(own, index=self.centres.index))
         return table.loc[[*range(self.count), *([-1] if -1 in table.index else [])]]
-
-    def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw the clusters over the two columns that tell them apart best.
-
-        **Arguments:**
-
-        - `path`: of a picture to write; none when left out.
-
-        **Returns:** the figure.
-        """
-        return late("verifai_jax.plotting.clusters", "plot_clusters")(self, path)
 
     def __str__(self) -> str:
         score = f", silhouette {self.silhouette:z.2f}" if np.isfinite(self.silhouette) else ""

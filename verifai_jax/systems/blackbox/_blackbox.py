@@ -160,20 +160,11 @@ class Simulation:
 
 
 @dataclass(frozen=True, eq=False)
-class BlackBox(System):
-    """A system on the host, simulated row by row and never traced by JAX; made by `blackbox`."""
+class _RowByRow(System):
+    """A simulator on the host that simulates one row at a time."""
 
     black_box: ClassVar[bool] = True
     simulation: Simulation
-
-    def __call__(self, features: Features, key: Seed = None) -> Trace:
-        """Simulate once, with features as plain Python and NumPy values.
-
-        **Arguments:**
-
-        - `key`: a JAX random key, or an integer seed.
-        """
-        return self.simulation(plain_leaves(features), seed_of(key))
 
     def abstract(self, features: Features) -> Trace | None:
         """Return the form of the traces, if it is given."""
@@ -196,6 +187,20 @@ class BlackBox(System):
     def exact_step(self) -> bool:
         """True for a simulator that says that its step is part of the system."""
         return as_system(self.simulation.function).exact_step
+
+
+@dataclass(frozen=True, eq=False)
+class BlackBox(_RowByRow):
+    """A system on the host, simulated row by row and never traced by JAX; made by `blackbox`."""
+
+    def __call__(self, features: Features, key: Seed = None) -> Trace:
+        """Simulate once, with features as plain Python and NumPy values.
+
+        **Arguments:**
+
+        - `key`: a JAX random key, or an integer seed.
+        """
+        return self.simulation(plain_leaves(features), seed_of(key))
 
     @property
     def can_refine(self) -> bool:
@@ -215,11 +220,9 @@ class BlackBox(System):
 
 
 @dataclass(frozen=True, eq=False)
-class PooledBlackBox(System):
+class PooledBlackBox(_RowByRow):
     """A system on the host, in processes of its own; made by `blackbox(..., workers=n)`."""
 
-    black_box: ClassVar[bool] = True
-    simulation: Simulation
     pool: Pool
 
     def __call__(self, features: Features, key: Seed = None) -> Trace:
@@ -234,28 +237,6 @@ class PooledBlackBox(System):
     ) -> Iterator[tuple[int, Outcome]]:
         """Simulate each row in a worker; see `System.simulate_each`."""
         return self.pool.outcomes(features, seeds)
-
-    def abstract(self, features: Features) -> Trace | None:
-        """Return the form of the traces, if it is given."""
-        return self.simulation.declared.abstract()
-
-    @property
-    def known_signals(self) -> KnownSignals:
-        """Signals of a trace, see `System.known_signals`."""
-        return self.simulation.known_signals
-
-    def may_draw(self, features: Features) -> bool:
-        """Return whether the simulator is given a seed."""
-        return self.simulation.seeded
-
-    def check(self, features: Features) -> None:
-        """Refuse features that do not fit, if the simulator has a `check` of its own."""
-        as_system(self.simulation.function).check(features)
-
-    @property
-    def exact_step(self) -> bool:
-        """True for a simulator that says that its step is part of the system."""
-        return as_system(self.simulation.function).exact_step
 
     def renewed(self) -> "PooledBlackBox":
         """Return the same simulator in worker processes of its own."""

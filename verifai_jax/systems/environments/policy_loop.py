@@ -1,4 +1,4 @@
-"""What all environments of JAX with a policy in the loop have in common, as systems.
+"""Environments of JAX with a policy in the loop, as systems: what all of them have in common.
 
 A subclass says how a feature is bound, and gives the environment under the features of an instant,
 its start, its step, its parts and its actions. All else is here: episodes, checks, delays.

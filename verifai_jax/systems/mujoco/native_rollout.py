@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from verifai_jax.core.errors import require
+from verifai_jax.core.shapes import power_of_two
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.systems.base import Features
 from verifai_jax.systems.mujoco.loop import Loop, Progress, Sample
@@ -42,7 +43,7 @@ class Native:
         """Simulate a batch: every leaf of `features` and `keys` has a leading axis `[n]`."""
         count = len(keys)
         # Few sizes, for which programs are compiled; the rows that fill one up are never stepped.
-        size = 1 << (count - 1).bit_length()
+        size = power_of_two(count)
         filled = np.minimum(np.arange(size), count - 1)
         program = self._program(features)
         features = jax.tree.map(lambda leaf: np.asarray(leaf)[filled], features)
