@@ -29,6 +29,7 @@ ROOMS = (
     "events",
     "mtl",
     "perception",
+    "policies",
     "rl",
     "search",
 )

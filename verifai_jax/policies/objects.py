@@ -19,7 +19,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Key, PyTree
+from jaxtyping import Array, ArrayLike, Key, PyTree
 
 from verifai_jax.core.errors import require
 from verifai_jax.core.text import format_seconds, one_line
@@ -32,7 +32,7 @@ from verifai_jax.policies.sb3 import read_sb3
 log = logging.getLogger("verifai_jax.policies")
 
 
-def from_object(source: Any, observation: Any, batched: bool) -> Policy:
+def from_object(source: object, observation: ArrayLike | None, batched: bool) -> Policy:
     """Return the policy of a model or function.
 
     **Arguments:**
@@ -111,7 +111,7 @@ class _Applied:
 
     module: Any
 
-    def __call__(self, weights: PyTree, observation: Any, memory: None) -> tuple[Any, None]:
+    def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
         return _Function.first(self.module.apply(weights, observation)), None
 
 
@@ -121,7 +121,7 @@ class _Merged:
 
     graph: Any
 
-    def __call__(self, weights: PyTree, observation: Any, memory: None) -> tuple[Any, None]:
+    def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
         nnx = require("flax.nnx", extra="policies")
         return _Function.first(nnx.merge(self.graph, weights)(observation)), None
 
@@ -133,7 +133,7 @@ class _Rebuilt:
     structure: Any
     rest: tuple[Any, ...]
 
-    def __call__(self, weights: PyTree, observation: Any, memory: None) -> tuple[Any, None]:
+    def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
         leaves = [r if w is None else w for w, r in zip(weights, self.rest, strict=True)]
         return _Function.first(jax.tree.unflatten(self.structure, leaves)(observation)), None
 
@@ -159,7 +159,7 @@ class _Function:
         """Shapes of observations that the host computes, with the form of the action."""
         return {}
 
-    def __call__(self, weights: PyTree, observation: Any, memory: None) -> tuple[Any, None]:
+    def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
         shapes = jax.tree.map(lambda o: (jnp.shape(o), str(jnp.result_type(o))), observation)
         key = str(shapes)
         if key not in self.forms:
@@ -178,11 +178,11 @@ class _Function:
         )
         return action, None
 
-    def _on_host(self, observation: Any) -> Any:
+    def _on_host(self, observation: PyTree) -> Any:
         seen = jax.tree.map(np.asarray, observation)
         return jax.tree.map(_plain, self.first(self.function(seen)))
 
-    def _form(self, observation: Any, error: Exception) -> Any:
+    def _form(self, observation: PyTree, error: Exception) -> Any:
         """Return the form of the action on the host, and say what it costs.
 
         **Raises:** what the function raises there.
@@ -217,7 +217,7 @@ def _of_sb3(model: Any) -> Policy:
         return Policy((), _Function(lambda seen: model.predict(seen, deterministic=True)[0], True))
 
 
-def _of_torch(module: Any, observation: Any, batched: bool) -> Policy:
+def _of_torch(module: Any, observation: ArrayLike | None, batched: bool) -> Policy:
     """Return a module of PyTorch by way of ONNX, or as a function of the host."""
     if observation is None:
         raise PolicyError("of a torch module give observation=, an example of what it takes, too")
@@ -226,7 +226,7 @@ def _of_torch(module: Any, observation: Any, batched: bool) -> Policy:
     example = np.asarray(observation, np.float32)
     module = module.eval()
 
-    def on_host(seen: Any) -> Any:
+    def on_host(seen: np.ndarray) -> Any:
         batch = torch.as_tensor(np.array(seen, np.float32)).reshape(-1, *example.shape)
         with torch.no_grad():
             made = module(batch)
@@ -242,7 +242,9 @@ def _of_torch(module: Any, observation: Any, batched: bool) -> Policy:
         return Policy((), _Function(on_host, batched))
 
 
-def _translated(torch: Any, module: Any, example: np.ndarray, on_host: Any) -> Policy:
+def _translated(
+    torch: Any, module: Any, example: np.ndarray, on_host: Callable[..., Any]
+) -> Policy:
     """Return a module of PyTorch in JAX, compared with itself.
 
     **Raises:** `ValueError` where they differ: an exporter follows one branch of each decision.
@@ -305,6 +307,6 @@ class _Inference:
 
     make: Callable[..., Any]
 
-    def __call__(self, weights: PyTree, observation: Any, memory: None) -> tuple[Any, None]:
+    def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
         action, _ = self.make(weights, deterministic=True)(observation, jax.random.key(0))
         return action, None

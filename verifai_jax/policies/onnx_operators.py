@@ -7,14 +7,19 @@ An operator of NumPy arrays alone gives NumPy arrays, so that shapes and indices
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from verifai_jax.policies.errors import PolicyError
 from verifai_jax.policies.onnx_recurrent import gru, lstm, rnn
+
+Value: TypeAlias = Array
+"""A value of a graph. Where it is known before the observation, an array of NumPy takes its place,
+which has the same operations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +47,7 @@ class Node:
         return self.attributes.get(name, default)
 
 
-def _module(*values: Any) -> Any:
+def _module(*values: Value) -> Any:
     """Return NumPy where all values are its arrays, otherwise JAX's."""
     return np if all(isinstance(v, np.ndarray | np.generic) for v in values) else jnp
 
@@ -50,7 +55,7 @@ def _module(*values: Any) -> Any:
 def _same(name: str) -> Callable[..., Any]:
     """Return an operator that is a function of NumPy of this name."""
 
-    def operator(node: Node, *inputs: Any) -> Any:
+    def operator(node: Node, *inputs: Value) -> Value:
         return getattr(_module(*inputs), name)(*inputs)
 
     return operator
@@ -59,7 +64,7 @@ def _same(name: str) -> Callable[..., Any]:
 def _folded(name: str) -> Callable[..., Any]:
     """Return an operator of any number of inputs that is a function of two."""
 
-    def operator(node: Node, first: Any, *others: Any) -> Any:
+    def operator(node: Node, first: Value, *others: Value) -> Value:
         for other in others:
             first = getattr(_module(first, other), name)(first, other)
         return first
@@ -72,19 +77,19 @@ def _real(function: Callable[..., Any]) -> Callable[..., Any]:
     return lambda node, x: function(x)
 
 
-def _divide(node: Node, a: Any, b: Any) -> Any:
+def _divide(node: Node, a: Value, b: Value) -> Value:
     xp = _module(a, b)
     if np.issubdtype(a.dtype, np.integer):
         return xp.trunc(a / b).astype(a.dtype)  # Towards zero, as in C.
     return a / b
 
 
-def _mod(node: Node, a: Any, b: Any) -> Any:
+def _mod(node: Node, a: Value, b: Value) -> Value:
     xp = _module(a, b)
     return xp.fmod(a, b) if node.get("fmod", 0) else xp.mod(a, b)
 
 
-def _gemm(node: Node, a: Any, b: Any, c: Any = None) -> Any:
+def _gemm(node: Node, a: Value, b: Value, c: Value | None = None) -> Value:
     a = a.T if node.get("transA", 0) else a
     b = b.T if node.get("transB", 0) else b
     alpha, beta = node.get("alpha", 1.0), node.get("beta", 1.0)
@@ -93,22 +98,22 @@ def _gemm(node: Node, a: Any, b: Any, c: Any = None) -> Any:
     return product if c is None else product + (c if beta == 1 else beta * c)
 
 
-def _elu(node: Node, x: Any) -> Any:
+def _elu(node: Node, x: Value) -> Value:
     return jax.nn.elu(x, node.get("alpha", 1.0))
 
 
-def _selu(node: Node, x: Any) -> Any:
+def _selu(node: Node, x: Value) -> Value:
     alpha = node.get("alpha", 1.6732631921768188)
     gamma = node.get("gamma", 1.0507010221481323)
     return gamma * jnp.where(x > 0, x, alpha * jnp.expm1(jnp.minimum(x, 0)))
 
 
-def _hard_sigmoid(node: Node, x: Any) -> Any:
+def _hard_sigmoid(node: Node, x: Value) -> Value:
     return jnp.clip(node.get("alpha", 0.2) * x + node.get("beta", 0.5), 0, 1)
 
 
 def _softmax(function: Callable[..., Any]) -> Callable[..., Any]:
-    def operator(node: Node, x: Any) -> Any:
+    def operator(node: Node, x: Value) -> Value:
         if node.opset >= 13:
             return function(x, axis=node.get("axis", -1))
         # Before, all axes from this one on were one.
@@ -118,11 +123,11 @@ def _softmax(function: Callable[..., Any]) -> Callable[..., Any]:
     return operator
 
 
-def _gelu(node: Node, x: Any) -> Any:
+def _gelu(node: Node, x: Value) -> Value:
     return jax.nn.gelu(x, approximate=node.get("approximate", "none") == "tanh")
 
 
-def _clip(node: Node, x: Any, low: Any = None, high: Any = None) -> Any:
+def _clip(node: Node, x: Value, low: Value | None = None, high: Value | None = None) -> Value:
     low = node.get("min", None) if low is None else low
     high = node.get("max", None) if high is None else high
     xp = _module(x)
@@ -130,7 +135,7 @@ def _clip(node: Node, x: Any, low: Any = None, high: Any = None) -> Any:
     return x if high is None else xp.minimum(x, xp.asarray(high, x.dtype))
 
 
-def _cast(node: Node, x: Any) -> Any:
+def _cast(node: Node, x: Value) -> Any:
     kinds = {1: float, 10: float, 11: float, 16: float, 6: np.int32, 7: np.int64, 9: np.bool_}
     kinds |= {2: np.uint8, 3: np.int8, 5: np.int16, 12: np.uint32, 13: np.uint64}
     kind = kinds.get(node.attributes["to"])
@@ -151,12 +156,12 @@ def _constant(node: Node) -> Any:
     return array.astype(np.float32) if array.dtype == np.float64 else array
 
 
-def _constant_of_shape(node: Node, shape: Any) -> Any:
+def _constant_of_shape(node: Node, shape: Value) -> Any:
     value = np.asarray(node.get("value", np.zeros(1, np.float32))).ravel()[0]
     return np.full(_static(node, shape), value)
 
 
-def _static(node: Node, value: Any) -> tuple[int, ...]:
+def _static(node: Node, value: Value) -> tuple[int, ...]:
     """Return numbers that say a shape, axes or indices.
 
     **Raises:** `PolicyError` where they depend on the observation.
@@ -166,7 +171,7 @@ def _static(node: Node, value: Any) -> tuple[int, ...]:
     return tuple(int(n) for n in np.ravel(value))
 
 
-def _axes(node: Node, given: Any) -> tuple[int, ...] | None:
+def _axes(node: Node, given: Value | None) -> tuple[int, ...] | None:
     """Return axes, an attribute in old operator sets and an input in new ones."""
     if given is not None:
         return _static(node, given) or None
@@ -174,38 +179,38 @@ def _axes(node: Node, given: Any) -> tuple[int, ...] | None:
     return None if axes is None else tuple(axes)
 
 
-def _reshape(node: Node, x: Any, shape: Any = None) -> Any:
+def _reshape(node: Node, x: Value, shape: Value | None = None) -> Value:
     sizes = list(node.attributes["shape"] if shape is None else _static(node, shape))
     if not node.get("allowzero", 0):
         sizes = [x.shape[i] if n == 0 else n for i, n in enumerate(sizes)]
     return x.reshape(sizes)
 
 
-def _flatten(node: Node, x: Any) -> Any:
+def _flatten(node: Node, x: Value) -> Value:
     axis = node.get("axis", 1)
     axis = axis + x.ndim if axis < 0 else axis
     return x.reshape(math.prod(x.shape[:axis]), -1)
 
 
-def _transpose(node: Node, x: Any) -> Any:
+def _transpose(node: Node, x: Value) -> Value:
     return x.transpose(node.get("perm", tuple(range(x.ndim))[::-1]))
 
 
-def _squeeze(node: Node, x: Any, axes: Any = None) -> Any:
+def _squeeze(node: Node, x: Value, axes: Value | None = None) -> Value:
     found = _axes(node, axes)
     found = tuple(i for i, n in enumerate(x.shape) if n == 1) if found is None else found
-    return x.squeeze(found)
+    return _module(x).squeeze(x, found)
 
 
-def _unsqueeze(node: Node, x: Any, axes: Any = None) -> Any:
+def _unsqueeze(node: Node, x: Value, axes: Value | None = None) -> Value:
     return _module(x).expand_dims(x, _axes(node, axes) or ())
 
 
-def _concat(node: Node, *inputs: Any) -> Any:
+def _concat(node: Node, *inputs: Value) -> Value:
     return _module(*inputs).concatenate(inputs, axis=node.attributes["axis"])
 
 
-def _split(node: Node, x: Any, sizes: Any = None) -> tuple[Any, ...]:
+def _split(node: Node, x: Value, sizes: Value | None = None) -> tuple[Value, ...]:
     axis = node.get("axis", 0)
     lengths = node.get("split", None) if sizes is None else _static(node, sizes)
     if lengths is None:
@@ -215,7 +220,7 @@ def _split(node: Node, x: Any, sizes: Any = None) -> tuple[Any, ...]:
     return tuple(_module(x).split(x, np.cumsum(lengths)[:-1].tolist(), axis=axis))
 
 
-def _slice(node: Node, x: Any, *given: Any) -> Any:
+def _slice(node: Node, x: Value, *given: Value) -> Value:
     if given:
         starts, ends, axes, steps = (
             None if v is None else _static(node, v) for v in (*given, None, None)[:4]
@@ -234,28 +239,34 @@ def _slice(node: Node, x: Any, *given: Any) -> Any:
     return x[tuple(where)]
 
 
-def _gather(node: Node, x: Any, index: Any) -> Any:
+def _gather(node: Node, x: Value, index: Value) -> Value:
     axis = node.get("axis", 0)
     index = _module(index).where(index < 0, index + x.shape[axis], index)
     return _module(x, index).take(x, index, axis=axis)
 
 
-def _gather_elements(node: Node, x: Any, index: Any) -> Any:
+def _gather_elements(node: Node, x: Value, index: Value) -> Value:
     axis = node.get("axis", 0)
     index = _module(index).where(index < 0, index + x.shape[axis], index)
     return _module(x, index).take_along_axis(x, index, axis=axis)
 
 
-def _expand(node: Node, x: Any, shape: Any) -> Any:
+def _expand(node: Node, x: Value, shape: Value) -> Value:
     whole = np.broadcast_shapes(x.shape, _static(node, shape))
     return _module(x).broadcast_to(x, whole)
 
 
-def _tile(node: Node, x: Any, repeats: Any) -> Any:
+def _tile(node: Node, x: Value, repeats: Value) -> Value:
     return _module(x).tile(x, _static(node, repeats))
 
 
-def _pad(node: Node, x: Any, pads: Any = None, value: Any = None, axes: Any = None) -> Any:
+def _pad(
+    node: Node,
+    x: Value,
+    pads: Value | None = None,
+    value: Value | None = None,
+    axes: Value | None = None,
+) -> Value:
     widths = node.attributes["pads"] if pads is None else _static(node, pads)
     chosen = range(x.ndim) if axes is None else _static(node, axes)
     around = [(0, 0)] * x.ndim
@@ -268,18 +279,18 @@ def _pad(node: Node, x: Any, pads: Any = None, value: Any = None, axes: Any = No
     return jnp.pad(x, around, mode={"reflect": "reflect", "edge": "edge", "wrap": "wrap"}[mode])
 
 
-def _range(node: Node, start: Any, end: Any, step: Any) -> Any:
+def _range(node: Node, start: Value, end: Value, step: Value) -> Any:
     values = [np.asarray(v) for v in (start, end, step)]
     return np.arange(*(v.item() for v in values), dtype=values[0].dtype)
 
 
-def _shape(node: Node, x: Any) -> Any:
+def _shape(node: Node, x: Value) -> Any:
     start, end = node.get("start", 0), node.get("end", None)
     return np.array(x.shape[start:end], np.int64)
 
 
 def _reduce(name: str) -> Callable[..., Any]:
-    def operator(node: Node, x: Any, axes: Any = None) -> Any:
+    def operator(node: Node, x: Value, axes: Value | None = None) -> Value:
         found = _axes(node, axes)
         if found is None and node.get("noop_with_empty_axes", 0):
             return x
@@ -292,7 +303,7 @@ def _reduce(name: str) -> Callable[..., Any]:
 
 
 def _arg(name: str) -> Callable[..., Any]:
-    def operator(node: Node, x: Any) -> Any:
+    def operator(node: Node, x: Value) -> Value:
         axis, keep = node.get("axis", 0), bool(node.get("keepdims", 1))
         if node.get("select_last_index", 0):
             return x.shape[axis] - 1 - getattr(jnp, name)(jnp.flip(x, axis), axis, keepdims=keep)
@@ -301,7 +312,7 @@ def _arg(name: str) -> Callable[..., Any]:
     return operator
 
 
-def _layer_normalization(node: Node, x: Any, scale: Any, bias: Any = None) -> Any:
+def _layer_normalization(node: Node, x: Value, scale: Value, bias: Value | None = None) -> Value:
     axes = tuple(range(node.get("axis", -1) % x.ndim, x.ndim))
     centred = x - jnp.mean(x, axis=axes, keepdims=True)
     variance = jnp.mean(centred**2, axis=axes, keepdims=True)
@@ -309,19 +320,21 @@ def _layer_normalization(node: Node, x: Any, scale: Any, bias: Any = None) -> An
     return scaled if bias is None else scaled + bias
 
 
-def _across(x: Any, vector: Any) -> Any:
+def _across(x: Value, vector: Value) -> Value:
     """Return one number a channel in the form of a batch of them."""
     return jnp.reshape(vector, (1, -1) + (1,) * (x.ndim - 2))
 
 
-def _batch_normalization(node: Node, x: Any, scale: Any, b: Any, mean: Any, var: Any) -> Any:
+def _batch_normalization(
+    node: Node, x: Value, scale: Value, b: Value, mean: Value, var: Value
+) -> Value:
     if node.get("training_mode", 0):
         raise PolicyError(f"{node} is in training mode: export the model after model.eval()")
     scale, b, mean, var = (_across(x, v) for v in (scale, b, mean, var))
     return (x - mean) / jnp.sqrt(var + node.get("epsilon", 1e-5)) * scale + b
 
 
-def _instance_normalization(node: Node, x: Any, scale: Any, b: Any) -> Any:
+def _instance_normalization(node: Node, x: Value, scale: Value, b: Value) -> Value:
     axes = tuple(range(2, x.ndim))
     centred = x - jnp.mean(x, axis=axes, keepdims=True)
     variance = jnp.mean(centred**2, axis=axes, keepdims=True)
@@ -329,7 +342,9 @@ def _instance_normalization(node: Node, x: Any, scale: Any, b: Any) -> Any:
     return centred / jnp.sqrt(variance + epsilon) * _across(x, scale) + _across(x, b)
 
 
-def _window(node: Node, x: Any, kernel: tuple[int, ...]) -> tuple[Any, Any, Any]:
+def _window(
+    node: Node, x: Value, kernel: tuple[int, ...]
+) -> tuple[tuple[int, ...], tuple[int, ...], list[tuple[int, int]]]:
     """Return strides, dilations and padding of a convolution or pooling."""
     rank = len(kernel)
     strides = tuple(node.get("strides", (1,) * rank))
@@ -347,7 +362,7 @@ def _window(node: Node, x: Any, kernel: tuple[int, ...]) -> tuple[Any, Any, Any]
     return strides, dilations, list(zip(pads[:rank], pads[rank:], strict=True))
 
 
-def _conv(node: Node, x: Any, kernel: Any, bias: Any = None) -> Any:
+def _conv(node: Node, x: Value, kernel: Value, bias: Value | None = None) -> Value:
     strides, dilations, around = _window(node, x, kernel.shape[2:])
     x, kernel = jnp.asarray(x), jnp.asarray(kernel)
     real = jnp.promote_types(x.dtype, kernel.dtype)
@@ -363,7 +378,7 @@ def _conv(node: Node, x: Any, kernel: Any, bias: Any = None) -> Any:
 
 
 def _pool(largest: bool) -> Callable[..., Any]:
-    def operator(node: Node, x: Any) -> Any:
+    def operator(node: Node, x: Value) -> Value:
         kernel = tuple(node.attributes["kernel_shape"])
         strides, dilations, around = _window(node, x, kernel)
         beyond = [0] * len(kernel)
@@ -376,7 +391,9 @@ def _pool(largest: bool) -> Callable[..., Any]:
                 begins = size + low + high + more - span
                 beyond[i] = more - s if more and begins >= size + low else more
 
-        def windows(values: Any, start: float, function: Any, pads: Any) -> Any:
+        def windows(
+            values: Value, start: float, function: Callable[..., Any], pads: list[tuple[int, int]]
+        ) -> Value:
             pads = [(low, high + more) for (low, high), more in zip(pads, beyond, strict=True)]
             return jax.lax.reduce_window(
                 values,
@@ -403,21 +420,23 @@ def _global_pool(name: str) -> Callable[..., Any]:
     return lambda node, x: getattr(jnp, name)(x, axis=tuple(range(2, x.ndim)), keepdims=True)
 
 
-def _dropout(node: Node, x: Any, ratio: Any = None, training: Any = None) -> Any:
+def _dropout(
+    node: Node, x: Value, ratio: Value | None = None, training: Value | None = None
+) -> Value:
     if training is not None and np.any(training):
         raise PolicyError(f"{node} is in training mode: export the model after model.eval()")
     return x
 
 
-def _hard_swish(x: Any) -> Any:
+def _hard_swish(x: Value) -> Value:
     return x * jnp.clip(x / 6 + 0.5, 0, 1)
 
 
-def _prelu(node: Node, x: Any, slope: Any) -> Any:
+def _prelu(node: Node, x: Value, slope: Value) -> Value:
     return jnp.where(x > 0, x, slope * x)
 
 
-def _where(node: Node, condition: Any, a: Any, b: Any) -> Any:
+def _where(node: Node, condition: Value, a: Value, b: Value) -> Value:
     return _module(condition, a, b).where(condition, a, b)
 
 

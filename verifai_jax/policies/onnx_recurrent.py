@@ -16,7 +16,7 @@ _USUAL = {"LSTM": ("Sigmoid", "Tanh", "Tanh"), "GRU": ("Sigmoid", "Tanh"), "RNN"
 _FUNCTIONS = {"Sigmoid": jax.nn.sigmoid, "Tanh": jnp.tanh, "Relu": jax.nn.relu}
 
 
-def lstm(node: Any, x: Array, w: Array, r: Array, *others: Any) -> tuple[Array, ...]:
+def lstm(node: Any, x: Array, w: Array, r: Array, *others: Array | None) -> tuple[Array, ...]:
     """Return the outputs `[time, directions, batch, hidden]`, the last output and the last cell."""
     b, _, h, c, peepholes = (*others, *(None,) * 5)[:5]
     if peepholes is not None or node.get("input_forget", 0):
@@ -24,13 +24,13 @@ def lstm(node: Any, x: Array, w: Array, r: Array, *others: Any) -> tuple[Array, 
     return _both_ways(node, _lstm_step, x, w, r, b, (h, c))
 
 
-def gru(node: Any, x: Array, w: Array, r: Array, *others: Any) -> tuple[Array, ...]:
+def gru(node: Any, x: Array, w: Array, r: Array, *others: Array | None) -> tuple[Array, ...]:
     """Return the outputs `[time, directions, batch, hidden]` and the last output."""
     b, _, h = (*others, *(None,) * 3)[:3]
     return _both_ways(node, _gru_step, x, w, r, b, (h,))
 
 
-def rnn(node: Any, x: Array, w: Array, r: Array, *others: Any) -> tuple[Array, ...]:
+def rnn(node: Any, x: Array, w: Array, r: Array, *others: Array | None) -> tuple[Array, ...]:
     """Return the outputs `[time, directions, batch, hidden]` and the last output."""
     b, _, h = (*others, *(None,) * 3)[:3]
     return _both_ways(node, _rnn_step, x, w, r, b, (h,))

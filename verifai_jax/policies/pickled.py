@@ -132,18 +132,18 @@ class _Reader:
         else:
             raise PolicyError(f"the pickled data has an operation {name}, which is not supported")
 
-    def memoize(self, _: Any) -> None:
+    def memoize(self, _: object) -> None:
         self.memo[len(self.memo)] = self.stack[-1]
 
     def global_name(self, argument: str) -> None:
         module, _, name = argument.partition(" ")
         self.stack.append(Name(module, name))
 
-    def stack_global(self, _: Any) -> None:
+    def stack_global(self, _: object) -> None:
         name, module = self.stack.pop(), self.stack.pop()
         self.stack.append(Name(module, name))
 
-    def call(self, _: Any) -> None:
+    def call(self, _: object) -> None:
         arguments, function = self.stack.pop(), self.stack.pop()
         # Old protocols write bytes as a call.
         is_bytes = function == Name("_codecs", "encode")
@@ -151,44 +151,44 @@ class _Reader:
             arguments[0].encode("latin1") if is_bytes else Record(function, arguments)
         )
 
-    def call_with_names(self, _: Any) -> None:
+    def call_with_names(self, _: object) -> None:
         named, arguments, function = self.stack.pop(), self.stack.pop(), self.stack.pop()
         self.stack.append(Record(function, (*arguments, named)))
 
-    def build(self, _: Any) -> None:
+    def build(self, _: object) -> None:
         state = self.stack.pop()
         if isinstance(self.stack[-1], Record):
             self.stack[-1].state = state
 
-    def persistent(self, _: Any) -> None:
+    def persistent(self, _: object) -> None:
         self.stack.append(Persistent(self.stack.pop()))
 
-    def tuple_since(self, _: Any) -> None:
+    def tuple_since(self, _: object) -> None:
         self.stack.append(tuple(self.since_mark()))
 
-    def list_since(self, _: Any) -> None:
+    def list_since(self, _: object) -> None:
         self.stack.append(self.since_mark())
 
-    def dict_since(self, _: Any) -> None:
+    def dict_since(self, _: object) -> None:
         taken = self.since_mark()
         self.stack.append(dict(zip(taken[::2], taken[1::2], strict=True)))
 
-    def append(self, _: Any) -> None:
+    def append(self, _: object) -> None:
         value = self.stack.pop()
         self.extend([value])
 
-    def appends(self, _: Any) -> None:
+    def appends(self, _: object) -> None:
         self.extend(self.since_mark())
 
     def extend(self, values: list[Any]) -> None:
         if isinstance(self.stack[-1], list):
             self.stack[-1].extend(values)
 
-    def set_item(self, _: Any) -> None:
+    def set_item(self, _: object) -> None:
         value, key = self.stack.pop(), self.stack.pop()
         self.set_all([key, value])
 
-    def set_items(self, _: Any) -> None:
+    def set_items(self, _: object) -> None:
         self.set_all(self.since_mark())
 
     def set_all(self, taken: list[Any]) -> None:

@@ -35,7 +35,7 @@ ACTIONS = {
 
 @dataclass(frozen=True)
 class Actions:
-    """How the outputs of a network become an action.
+    """The way from the outputs of a network to an action.
 
     - `kind`: one of `ACTIONS`.
     - `low`, `high`: bounds of each entry of the action; for `clip`, `scale` and `tanh`.

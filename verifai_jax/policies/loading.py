@@ -27,7 +27,7 @@ from verifai_jax.policies.torch_archive import read_state
 from verifai_jax.rl.policy import Policy as OwnPolicy
 from verifai_jax.rl.policy import load_policy
 
-Network = Callable[[dict[str, Array], Any], Any]
+Network = Callable[[dict[str, Array], PyTree], PyTree]
 
 FORMATS = (".zip", ".onnx", ".safetensors", ".pt", ".pth", ".npz")
 
@@ -166,7 +166,7 @@ class _Given:
     def __init__(self, network: Network) -> None:
         self.network = network
 
-    def __call__(self, weights: PyTree, observation: Any, memory: None) -> tuple[Any, None]:
+    def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
         return self.network(weights, observation), None
 
 
