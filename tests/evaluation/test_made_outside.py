@@ -46,7 +46,7 @@ def test_replays_are_planned_before_there_is_a_row(name, precision):
     confirmer = Confirmer(problem, precision)
     confirmer.prepare()
     assert not confirmer.raised
-    assert "float64" in confirmer.check_names
+    assert "float64" in confirmer._checks
     # The form is that of the rows that come later.
     points = np.full((1, problem.space.dim), 0.3, np.float32)
     rows = problem.space.rows(problem.space.features_at(points))
@@ -103,7 +103,7 @@ def test_blocks_made_outside_serve_both_precisions(system, precision):
     problem.check()
     confirmer = Confirmer(problem, precision)
     confirmer.prepare()
-    assert set(confirmer.check_names) >= {"float64", "half_step"}
+    assert set(confirmer._checks) >= {"float64", "half_step"}
     trace = replay(problem, {"v": 0.25, "lag": 0.2}, run_keys(0)[1], 0, precision).trace
     assert trace["x"].dtype == precision
     assert np.all(np.isfinite(trace["x"]))

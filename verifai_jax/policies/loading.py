@@ -17,11 +17,11 @@ from jaxtyping import Array, ArrayLike, PyTree
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import require, suggests_options
 from verifai_jax.core.text import one_line
+from verifai_jax.policies.base import Actions, Normaliser, Policy, bounds, stack_frames
 from verifai_jax.policies.errors import MAX_BYTES, PolicyError
 from verifai_jax.policies.networks import Mlp, activation_name, linear_layers, natural
 from verifai_jax.policies.objects import from_object, read_brax
 from verifai_jax.policies.onnx_graph import read_onnx
-from verifai_jax.policies.policy import Actions, Normaliser, Policy, bounds, stack_frames
 from verifai_jax.policies.sb3 import read_normaliser, read_sb3
 from verifai_jax.policies.torch_archive import read_state
 from verifai_jax.rl.policy import Policy as OwnPolicy

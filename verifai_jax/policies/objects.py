@@ -24,9 +24,9 @@ from jaxtyping import Array, ArrayLike, Key, PyTree
 from verifai_jax.core.errors import require
 from verifai_jax.core.text import format_seconds, one_line
 from verifai_jax.core.user_errors import defined_at
+from verifai_jax.policies.base import Policy
 from verifai_jax.policies.errors import PolicyError
 from verifai_jax.policies.onnx_graph import read_onnx
-from verifai_jax.policies.policy import Policy
 from verifai_jax.policies.sb3 import read_sb3
 
 log = logging.getLogger("verifai_jax.policies")

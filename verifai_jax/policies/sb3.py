@@ -14,10 +14,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from verifai_jax.policies.base import Actions, Normaliser, Policy
 from verifai_jax.policies.errors import PolicyError
 from verifai_jax.policies.networks import Mlp, activation_name, linear_layers, natural
 from verifai_jax.policies.pickled import Name, Record, array_of, read_pickle
-from verifai_jax.policies.policy import Actions, Normaliser, Policy
 from verifai_jax.policies.torch_archive import open_archive, read_member, read_state
 
 Weights = Mapping[str, np.ndarray]
