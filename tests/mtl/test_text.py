@@ -124,9 +124,9 @@ def test_writes(formula, text):
         ("always x > 1 -> b", "write always (x > 1 -> b) or (always x > 1) -> b"),
         (
             "a U b & c",
-            "until and its like beside '&' is ambiguous: put it in parentheses, as in (a U b)",
+            "until and its like next to '&' is ambiguous: put it in parentheses, as in (a U b)",
         ),
-        ("a | b S c", "beside '|' is ambiguous: put it in parentheses, as in (b S c)"),
+        ("a | b S c", "next to '|' is ambiguous: put it in parentheses, as in (b S c)"),
         ("G[3,1] a", "an interval ends no earlier than it starts: write [1, 3]"),
         ("G[-1,2] a", "an interval starts at 0 or later"),
         ("G[inf,inf] a", "an interval starts at a finite time"),
@@ -151,7 +151,10 @@ def test_writes(formula, text):
         ("always (1 + 2)", "a formula is needed here, not the number 1 + 2"),
         ("2 < 0.5", "2 < 0.5 compares numbers and no signal"),
         ("a & 2 < 0.5", "compare a signal, as in x < 0.5, or write TRUE or FALSE"),
-        ("always (x^2 < 0.5)", "beside arithmetic: a power is written x**2, and exclusive or (one"),
+        (
+            "always (x^2 < 0.5)",
+            "next to arithmetic: a power is written x**2, and exclusive or (one",
+        ),
         ("x^2 + y^2 < 1", "a power is written x**2"),
         ("a -> x > y^2", "a power is written y**2"),
         ("abs(x)^y < 1", "a power is written abs(x)**y"),

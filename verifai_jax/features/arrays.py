@@ -138,7 +138,7 @@ class Array(Domain):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Items:
-    """The value of an array of variable length: all places, of which the first `length` are valid.
+    """The value of an array of variable length: entries, of which the first `length` are valid.
 
     - `values`: stacked along a leading axis as in an `Array` of the greatest length, so that every
       simulation has the same shapes. Entries after the length hold the middle of the item's domain.
@@ -152,7 +152,7 @@ class Items:
 
     @property
     def mask(self) -> Bool[jax.Array, "*n entries"]:
-        """True at the places that hold an item."""
+        """True for the entries that hold an item."""
         count = jax.tree.leaves(self.values)[0].shape[jnp.ndim(self.length)]
         return jnp.arange(count) < jnp.asarray(self.length)[..., None]
 

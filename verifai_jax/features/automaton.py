@@ -309,8 +309,8 @@ class Automaton(Domain):
         _, (taken, nodes) = jax.lax.scan(step, jnp.int32(0), (slots[:, 0], indices))
         return taken, nodes, slots
 
-    def _follow(self, kinds: Int[jax.Array, " places"]) -> tuple[jax.Array, jax.Array]:
-        """Return the transition at each place and the node before it, from the kinds of events."""
+    def _follow(self, kinds: Int[jax.Array, " events"]) -> tuple[jax.Array, jax.Array]:
+        """Return the transition of each event and the node before it, from the kinds of events."""
         lookup = jnp.asarray(self._tables.by_kind)
         following = jnp.asarray(self.graph.following)
 

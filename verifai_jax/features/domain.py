@@ -267,7 +267,7 @@ class Domain(ForUsers, abc.ABC):
 
     @property
     def tuning(self) -> "Tuning | None":
-        """The domain as tools have it that tune hyper-parameters; None where they have none."""
+        """The domain as tools that tune hyper-parameters have it; None for one that they lack."""
         return None
 
     @property

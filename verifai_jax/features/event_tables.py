@@ -107,8 +107,8 @@ class EventTables:
             table[one, other] = count + i
         return table
 
-    def followed(self, kinds: Int[np.ndarray, "n places"]) -> Int[np.ndarray, "n places"]:
-        """Return the transition at each place, from the kinds of many sequences."""
+    def followed(self, kinds: Int[np.ndarray, "n events"]) -> Int[np.ndarray, "n events"]:
+        """Return the transition of each event, from the kinds of many sequences."""
         taken, node = np.full(kinds.shape, ABSENT), np.zeros(len(kinds), int)
         for i in range(kinds.shape[1]):
             there = kinds[:, i] >= 0

@@ -84,7 +84,7 @@ class Signal(Domain):
         fewest, knots = 1 if self.hold in HELD else 2, self.knots
         times = None if self.times is None else check_times(self.times)
         if times is not None:
-            # The default cannot be told from a 16 that was given.
+            # The default cannot be distinguished from a 16 that was given.
             if knots not in (DEFAULT_KNOTS, len(times)):
                 raise ValueError(
                     f"a Signal has one knot at each of its times; got {knots!r} knots and "

@@ -357,12 +357,12 @@ class FeatureSpace(ForUsers):
 
     @cached_property
     def without_items(self) -> Callable[[Numbers, Numbers], Float[Array, "n dim"]]:
-        """Take items away from points `[n, dim]`, which say the places `[n, items]`; compiled."""
+        """Take those items away from points `[n, dim]` that `[n, items]` marks; compiled."""
         return jax.jit(jax.vmap(self.root.without))
 
     @cached_property
     def settle(self) -> Callable[[Numbers], Float[Array, "n dim"]]:
-        """Move coordinates of points `[n, dim]` that mean nothing to one place; compiled."""
+        """Move coordinates of points `[n, dim]` that mean nothing to one value; compiled."""
         return jax.jit(jax.vmap(self.root.settled))
 
     @cached_property

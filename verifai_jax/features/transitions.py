@@ -249,7 +249,7 @@ def _tables(
         node, number = (int(i) for i in np.argwhere(enabled & (shares < MIN_SHARE))[0])
         raise ValueError(
             f"the weight of {transitions[number].label}, {transitions[number].weight:zg}, is too "
-            f"small beside the others of its state: its probability must be at least "
+            f"small next to the others of its state: its probability must be at least "
             f"{MIN_SHARE:z.1g}; leave out what never happens"
         )
     last = np.where(

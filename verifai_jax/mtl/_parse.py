@@ -267,7 +267,7 @@ class _Builder:
                 word = next(c for c in words if c)
                 offer = self._offered(", as in ", f"({self._source(part)})")
                 raise self._fail(
-                    f"until and its like beside {str(word)!r} is ambiguous: put it in "
+                    f"until and its like next to {str(word)!r} is ambiguous: put it in "
                     f"parentheses{offer}",
                     part.start,
                     part.end,
@@ -290,7 +290,7 @@ class _Builder:
             exponent = _text(self.text, _edge(tree.children[2 * k + 2], 0))
             power = self._offered("", f"{base}**{exponent}", within='"s" < {}') or "x**2"
             raise self._fail(
-                f"'^' is exclusive or, and here it stands beside arithmetic: a power is written "
+                f"'^' is exclusive or, and here it stands next to arithmetic: a power is written "
                 f"{power}, and exclusive or (one formula) xor (the other)",
                 word.start_pos,
                 word.start_pos + 1,

@@ -7,9 +7,8 @@
 
 A formula is a frozen tree, hashable and equal by value, so it is a static argument under `jax.jit`.
 Sugar (implication, equivalence, weak until, release) is rewritten into the few nodes below when it
-is written, and restored when it is printed. What is said of an operator stands in the table
-`OPERATORS` of `words`; its meaning is that of the kind of node that it is: a `Join` of operands, a
-`Window` over time, a `Witness` with what holds up to it, or `Derived` from other operators.
+is written, and restored when it is printed. The table `OPERATORS` of `words` describes an operator;
+its kind of node gives its meaning: `Join`, `Window`, `Witness`, or `Derived` from other operators.
 """
 
 import abc
@@ -88,14 +87,8 @@ class Formula(Tree):
 
     def signals(self) -> tuple[str, ...]:
         """Return the names of the signals that it speaks of, in order of appearance."""
-        return tuple(
-            dict.fromkeys(
-                name
-                for part in self.subformulas()
-                for term in part.terms()
-                for name in term.signals()
-            )
-        )
+        terms = (term for part in self.subformulas() for term in part.terms())
+        return tuple(dict.fromkeys(name for term in terms for name in term.signals()))
 
     def terms(self) -> tuple[Term, ...]:
         """Return the expressions that a leaf compares; none for an operator."""
@@ -126,9 +119,7 @@ class Formula(Tree):
     def subformulas(self, valued: bool = False) -> Iterator["Formula"]:
         """Yield itself and everything below, parents first, left to right, each part once.
 
-        **Arguments:**
-
-        - `valued`: whether the meaning of a `Derived` operator stands for its operands.
+        With `valued`, a `Derived` operator has its meaning below it instead of its operands.
         """
         seen: set[int] = set()
         stack: list[Formula] = [self]
@@ -165,10 +156,7 @@ class Formula(Tree):
 class Leaf(Formula):
     """A formula without operands."""
 
-    @property
-    def side(self) -> str:
-        """Nothing: a leaf looks at the instant alone."""
-        return ""
+    timeless = True
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -352,15 +340,12 @@ class Derived(Formula, abc.ABC):
     A subclass has its operands and its interval as fields, and defines `meaning`.
     """
 
+    timeless = True  # Its meaning is what looks ahead or back.
+
     @property
     @abc.abstractmethod
     def meaning(self) -> Formula:
         """The formula of other operators that it stands for."""
-
-    @property
-    def side(self) -> str:
-        """Nothing: its meaning is what looks ahead or back."""
-        return ""
 
     def below(self) -> tuple[Node, ...]:
         """Return the nodes among its fields, and its meaning."""
@@ -397,8 +382,7 @@ def build(word: str, operands: Iterable[Formula], interval: Interval = EVERYTHIN
     - `operands`: as many as the operator takes.
     - `interval`: for an operator that takes one.
     """
-    spans = (interval,) if OPERATORS[word].timed else ()
-    return NODES[word](*operands, *spans)
+    return NODES[word](*operands, *((interval,) if OPERATORS[word].timed else ()))
 
 
 def surface(f: Formula) -> tuple[str, tuple[Formula, ...], Interval | None]:
@@ -443,19 +427,19 @@ def formula(value: Formulaic) -> Formula:
 
 def conjunction(*parts: Formulaic) -> Formula:
     """Return `f & g & ...`; one part alone is itself."""
-    return _joined(And, "and", parts)
+    return _joined(And, parts)
 
 
 def disjunction(*parts: Formulaic) -> Formula:
     """Return `f | g | ...`; one part alone is itself."""
-    return _joined(Or, "or", parts)
+    return _joined(Or, parts)
 
 
-def _joined(kind: type[And] | type[Or], word: str, parts: tuple[Formulaic, ...]) -> Formula:
+def _joined(kind: type[And] | type[Or], parts: tuple[Formulaic, ...]) -> Formula:
     first, *rest = map(formula, parts)
     if not rest:
         return first
     # `a & b & c` is one node, but an implication within `|` must stay readable as one.
-    if isinstance(first, And | Or) and isinstance(first, kind) and surface(first)[0] == word:
+    if isinstance(first, kind) and surface(first)[0] == kind.word:
         return kind((*first.parts, *rest))
     return kind((first, *rest))

@@ -39,7 +39,7 @@ class Node(ForUsers):
     _internal = frozenset((
         "below", "children", "compared", "depth", "first_look_ahead", "interval", "is_predicate",
         "is_signal", "meaning", "number", "operands", "operator", "side", "span", "temporal_depth",
-        "terms", "text", "valued", "word",
+        "terms", "text", "timeless", "valued", "word",
     ))  # fmt: skip
 
     def below(self) -> tuple["Node", ...]:

@@ -134,7 +134,7 @@ def rebuild(f: Formula, operands: tuple[Formula, ...]) -> Formula:
 
 
 def expand(f: Formula) -> Formula:
-    """Return a formula with the meaning of each operator that is made of others in its place."""
+    """Return a formula without `Derived` operators: each is replaced by its meaning."""
     known: dict[Formula, Formula] = {}
     for part in postorder(f):
         if isinstance(part, Formula):

@@ -72,6 +72,9 @@ class Tree(Node):
     word: ClassVar[str] = ""
     """Its operator, a key of `OPERATORS`; none for a leaf."""
 
+    timeless: ClassVar[bool] = False
+    """True for a kind of node that itself looks at the instant alone."""
+
     interval: Interval
     """The interval of an operator that takes one."""
 
@@ -152,7 +155,7 @@ class Tree(Node):
     @property
     def side(self) -> str:
         """Where its own operator looks: `"ahead"`, `"back"`, or nowhere."""
-        return self.operator.side
+        return "" if self.timeless else self.operator.side
 
     def span(self, dt: float) -> tuple[float, float]:
         """Return the first and the last second from an instant on at which its operator looks.
