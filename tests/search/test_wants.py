@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -125,8 +126,6 @@ def test_parts_of_a_space_get_what_each_wants():
     search = Split({"x": Noting()}, Portfolio())
     assert search.wants == Wants(clauses=True, clause_gradients=True, marks=True)
     plain = Split({"x": Noting()}, CrossEntropy())
-    import jax
-
     state = plain.init(jax.random.key(0), cube, 4)
     marks = jnp.arange(8).reshape(4, 2)
     told = Observations(jnp.full((4, 2), 0.25), jnp.ones(4), jnp.ones(4, bool), marks=marks)
@@ -154,6 +153,16 @@ def test_what_takes_the_place_of_a_search():
 def test_a_wrapper_of_given_points_is_one_of_given_points():
     assert Rounded(PointList([[0.5, 0.5]])).origin == "given"
     assert Rounded(Grid(3)).sequence[0] == "grid"
+
+
+def test_a_wrapper_that_moves_points_has_none_of_the_prior():
+    @dataclass(frozen=True)
+    class Moved(Rounded):
+        samples_prior: ClassVar[bool] = False
+
+    assert Rounded(Uniform()).origin == "prior"
+    assert Moved(Uniform()).origin == "sequence"
+    assert Diverse(Moved(Uniform())).origin == "sequence"
 
 
 def test_a_wrapper_needs_a_search():

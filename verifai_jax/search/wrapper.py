@@ -27,6 +27,7 @@ Learn: TypeAlias = Callable[[PyTree, Cube, Observations], PyTree]
 class Wrapper(Search[State]):
     """A search around another one; a subclass is a frozen dataclass with a field `search`.
 
+    One that moves the points of a search that samples the prior defines `samples_prior` as False.
     A subclass whose state holds more than that of the search inside defines `inner_state` and
     `with_inner_state`, and one that changes what the search inside learns defines `learn`.
 
@@ -69,7 +70,9 @@ class Wrapper(Search[State]):
 
     @property
     def origin(self) -> Origin:
-        return self.search.origin
+        # A wrapper that moves the points of the prior has none of these.
+        inner = self.search.origin
+        return super().origin if inner == "prior" else inner
 
     @property
     def sequence(self) -> tuple[str, str]:
