@@ -30,7 +30,7 @@ other = replace(safe, name="other")
 def call(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(Path(__file__).parents[1] / "sweeps")
-    monkeypatch.setattr(driver, "certify_policies", quick_certificates)
+    monkeypatch.setattr(driver, "certify", quick_certificates)
     (tmp_path / "specs").mkdir()
     (tmp_path / "specs" / "drift.py").write_text(STUDY)
 
@@ -74,7 +74,7 @@ def test_resume_goes_on_with_what_was_asked_for(call, tmp_path, monkeypatch):
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(Path(__file__).parents[1] / "sweeps")
-    monkeypatch.setattr(driver, "certify_policies", quick_certificates)
+    monkeypatch.setattr(driver, "certify", quick_certificates)
     again = call(*words[2:], "--no-pictures")
 
     def rows(output):
