@@ -13,7 +13,7 @@ from checked_types import unchecked
 
 import verifai_jax as vj
 from verifai_jax.core.errors import MissingExtra, require
-from verifai_jax.core.user_errors import format_user_error, user_line
+from verifai_jax.core.user_errors import explain_user_error, format_user_error, user_line
 
 SPACE = vj.FeatureSpace(
     {
@@ -269,3 +269,16 @@ def test_a_package_that_is_there_and_cannot_be_imported_says_why(tmp_path, monke
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(MissingExtra, match=r"lacks_a_library is installed and .*: libxcb.so.1"):
         require("lacks_a_library", "scenic")
+
+
+def test_what_a_callback_raised_is_told_in_its_own_words():
+    # Raised for real, it would be told once more by JAX as the process ends.
+    text = (
+        "INTERNAL: CpuCallback error calling callback: Traceback (most recent call last):\n"
+        '  File "jax/_src/callback.py", line 71, in __call__\n'
+        '  File "sim.py", line 12, in road\n'
+        "ValueError: no road here"
+    )
+    error = jax.errors.JaxRuntimeError(text)
+    assert explain_user_error(error) == "ValueError: no road here (sim.py, line 12)"
+    assert "INTERNAL" in explain_user_error(jax.errors.JaxRuntimeError("INTERNAL: out of memory"))

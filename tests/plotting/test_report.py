@@ -114,6 +114,8 @@ def test_names_are_wrapped_and_numbers_on_logarithmic_axes_are_few():
         "initial_lateral_\noffset_of_the_\nvehicle"
     )
     assert wrap_name("x") == "x"
+    # A value stays with its name, and digits with theirs, where there is a blank to break at.
+    assert wrap_name("delay=0.3861, notice=0, b=0.25", 20) == "delay=0.3861,\nnotice=0, b=0.25"
     figure = new_figure(figsize=(4, 3))
     axes = figure.subplots()
     axes.set_xscale("log")
@@ -272,3 +274,12 @@ def test_figures_show_themselves_in_a_notebook():
     assert run.plot()._repr_png_().startswith(b"\x89PNG")
     with pytest.raises(ValueError, match="unknown feature 'colr'; did you mean 'color'"):
         plot_features(run, features=["a", "colr"])
+
+
+def test_an_axis_of_less_than_a_decade_has_several_numbers():
+    axes = new_figure().add_subplot()
+    axes.set_xscale("log")
+    axes.set_xlim(0.0947, 0.101)
+    log_ticks(axes.xaxis)
+    ticks = axes.xaxis.get_major_locator().tick_values(0.0947, 0.101)
+    assert sum(0.0947 <= tick <= 0.101 for tick in ticks) >= 3

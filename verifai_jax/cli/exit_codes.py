@@ -106,6 +106,8 @@ def _told(error: BaseException) -> tuple[str, int]:
         return str(error), BROKEN
     if isinstance(error, MemoryError):
         return "the machine has not enough memory; a smaller --batch needs less", BROKEN
-    from verifai_jax.core.user_errors import explain_user_error, user_line
+    from verifai_jax.core.user_errors import explain_user_error, raised_in_callback, user_line
 
+    if (raised := raised_in_callback(error)) is not None:
+        return raised, BROKEN
     return ("" if user_line(error) is None else explain_user_error(error)), BROKEN

@@ -34,6 +34,8 @@ MOST_MESSAGE = 300
 """Characters of what a library or a simulator says."""
 MOST_READ = 4 * MOST_MESSAGE
 """Characters of a message that are read at all: one of megabytes costs no time."""
+MOST_TRACEBACK = 100_000
+"""The same of a message that ends with what was raised, behind its traceback."""
 MOST_NAMES = 12
 """Names that a message lists."""
 
@@ -317,8 +319,27 @@ def _same_names(one: Mapping[Any, Any], other: object) -> bool:
     return isinstance(other, Mapping) and one.keys() == other.keys()
 
 
+def raised_in_callback(error: BaseException) -> str | None:
+    """Return what a function raised that JAX calls on the host, and its line; None elsewhere.
+
+    JAX has the whole traceback as the text of an error of its own.
+    """
+    if type(error).__name__ not in ("JaxRuntimeError", "XlaRuntimeError"):
+        return None
+    text = storable(error, MOST_TRACEBACK)
+    head, _, traceback = text.partition("Traceback (most recent call last):")
+    lines = traceback.strip().splitlines()
+    if "allback" not in head or not lines:
+        return None
+    places = re.findall(r'File "([^"]+)", line (\d+)', traceback)
+    where = f" ({_shown_file(places[-1][0])}, line {places[-1][1]})" if places else ""
+    return f"{storable(lines[-1].strip(), MOST_MESSAGE)}{where}"
+
+
 def _said(error: BaseException) -> str:
     """Return the type of an error and what it says, in one line of bounded length."""
+    if (raised := raised_in_callback(error)) is not None:
+        return raised
     # JAX appends advice about its own tracebacks.
     said = storable(error, MOST_READ)
     words = " ".join(said.partition("\n------")[0].split())

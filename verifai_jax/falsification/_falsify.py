@@ -647,6 +647,8 @@ def _failure_message(name: str, simulations: int, place: Path | None, cause: Exc
     message = f"the run of {name!r} broke down after {simulations} simulations: {why}. "
     if place is None:
         return f"{message}They are in the .run of this error"
+    if isinstance(cause, OSError) and not place.is_dir():
+        return f"{message}{place} is there no more: all are in the .run of this error, to be saved"
     if isinstance(cause, OSError):
         return (
             f"{message}All of them are in the .run of this error, and in {place} those up to the "

@@ -59,12 +59,16 @@ def wrap_name(name: str, width: int = 20, lines: int = 2) -> str:
 
 
 def log_ticks(axis: Axis) -> None:
-    """Name a few numbers on a logarithmic axis: powers of ten, 2 and 5 too where these are few."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+    """Name a few numbers on a logarithmic axis: powers of ten, round ones where these are few."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
     low, high = axis.get_view_interval()
     narrow = high / low < 100
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if narrow else (1.0,), numticks=6))
+    locator: Any = LogLocator(subs=(1.0, 2.0, 5.0) if narrow else (1.0,), numticks=6)
+    if high / low < 5:  # Powers of ten, twice and five times these, are one at most.
+        locator = MaxNLocator(4)
+        axis.set_minor_locator(NullLocator())
+    axis.set_major_locator(locator)
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:zg}"))
     axis.set_minor_formatter(NullFormatter())
 
@@ -127,9 +131,15 @@ def _overlap(one: Sequence[float], other: Sequence[float]) -> bool:
 
 
 def _broken(line: str, width: int) -> list[str]:
-    """Break a line behind blanks and signs so that each part has at most so many characters."""
-    lines = [""]
-    for part in re.findall(r"[^\s_.,;=]*[\s_.,;=]|[^\s_.,;=]+", line):
+    """Break a line behind blanks so that each part has at most so many characters.
+
+    What is longer without a blank is broken behind signs.
+    """
+    lines, parts = [""], list[str]()
+    for word in re.findall(r"\S*\s|\S+", line):
+        signs = len(word.rstrip()) > width
+        parts += re.findall(r"[^\s_.,;=]*[\s_.,;=]|[^\s_.,;=]+", word) if signs else [word]
+    for part in parts:
         fits = not lines[-1] or len((lines[-1] + part).rstrip()) <= width
         lines = [*lines[:-1], lines[-1] + part] if fits else [*lines, part]
     return [each.rstrip() for each in lines]
