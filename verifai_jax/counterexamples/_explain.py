@@ -25,7 +25,7 @@ from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.counterexamples.candidates import Candidates
 from verifai_jax.counterexamples.description import describe
-from verifai_jax.counterexamples.fixed_key import fix_key
+from verifai_jax.counterexamples.fixed_key import fix_key, note_on_key
 from verifai_jax.counterexamples.influence import Influence, spans_of
 from verifai_jax.counterexamples.nominal import Nominal
 from verifai_jax.counterexamples.selection import Row, problem_of, select_row
@@ -121,6 +121,7 @@ def explain(
     if not replayed.violated:
         notes.append("simulated again alone the row does not fail; see what confirm says of it")
     why = replayed.explain()
+    notes += note_on_key(problem, number)
     fixed = fix_key(problem, run, number)
     features = problem.space.from_row(entry)
     u = at.settle(np.asarray(problem.space.point_of(features))[None])[0]

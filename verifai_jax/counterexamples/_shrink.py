@@ -26,7 +26,7 @@ from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.core.text import format_seconds
 from verifai_jax.counterexamples.candidates import Candidates
-from verifai_jax.counterexamples.fixed_key import fix_key
+from verifai_jax.counterexamples.fixed_key import fix_key, note_on_key
 from verifai_jax.counterexamples.minimize_count import grow, minimize_count, revert_features
 from verifai_jax.counterexamples.minimize_distance import minimize_distance
 from verifai_jax.counterexamples.nominal import Nominal
@@ -40,6 +40,7 @@ from verifai_jax.counterexamples.selection import (
 )
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.run import Run
+from verifai_jax.features.continuous import Continuous
 from verifai_jax.problem.problem import Problem
 
 ORDERS = ("count", "distance")
@@ -120,6 +121,10 @@ class Shrunk(Drawn, InNotebook):
     def __str__(self) -> str:
         d = len(self.u)
         name = self.problem.name
+        domains = self.problem.space.domains.values()
+        # A distribution has no width: what counts is the probability between two values.
+        unbounded = any(isinstance(domain, Continuous) for domain in domains)
+        unit = "prior, in probability" if unbounded else "range"
         if not self.count:
             lines = [
                 f"{name}: the nominal features fail themselves, with robustness {self.rho:z.4g}; "
@@ -129,7 +134,7 @@ class Shrunk(Drawn, InNotebook):
             lines = [
                 f"{name}: {_of(self.count, d)} away from nominal "
                 f"{'is' if self.count == 1 else 'are'} enough for a failure, by "
-                f"{self.distance:z.3g} of {'its' if self.count == 1 else 'their'} range "
+                f"{self.distance:z.3g} of {'its' if self.count == 1 else 'their'} {unit} "
                 f"(robustness {self.rho:z.3g})"
             ]
             names = self.labels
@@ -214,6 +219,7 @@ def shrink(
     check_count("budget", budget)
     number, first = select_row(run, row)
     at = Nominal.of(problem, nominal)
+    about_key = note_on_key(problem, number)
     problem = fix_key(problem, run, number)
     key = run_keys(run.seed)[1]
     original = run.compared(replay(problem, first, key, number, run.precision))
@@ -243,7 +249,7 @@ def shrink(
     verified = _verified(problem, search, key, number, run.precision)
     u = start[0] if verified is None else verified[0]
     replayed = original if verified is None else verified[1]
-    notes += candidates.notes
+    notes += [*candidates.notes, *about_key]
     return Shrunk(
         problem=problem,
         row=number,

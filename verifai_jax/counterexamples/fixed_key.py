@@ -14,6 +14,7 @@ from jaxtyping import Array, Int, Key
 from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.trace import Trace
 from verifai_jax.falsification.run import Run
+from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import Carry, Features, Outcome, Seed, System
 
@@ -80,6 +81,16 @@ def key_of(run: Run, row: int | None) -> Key[Array, ""]:
 def hold_key(problem: Problem, key: Key[Array, ""]) -> Problem:
     """Return the problem with every simulation on one random key."""
     return replace(problem, system=FixedKey(problem.system, key))
+
+
+def note_on_key(problem: Problem, row: int) -> list[str]:
+    """Return what there is to say of the random key that a study of a row holds."""
+    if not depends_on_key(problem):
+        return []
+    return [
+        f"the system draws random numbers: all simulations had the random key of row {row}, and "
+        "with another one the same features may keep the property"
+    ]
 
 
 def fix_key(problem: Problem, run: Run, row: int | None) -> Problem:

@@ -292,12 +292,12 @@ def _with_chance(answer: Answer, again: float, own_chance: str) -> Answer:
         answer.diagnostics["failing_again"] = again
     if again < SURE:
         what = "the system draws random numbers, and they decide"
-        keys = "with other random keys"
+        keys = " with other random keys"
         if own_chance:
-            what, keys = "what the system has of its own decides", "when simulated again"
+            what, keys = "what the system has of its own decides", ""
         answer.notes.append(
             f"{what} with the features whether a simulation fails: of the failures found "
-            f"{format_percent(again)} fail again {keys}. The probability is over both"
+            f"{format_percent(again)} fail again{keys}. The probability is over both"
         )
     return answer
 

@@ -150,6 +150,7 @@ def modes(
             limit_state.ended = "interrupted"
             answer = bound_from_pilot(limit_state, plan)
         limit_state.budget = int(budget)
+        limit_state.draws = draws  # Chance that is not of the key is under no key that is held.
         held = _under_keys(simulated, limit_state)
         divided = _divide(limit_state, held, rng, answer, _failures_of(source))
     bound = answer.prior.upper_bound(confidence)
@@ -406,6 +407,8 @@ def _cause(numbers: _Numbers, features: dict[str, Any], key: Any, number: int) -
     """Return the robustness at features, and the formula and predicate that decide, in words."""
     replayed = replay(numbers.problem, features, key, number, numbers.precision)
     rho = min(replayed.rho.values())
+    if not replayed.violated and replayed.rho:
+        return rho, f"simulated again it keeps the property, with robustness {rho:z.4g}"
     try:
         why = replayed.explain()
     except ValueError:
