@@ -117,6 +117,10 @@ class Evaluator:
         u: Float[Any, "n d"],
         temperature: Float[np.ndarray, " n"] | float = 1.0,
         first: int | None = None,
+        *,
+        padded_to: int = 1,
+        keep_traces: bool | None = None,
+        journals: bool = True,
     ) -> Verdicts:
         """Simulate and evaluate these points.
 
@@ -125,6 +129,7 @@ class Evaluator:
         - `u`: points of the unit cube, or rows of given features.
         - `temperature`: of the smooth robustness that is differentiated, one for all or one each.
         - `first`: number of the first simulation; numbers go on from those before when left out.
+        - `padded_to`, `keep_traces`, `journals`: as of `HostEngine.evaluate`, for a black box.
 
         **Raises:** `AlwaysRaises` where it was asked for.
         """
@@ -139,12 +144,23 @@ class Evaluator:
             return verdicts
         begin = 0
         while begin < count:
-            block = slice(begin, begin + self._size(min(self.batch, count - begin)))
+            size = min(self.batch, count - begin)
+            if self._looks_often:
+                # Their features are those of the whole batch, bit for bit.
+                size, padded_to = min(size, ALIKE), 1 << (size - 1).bit_length()
+            block = slice(begin, begin + size)
             some = temperature[block] if isinstance(temperature, np.ndarray) else temperature
             points = u if block.stop - block.start >= count else u[block]
             if points.dtype != self._dtype:
                 points = np.asarray(points, self._dtype)
-            parts.append(self.engine.evaluate(points, self.key, start + begin, some))
+            if isinstance(self.engine, HostEngine):
+                verdicts = self.engine.evaluate(
+                    points, self.key, start + begin, some,
+                    padded_to=padded_to, keep_traces=keep_traces, journals=journals,
+                )  # fmt: skip
+            else:
+                verdicts = self.engine.evaluate(points, self.key, start + begin, some)
+            parts.append(verdicts)
             count_done(len(points))
             self._check_raising(parts[-1])
             begin = block.stop
@@ -162,23 +178,18 @@ class Evaluator:
             raise TypeError("points are sent to workers only by an evaluator with an executor")
         return self.engine.submit(self._with_values(u), self.key, first)
 
-    def _size(self, most: int) -> int:
-        """Return how many points are simulated before one looks whether all raise."""
+    @property
+    def _looks_often(self) -> bool:
+        """Whether few rows are simulated at a time, since all may raise."""
         if self._raising is None or not self._raising.always:
-            return most
+            return False
         engine = self.engine
-        if not isinstance(engine, HostEngine) or engine.system.can_simulate_batch:
-            return most
-        # Their features are those of the whole batch, bit for bit.
-        engine.least = 1 << (most - 1).bit_length()
-        return min(most, ALIKE)
+        return isinstance(engine, HostEngine) and not engine.system.can_simulate_batch
 
     def _check_raising(self, verdicts: Verdicts) -> None:
         if self._raising is not None:
             self._raising.add(verdicts.status, verdicts.messages)
             self._raising.check(self.problem.name)
-            if isinstance(self.engine, HostEngine):
-                self.engine.least = 1
 
     def _with_values(self, u: Float[Any, "n d"]) -> Float[Any, "n row"]:
         """Return points as rows without given numbers, where the engine takes such rows."""
