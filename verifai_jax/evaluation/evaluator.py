@@ -87,9 +87,6 @@ class Evaluator:
             self.engine = engine_for(
                 problem, batch, gradient, precision, clauses, steering, self.given
             )
-        if ends_raising and isinstance(self.engine, HostEngine):
-            # Features of few points are those of a whole batch, bit for bit.
-            self.engine.least = power_of_two(batch)
         self.key: Key[Array, ""] = run_keys(seed)[1]
         self.simulations = 0
 
@@ -121,6 +118,10 @@ class Evaluator:
         u: Float[Any, "n d"],
         temperature: Float[np.ndarray, " n"] | float = 1.0,
         first: int | None = None,
+        *,
+        padded_to: int = 1,
+        keep_traces: bool | None = None,
+        journals: bool = True,
     ) -> Verdicts:
         """Simulate and evaluate these points.
 
@@ -129,6 +130,7 @@ class Evaluator:
         - `u`: points of the unit cube, or rows of given features.
         - `temperature`: of the smooth robustness that is differentiated, one for all or one each.
         - `first`: number of the first simulation; numbers go on from those before when left out.
+        - `padded_to`, `keep_traces`, `journals`: as of `HostEngine.evaluate`, for a black box.
 
         **Raises:** `AlwaysRaises` where it was asked for.
         """
@@ -141,6 +143,9 @@ class Evaluator:
             count_done(count)
             self._check_raising(verdicts)
             return verdicts
+        if self._raising is not None:
+            # Features of few points are those of a whole batch, bit for bit.
+            padded_to = max(padded_to, power_of_two(self.batch))
         begin = 0
         while begin < count:
             block = slice(begin, begin + self._size(min(self.batch, count - begin)))
@@ -148,7 +153,14 @@ class Evaluator:
             points = u if block.stop - block.start >= count else u[block]
             if points.dtype != self._dtype:
                 points = np.asarray(points, self._dtype)
-            parts.append(self.engine.evaluate(points, self.key, start + begin, some))
+            if isinstance(self.engine, HostEngine):
+                verdicts = self.engine.evaluate(
+                    points, self.key, start + begin, some,
+                    padded_to=padded_to, keep_traces=keep_traces, journals=journals,
+                )  # fmt: skip
+            else:
+                verdicts = self.engine.evaluate(points, self.key, start + begin, some)
+            parts.append(verdicts)
             count_done(len(points))
             self._check_raising(parts[-1])
             begin = block.stop

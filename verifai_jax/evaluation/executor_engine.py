@@ -100,9 +100,10 @@ class ExecutorEngine:
         form = problem.space.feature_form
         self._features: Any = jax.tree.structure(form)
         _, lanes = chunks_and_lanes(problem, batch, len(jax.local_devices()))
-        least = power_of_two(batch)
         backend = problem.system.backend if problem.system.backends else None
-        self.mode = BlockMode(lanes, gradient, clauses, precision, least, backend, steering, given)
+        self.mode = BlockMode(
+            lanes, gradient, clauses, precision, power_of_two(batch), backend, steering, given
+        )
         self._dtype = np.dtype(precision if given else "float32")
         self.unit = lanes
         if problem.black_box:
@@ -216,11 +217,10 @@ class ExecutorEngine:
                 self.problem,
                 self.precision,
                 self._journal,
-                least=self.mode.least,
                 steering=self.mode.steering,
                 given=self.mode.given,
             )
-        return self._recalling.evaluate(u, key, first)
+        return self._recalling.evaluate(u, key, first, padded_to=self.mode.padded_to)
 
     def receive(self, result: dict[str, Any], u: Float[np.ndarray, "n d"], first: int) -> Verdicts:
         """Return the verdicts of one block, and remember what it tells of its worker."""
