@@ -87,9 +87,8 @@ class Evaluator:
             self.engine = engine_for(
                 problem, batch, gradient, precision, clauses, steering, self.given
             )
-        if ends_raising and isinstance(self.engine, HostEngine):
-            # Features of few points are those of a whole batch, bit for bit.
-            self.engine.least = power_of_two(batch)
+        # Features of few points are those of a whole batch, bit for bit.
+        self._padded_to = power_of_two(batch) if ends_raising else 1
         self.key: Key[Array, ""] = run_keys(seed)[1]
         self.simulations = 0
 
@@ -121,6 +120,10 @@ class Evaluator:
         u: Float[Any, "n d"],
         temperature: Float[np.ndarray, " n"] | float = 1.0,
         first: int | None = None,
+        *,
+        padded_to: int = 1,
+        keep_traces: bool | None = None,
+        journals: bool = True,
     ) -> Verdicts:
         """Simulate and evaluate these points.
 
@@ -129,6 +132,7 @@ class Evaluator:
         - `u`: points of the unit cube, or rows of given features.
         - `temperature`: of the smooth robustness that is differentiated, one for all or one each.
         - `first`: number of the first simulation; numbers go on from those before when left out.
+        - `padded_to`, `keep_traces`, `journals`: as of `HostEngine.evaluate`, for a black box.
 
         **Raises:** `AlwaysRaises` where it was asked for.
         """
@@ -143,12 +147,22 @@ class Evaluator:
             return verdicts
         begin = 0
         while begin < count:
-            block = slice(begin, begin + self._size(min(self.batch, count - begin)))
+            size = min(self.batch, count - begin)
+            if self._looks_often:
+                size = min(size, ALIKE)
+            block = slice(begin, begin + size)
             some = temperature[block] if isinstance(temperature, np.ndarray) else temperature
             points = u if block.stop - block.start >= count else u[block]
             if points.dtype != self._dtype:
                 points = np.asarray(points, self._dtype)
-            parts.append(self.engine.evaluate(points, self.key, start + begin, some))
+            if isinstance(self.engine, HostEngine):
+                verdicts = self.engine.evaluate(
+                    points, self.key, start + begin, some,
+                    padded_to=max(padded_to, self._padded_to), keep_traces=keep_traces, journals=journals,
+                )  # fmt: skip
+            else:
+                verdicts = self.engine.evaluate(points, self.key, start + begin, some)
+            parts.append(verdicts)
             count_done(len(points))
             self._check_raising(parts[-1])
             begin = block.stop
@@ -166,14 +180,13 @@ class Evaluator:
             raise TypeError("points are sent to workers only by an evaluator with an executor")
         return self.engine.submit(self._with_values(u), self.key, first)
 
-    def _size(self, most: int) -> int:
-        """Return how many points are simulated before one looks whether all raise."""
+    @property
+    def _looks_often(self) -> bool:
+        """Whether few rows are simulated at a time, since all may raise."""
         if self._raising is None or not self._raising.always:
-            return most
+            return False
         engine = self.engine
-        if not isinstance(engine, HostEngine) or engine.system.can_simulate_batch:
-            return most
-        return min(most, ALIKE)
+        return isinstance(engine, HostEngine) and not engine.system.can_simulate_batch
 
     def _check_raising(self, verdicts: Verdicts) -> None:
         if self._raising is not None:

@@ -216,11 +216,10 @@ class ExecutorEngine:
                 self.problem,
                 self.precision,
                 self._journal,
-                least=self.mode.least,
                 steering=self.mode.steering,
                 given=self.mode.given,
             )
-        return self._recalling.evaluate(u, key, first)
+        return self._recalling.evaluate(u, key, first, padded_to=self.mode.padded_to)
 
     def receive(self, result: dict[str, Any], u: Float[np.ndarray, "n d"], first: int) -> Verdicts:
         """Return the verdicts of one block, and remember what it tells of its worker."""

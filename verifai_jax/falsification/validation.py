@@ -78,6 +78,26 @@ def usual_batch(
     return min(1 << (most.bit_length() - 1), 1 << max(3, (int(budget) // 20).bit_length() - 1))
 
 
+def batch_size(
+    asked: int | None,
+    search: Search,
+    budget: int,
+    stop_after: int | None = None,
+    whole: bool = False,
+    diverse: bool = False,
+) -> int:
+    """Return the simulations of a round.
+
+    **Arguments:**
+
+    - `asked`: what the user wants; the default when left out.
+    - `search`, `budget`, `stop_after`, `whole`: as of `usual_batch`.
+    - `diverse`: whether failures far from each other are wanted, which takes many small rounds.
+    """
+    usual = 16 if diverse else usual_batch(search, budget, stop_after, whole)
+    return min(usual if asked is None else asked, budget)
+
+
 def check_options(
     budget: object, batch: object, seed: object, max_seconds: object, stop_after: object
 ) -> None:
