@@ -162,7 +162,8 @@ class Evaluator:
             if isinstance(self.engine, HostEngine):
                 verdicts = self.engine.evaluate(
                     points, self.key, start + begin, some,
-                    padded_to=max(padded_to, self._padded_to), keep_traces=keep_traces, journals=journals,
+                    padded_to=max(padded_to, self._padded_to), keep_traces=keep_traces,
+                    journals=journals,
                 )  # fmt: skip
             else:
                 verdicts = self.engine.evaluate(points, self.key, start + begin, some)
