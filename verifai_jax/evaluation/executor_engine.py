@@ -41,17 +41,20 @@ from verifai_jax.evaluation.worker import ARRAYS, BlockMode, evaluate_block, que
 from verifai_jax.problem.problem import Problem
 
 AT_FIRST = 8
-"""Units of a compiled block, before it is known how long one takes."""
+"""Units of a compiled block, before it is known how long one takes: few enough to learn it soon."""
 TOGETHER = 128
-"""Rows of a host system that simulates batches, of which a block is a multiple."""
+"""Rows of a host system that simulates batches, of which a block is a multiple: fixed, since its
+numbers may depend on how many rows are simulated together."""
 WORTH_KEEPING = 0.01
-"""Seconds of a simulation from which on finished rows are journalled before their batch is."""
+"""Seconds of a simulation from which on finished rows are journalled before their batch is: what
+is quicker is simulated again instead."""
 IN_FLIGHT = 3
 """Blocks on their way for each worker, so that none waits for the next one."""
 MOST_DROPPED = 100
-"""Answers to other calls after which an executor is given up."""
+"""Answers to other calls after which an executor is given up: a bound, so that no run waits for
+ever for one that mixes up its answers."""
 MOST_AHEAD = 1 << 22
-"""Rows at most that are on their way at a time."""
+"""Rows at most that are on their way at a time: a bound on the memory that they take."""
 
 SHIPMENTS: Slot[tuple[str, str | None], Any] = Slot("shipments")
 """The problem as it is sent, by kind of executor and target."""
@@ -100,10 +103,9 @@ class ExecutorEngine:
         form = problem.space.feature_form
         self._features: Any = jax.tree.structure(form)
         _, lanes = chunks_and_lanes(problem, batch, len(jax.local_devices()))
+        least = power_of_two(batch)
         backend = problem.system.backend if problem.system.backends else None
-        self.mode = BlockMode(
-            lanes, gradient, clauses, precision, power_of_two(batch), backend, steering, given
-        )
+        self.mode = BlockMode(lanes, gradient, clauses, precision, least, backend, steering, given)
         self._dtype = np.dtype(precision if given else "float32")
         self.unit = lanes
         if problem.black_box:

@@ -43,9 +43,11 @@ from verifai_jax.systems.base import Outcome, System, outcome_of
 from verifai_jax.systems.blackbox._blackbox import plain_leaves
 
 BLOCK = 32
-"""Traces evaluated together, unless patience ends before there are so many."""
+"""Traces evaluated together, unless patience ends before there are so many: one program of one
+shape for all."""
 PATIENCE = 0.5
-"""Seconds after which traces are evaluated in smaller blocks, so that they are safe on disk."""
+"""Seconds after which traces are evaluated in smaller blocks, so that they are safe on disk: at
+most so much work is lost with the process."""
 
 
 class HostMonitor:
@@ -102,8 +104,8 @@ class HostEngine:
     - `journal`: where rows are kept as soon as they have a verdict, until their batch is finished.
     - `system`: simulated instead of the problem's own, such as one with a finer step.
     - `monitor`: one that is compiled already for the same formulas.
-    - `steering`: what is computed for a search beside the robustness; that of the monitor where one
-      is given.
+    - `steering`: what is computed for a search in addition to the robustness; that of the monitor
+      if one is given.
     - `keep_traces`: whether verdicts come with the traces, on the clock of the monitor.
     - `given`: whether points are rows of given features, as of `CubePoints`.
 

@@ -48,7 +48,7 @@ class BlockMode(NamedTuple):
     - `gradient`, `clauses`, `precision`: as of `Engine`.
     - `padded_to`: rows that a host system's features are computed of together.
     - `backend`: of a system that has several.
-    - `steering`: what is computed for a search beside the robustness.
+    - `steering`: what is computed for a search in addition to the robustness.
     - `given`: whether points are rows of given features, as of `CubePoints`.
     """
 

@@ -33,7 +33,6 @@ from verifai_jax.falsification.run import (
 )
 from verifai_jax.falsification.running import Ending, Running
 from verifai_jax.falsification.silent_mistakes import notes_before
-from verifai_jax.falsification.suggestions import Suggestions
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.falsification.validation import (
     AUTO,
@@ -192,7 +191,7 @@ def falsify(
             suggests=asking is not None,
         )  # fmt: skip
         if asking is not None:
-            rounds.suggestions = Suggestions(replace(asking, search=search), problem, precision)
+            rounds.ask(replace(asking, search=search))
 
         def prepare() -> None:
             if earlier is not None:
@@ -380,9 +379,7 @@ def _resume(
     )  # fmt: skip
 
     if asking is not None:
-        rounds.suggestions = Suggestions(replace(asking, search=search), problem, run.precision)
-        rounds.suggestions.restore(checkpoint)
-        rounds.suggestions.check_source()
+        rounds.ask(replace(asking, search=search), checkpoint)
 
     rounds.checks = tuple(run.checks)
 

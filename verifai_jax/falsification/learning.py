@@ -19,7 +19,6 @@ from jaxtyping import Array, Float, Int, Key
 from verifai_jax.evaluation.steering import Steering
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.marks import MarkBook
-from verifai_jax.falsification.surrogates import Surrogate
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Objective
 from verifai_jax.search import Search
@@ -28,9 +27,11 @@ from verifai_jax.search.proposals import Proposals
 if TYPE_CHECKING:
     import pandas as pd
 
+    from verifai_jax.falsification.surrogates import Surrogate
+
 MAX_WARM = 2048
-"""Rows of an earlier table that a search starts with at most, the worst ones: searches keep some
-tens of points, and one that fits a model to them takes seconds for more."""
+"""Rows of an earlier table that a search starts with at most, the worst ones: a bound on what the
+first `tell` costs, whatever the length of that table."""
 
 Source = Literal["search", "first", "suggested"]
 """Who gave the points of a round: the search, a person before it began, or a person on the way."""
@@ -82,6 +83,8 @@ class Learning:
         """Learn by this search from now on."""
         self.search = search
         if search.wants.traces is not None:
+            from verifai_jax.falsification.surrogates import Surrogate
+
             self.surrogate = Surrogate(self.problem, search.wants.traces, self._key)
 
     @property

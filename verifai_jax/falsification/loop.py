@@ -27,22 +27,22 @@ from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.verdicts import Verdicts
-from verifai_jax.falsification.ahead import Ahead
 from verifai_jax.falsification.checkpoint import write_checkpoint
 from verifai_jax.falsification.columns import import_tables
 from verifai_jax.falsification.counts import Tally
 from verifai_jax.falsification.learning import Batch, Learning
-from verifai_jax.falsification.question import describe_run
 from verifai_jax.falsification.rows import rows_of, without_failure
 from verifai_jax.falsification.simulations import MEASURED, Simulations
-from verifai_jax.falsification.suggestions import Suggestions
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.problem.problem import Problem
-from verifai_jax.search import Search
+from verifai_jax.search import Search, Suggested
 from verifai_jax.search.proposals import compiled_search
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from verifai_jax.falsification.ahead import Ahead
+    from verifai_jax.falsification.suggestions import Suggestions
 
 COMPILE, SEARCH, SIMULATE, CONFIRM, REST = "compile", "search", "simulate", "confirm", "rest"
 """What the seconds of a run are spent on."""
@@ -168,6 +168,8 @@ class Rounds:
                 return Batch(given[:left], "suggested", limit is not None and len(given) > left)
         if self._sends_ahead:
             if self._ahead is None:
+                from verifai_jax.falsification.ahead import Ahead
+
                 limit = done + most if limit is None else limit
                 proposals = self.learning.proposals
                 self._ahead = Ahead(proposals, self.evaluate, self.batch, limit, done)
@@ -261,11 +263,25 @@ class Rounds:
                 self._simulations.begin_derivatives()
             proposals.wait()
 
-    def _suggested(self, suggestions: Suggestions, rows: int) -> Float[np.ndarray, "n d"]:
+    def ask(self, search: Suggested, checkpoint: Mapping[str, Any] | None = None) -> None:
+        """Ask somebody for suggestions from now on, or go on asking from a checkpoint.
+
+        **Raises:** `ValueError` if questions are left of a checkpoint and nobody to ask.
+        """
+        from verifai_jax.falsification.suggestions import Suggestions
+
+        self.suggestions = Suggestions(search, self.problem, self.precision)
+        if checkpoint is not None:
+            self.suggestions.restore(checkpoint)
+            self.suggestions.check_source()
+
+    def _suggested(self, suggestions: "Suggestions", rows: int) -> Float[np.ndarray, "n d"]:
         """Return the suggested points that come next, after a question where it is time for one."""
         waiting = suggestions.waiting(rows)
         if len(waiting) or not suggestions.due(rows):
             return waiting
+        from verifai_jax.falsification.question import describe_run
+
         question = describe_run(
             self.problem,
             self.table.all,
@@ -421,14 +437,14 @@ class Rounds:
 
     def _keep(self) -> None:
         """Take the checkpoint: nothing is copied, as nothing in it is ever written to."""
-        source = self.learning.proposals if self._ahead is None else self._ahead
-        state = source.checkpoint if isinstance(source, Ahead) else source.checkpoint()
+        ahead, proposals = self._ahead, self.learning.proposals
+        state = proposals.checkpoint() if ahead is None else ahead.checkpoint
         self.checkpoint = {**state, "rows": np.array(len(self.table))}
         for part in self._parts:
             self.checkpoint |= part.checkpoint()
 
     @property
-    def _parts(self) -> list[Learning | Suggestions | Confirmer]:
+    def _parts(self) -> "list[Learning | Suggestions | Confirmer]":
         """What has entries of its own in a checkpoint."""
         each = (self.learning, self.suggestions, self._confirmer)
         return [part for part in each if part is not None]

@@ -108,7 +108,6 @@ class Running:
     warm: bool = False
     keep_going: bool = False
     _models: tuple[Mapping[str, Any], ...] = field(default=(), init=False)
-    _begun: float = field(default=0.0, init=False)
 
     def play(
         self,
@@ -120,8 +119,8 @@ class Running:
 
         **Raises:** `RunError` with what is finished.
         """
-        rounds, now = self.rounds, self.sources
-        self._begun = time.time()
+        rounds, begun = self.rounds, time.time()
+        now = self.sources
         self._models = (rounds.problem.sources().to_json(),) if now is None else tuple(now)
         # Checking and tracing are part of what a second run of the problem does not repeat.
         rounds.watch = Stopwatch(COMPILE, self.ends.started, self.ends.earlier)
@@ -130,13 +129,13 @@ class Running:
         try:
             with SimulationProgress(rounds.problem.name, self.ends.budget, progress) as bar:
                 self._begin(bar, progress, prepare)
-                stopped = self._play_rounds(bar, callbacks)
+                stopped = self._play_rounds(bar, callbacks, begun)
         except KeyboardInterrupt:
             stopped = "interrupted"
         except Exception as error:
             stopped, cause = format_user_error(error), error
         rounds.close()
-        self._settle_sources()
+        self._settle(begun)
         result = self._with_notes_after(self.result(stopped))
         try:
             rounds.table.close()
@@ -177,11 +176,12 @@ class Running:
             for note in (*rounds.chosen, *rounds.notes):
                 bar.note(note)
 
-    def _play_rounds(self, bar: SimulationProgress, callbacks: Sequence[Callback]) -> str:
+    def _play_rounds(
+        self, bar: SimulationProgress, callbacks: Sequence[Callback], begun: float
+    ) -> str:
         """Play rounds; return what has ended them."""
-        rounds, budget = self.rounds, self.ends.budget
+        rounds, budget, settled = self.rounds, self.ends.budget, False
         stopped = "exhausted" if rounds.exhausted else None
-        known = False
         if self._is_hopeless:
             rounds.take_in_measured()
             return RAISES
@@ -193,25 +193,25 @@ class Running:
                 stopped = self.ends.reached(rounds)
                 if stopped is None and self._is_hopeless:
                     stopped = RAISES
-                if rounds.folder is not None and not known:
+                if rounds.folder is not None and not settled:
                     # A run that is killed knows what its first simulations read, too.
-                    known = True
-                    self._settle_sources()
+                    settled = True
+                    self._settle(begun)
                     write_record(self.result("running"), rounds.folder)
                 if stopped is None:
                     rounds.save(seldom=True)
         return stopped
 
+    def _settle(self, begun: float) -> None:
+        """Note which files the simulations have read by now."""
+        if self._models:
+            last = Sources.from_json(self._models[-1]).settled(begun)
+            self._models = (*self._models[:-1], last.to_json())
+
     @property
     def _is_hopeless(self) -> bool:
         """Whether more simulations would only raise the same, and nobody wants them."""
         return self.rounds.hopeless is not None and not self.keep_going
-
-    def _settle_sources(self) -> None:
-        """Take in what the model has read since this part of the run began."""
-        if self._models:
-            last = Sources.from_json(self._models[-1]).settled(self._begun)
-            self._models = (*self._models[:-1], last.to_json())
 
     def _write_record(self) -> None:
         """Write the record of the run as it is now, for whoever resumes it."""

@@ -41,13 +41,13 @@ class Simulations:
     **Arguments:**
 
     - `problem`: on the backend that it runs on.
-    - `search`: what it wants decides what is computed beside the robustness.
+    - `search`: what it wants decides what is computed in addition to the robustness.
     - `batch`: simulations of a round at most.
     - `seed`: of the run.
     - `precision`, `journal`, `executor`, `target`, `steering`, `keep_traces`, `given`: as for
       `Evaluator`.
 
-    `hopeless` is what all of the rows that were timed raised; None where one did not.
+    `hopeless` is what all of the rows that were timed raised; None if one did not.
     """
 
     def __init__(
