@@ -46,12 +46,12 @@ if TYPE_CHECKING:
     from verifai_jax.falsification import Replay as Replay
     from verifai_jax.falsification import Run as Run
     from verifai_jax.falsification import RunError as RunError
-    from verifai_jax.falsification import Trials as Trials
     from verifai_jax.falsification import falsify as falsify
     from verifai_jax.falsification import load as load
-    from verifai_jax.falsification import repeat as repeat
     from verifai_jax.falsification import resume as resume
     from verifai_jax.falsification import simulate as simulate
+    from verifai_jax.falsification._repeat import Trials as Trials
+    from verifai_jax.falsification._repeat import repeat as repeat
     from verifai_jax.features import Array as Array
     from verifai_jax.features import Beta as Beta
     from verifai_jax.features import Box as Box

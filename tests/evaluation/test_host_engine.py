@@ -220,7 +220,7 @@ def test_zero_is_decided_by_the_comparator_without_another_simulation():
     rounds = Rounds(problem, Uniform(), 4, 0, ErrorTable(("a", "b")))
     rounds.compile()
     rounds.advance(4)
-    assert rounds.found == 4
+    assert rounds.tally.claimed == 4
     assert len(system.simulated) == 4
 
 

@@ -8,7 +8,7 @@ from checked_types import unchecked
 
 import verifai_jax as vj
 from verifai_jax.evaluation import engine as engine_module
-from verifai_jax.falsification._falsify import RunError
+from verifai_jax.falsification.running import RunError
 from verifai_jax.falsification.validation import usual_batch
 
 SPACE = {"a": vj.Box(0.0, 1.0), "b": vj.Box(-1.0, 1.0)}

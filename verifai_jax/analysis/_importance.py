@@ -105,8 +105,7 @@ def importance(
       verdict.
     - `repeats`: how often each feature is shuffled.
     - `seed`: of all that is drawn at random.
-    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
-      once a minute elsewhere.
+    - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     **Returns:** an `Importance`.
 

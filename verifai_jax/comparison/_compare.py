@@ -76,8 +76,7 @@ def compare(
     - `seed`: of the samples; the same seed gives the same pairs.
     - `max_seconds`: wall-clock seconds after which finished pairs give the verdict.
     - `precision`: as in `falsify`.
-    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
-      once a minute elsewhere.
+    - `progress`: whether to show one line of progress; see `core.progress` for the default.
     - `executor`: whose workers simulate, as in `falsify`; the comparison is the same.
 
     **Returns:** the comparison; after Ctrl-C that of the finished pairs.

@@ -70,8 +70,7 @@ def confirm(
     - `most`: how many rows are replayed at least, by default 256, and more where a row takes few
       replays; of more, the worst and those nearest to zero, until the rest
       is far from it (see `evaluation.confirmer.Confirmer`).
-    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
-      once a minute elsewhere.
+    - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     **Returns:** a `Confirmation` for a row, `Confirmations` for all; after Ctrl-C what is finished.
 

@@ -97,8 +97,7 @@ def explain(
     - `run`: a run of a problem, with a counterexample.
     - `row`: the number of one, or a row of the table; the worst when left out.
     - `nominal`: features that are ordinary, where the problem does not say or others are meant.
-    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
-      once a minute elsewhere.
+    - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     Takes one simulation for each feature and each unit coordinate, and one gradient. Without
     nominal features only the gradient tells what matters.

@@ -150,8 +150,7 @@ def replay_counterexamples(
     - `problem`: as it is now.
     - `folder`: that `run.save_counterexamples` wrote into, or one file of it.
     - `rename`: new names of features by their old ones.
-    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
-      once a minute elsewhere.
+    - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     **Raises:** `FileNotFoundError` for a place that does not exist; `TypeError` for something that
     is no `Problem`.

@@ -202,8 +202,7 @@ def shrink(
     - `others`: whether other counterexamples of the run are looked at too.
     - `stay`: whether every real feature stays on the side of nominal on which the row has it, so
       that failures of several kinds are shrunk each by itself.
-    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
-      once a minute elsewhere.
+    - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     All simulations have the random key of the row. The result was simulated alone and failed, in
     the precision of the run, and in float64 too unless the system draws random numbers or is a

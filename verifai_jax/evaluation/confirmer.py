@@ -39,6 +39,7 @@ from verifai_jax.evaluation.confirmations import (
     came_otherwise,
 )
 from verifai_jax.evaluation.resimulate import (
+    LANES,
     ONE_BY_ONE,
     HostReplays,
     Replays,
@@ -67,9 +68,10 @@ MORE = 3
 fails at every seventh call fails in the first repetition of every seventh row, too."""
 SAFE = 10.0
 """Further rows stay unexamined if they are so many times farther from zero than replays have moved
-any row."""
-BLOCK = 512
-"""Rows examined between two looks at whether the rest may stay unexamined."""
+any row: a margin, since replays move rows by unequal amounts."""
+BLOCK = 2 * LANES[1]
+"""Rows examined between two looks at whether the rest may stay unexamined: two calls of the larger
+program."""
 WITH_WORST = ONE_BY_ONE
 """Rows examined together with one that is worse than all examined before, so that no other program
 is compiled for it."""

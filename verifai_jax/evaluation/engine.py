@@ -64,7 +64,7 @@ class Engine:
     - `lanes`: rows that a device works on together; as the system says when left out.
     - `effort`: how much XLA does to make its programs fast; when left out as the system says, and
       for derivatives, which are of few rows, at most a little.
-    - `steering`: what it computes for a search beside the robustness.
+    - `steering`: what it computes for a search in addition to the robustness.
 
     `notes` says, once compiled, what the engine decided that a user may not expect.
     """
@@ -114,7 +114,7 @@ class Engine:
         self._executables: dict[Mode, jax.stages.Compiled] = {}
 
     def begin_compiling(self) -> None:
-        """Trace now and compile in the background, beside whatever else is compiled."""
+        """Trace now and compile in the background."""
         with in_precision(self.precision):
             self._begin("evaluate")
 

@@ -8,7 +8,7 @@ evaluator takes the engine that suits the problem, compiled or on the host, or s
 workers of an executor. Each simulation has a random key of its own, by its number.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Array, Float, Key
@@ -18,13 +18,15 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.progress import count_done
 from verifai_jax.core.shapes import power_of_two
 from verifai_jax.evaluation.engine import Engine, engine_for
-from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.raising import ALIKE, Raising
 from verifai_jax.evaluation.steering import NOTHING, Steering
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
+
+if TYPE_CHECKING:
+    from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
 
 
 class Evaluator:
@@ -41,7 +43,7 @@ class Evaluator:
     - `journal`: of rows in flight, for a problem on the host.
     - `executor`: with `concurrent.futures`' `submit`, whose workers simulate; this process when
       left out.
-    - `steering`: what is computed for a search beside the robustness.
+    - `steering`: what is computed for a search in addition to the robustness.
     - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
     - `keep_traces`: whether verdicts come with traces; in this process.
     - `given`: whether rows of features that somebody gave (`given_rows`) may be among the points.
@@ -72,7 +74,9 @@ class Evaluator:
         self._dtype = np.dtype(precision if self.given else "float32")
         self.engine: Engine | HostEngine | ExecutorEngine
         if executor is not None:
-            self.engine = ExecutorEngine(
+            from verifai_jax.evaluation import executor_engine
+
+            self.engine = executor_engine.ExecutorEngine(
                 problem, batch, executor, gradient=gradient, clauses=clauses,
                 precision=precision, journal=journal, target=target, steering=steering,
                 given=self.given,
@@ -87,9 +91,8 @@ class Evaluator:
             self.engine = engine_for(
                 problem, batch, gradient, precision, clauses, steering, self.given
             )
-        if ends_raising and isinstance(self.engine, HostEngine):
-            # Features of few points are those of a whole batch, bit for bit.
-            self.engine.least = power_of_two(batch)
+        # Features of few points are those of a whole batch, bit for bit.
+        self._padded_to = power_of_two(batch) if ends_raising else 1
         self.key: Key[Array, ""] = run_keys(seed)[1]
         self.simulations = 0
 
@@ -104,7 +107,7 @@ class Evaluator:
         return self.engine.notes
 
     def begin_compiling(self) -> None:
-        """Trace now and compile in the background, beside whatever else is compiled."""
+        """Trace now and compile in the background."""
         self.engine.begin_compiling()
 
     def begin_if_recalled(self) -> None:
@@ -121,6 +124,10 @@ class Evaluator:
         u: Float[Any, "n d"],
         temperature: Float[np.ndarray, " n"] | float = 1.0,
         first: int | None = None,
+        *,
+        padded_to: int = 1,
+        keep_traces: bool | None = None,
+        journals: bool = True,
     ) -> Verdicts:
         """Simulate and evaluate these points.
 
@@ -129,13 +136,14 @@ class Evaluator:
         - `u`: points of the unit cube, or rows of given features.
         - `temperature`: of the smooth robustness that is differentiated, one for all or one each.
         - `first`: number of the first simulation; numbers go on from those before when left out.
+        - `padded_to`, `keep_traces`, `journals`: as of `HostEngine.evaluate`, for a black box.
 
         **Raises:** `AlwaysRaises` where it was asked for.
         """
         start = self.simulations if first is None else first
         u = self._with_values(u)
         count, parts = len(u), []
-        if isinstance(self.engine, ExecutorEngine) and count:
+        if not isinstance(self.engine, Engine | HostEngine) and count:
             self.simulations = start + count
             verdicts = self.engine.evaluate(u, self.key, start, temperature)
             count_done(count)
@@ -143,12 +151,23 @@ class Evaluator:
             return verdicts
         begin = 0
         while begin < count:
-            block = slice(begin, begin + self._size(min(self.batch, count - begin)))
+            size = min(self.batch, count - begin)
+            if self._looks_often:
+                size = min(size, ALIKE)
+            block = slice(begin, begin + size)
             some = temperature[block] if isinstance(temperature, np.ndarray) else temperature
             points = u if block.stop - block.start >= count else u[block]
             if points.dtype != self._dtype:
                 points = np.asarray(points, self._dtype)
-            parts.append(self.engine.evaluate(points, self.key, start + begin, some))
+            if isinstance(self.engine, HostEngine):
+                verdicts = self.engine.evaluate(
+                    points, self.key, start + begin, some,
+                    padded_to=max(padded_to, self._padded_to), keep_traces=keep_traces,
+                    journals=journals,
+                )  # fmt: skip
+            else:
+                verdicts = self.engine.evaluate(points, self.key, start + begin, some)
+            parts.append(verdicts)
             count_done(len(points))
             self._check_raising(parts[-1])
             begin = block.stop
@@ -157,23 +176,22 @@ class Evaluator:
             return Verdicts.nothing(len(self.problem.formulas), self.problem.space.dim)
         return Verdicts.concatenate(parts)
 
-    def submit(self, u: Float[Any, "n d"], first: int) -> Pending:
+    def submit(self, u: Float[Any, "n d"], first: int) -> "Pending":
         """Send points to the workers of the executor; `result` of what it returns waits for them.
 
         **Raises:** `TypeError` for an evaluator without an executor.
         """
-        if not isinstance(self.engine, ExecutorEngine):
+        if isinstance(self.engine, Engine | HostEngine):
             raise TypeError("points are sent to workers only by an evaluator with an executor")
         return self.engine.submit(self._with_values(u), self.key, first)
 
-    def _size(self, most: int) -> int:
-        """Return how many points are simulated before one looks whether all raise."""
+    @property
+    def _looks_often(self) -> bool:
+        """Whether few rows are simulated at a time, since all may raise."""
         if self._raising is None or not self._raising.always:
-            return most
+            return False
         engine = self.engine
-        if not isinstance(engine, HostEngine) or engine.system.can_simulate_batch:
-            return most
-        return min(most, ALIKE)
+        return isinstance(engine, HostEngine) and not engine.system.can_simulate_batch
 
     def _check_raising(self, verdicts: Verdicts) -> None:
         if self._raising is not None:

@@ -41,17 +41,20 @@ from verifai_jax.evaluation.worker import ARRAYS, BlockMode, evaluate_block, que
 from verifai_jax.problem.problem import Problem
 
 AT_FIRST = 8
-"""Units of a compiled block, before it is known how long one takes."""
+"""Units of a compiled block, before it is known how long one takes: few enough to learn it soon."""
 TOGETHER = 128
-"""Rows of a host system that simulates batches, of which a block is a multiple."""
+"""Rows of a host system that simulates batches, of which a block is a multiple: fixed, since its
+numbers may depend on how many rows are simulated together."""
 WORTH_KEEPING = 0.01
-"""Seconds of a simulation from which on finished rows are journalled before their batch is."""
+"""Seconds of a simulation from which on finished rows are journalled before their batch is: what
+is quicker is simulated again instead."""
 IN_FLIGHT = 3
 """Blocks on their way for each worker, so that none waits for the next one."""
 MOST_DROPPED = 100
-"""Answers to other calls after which an executor is given up."""
+"""Answers to other calls after which an executor is given up: a bound, so that no run waits for
+ever for one that mixes up its answers."""
 MOST_AHEAD = 1 << 22
-"""Rows at most that are on their way at a time."""
+"""Rows at most that are on their way at a time: a bound on the memory that they take."""
 
 SHIPMENTS: Slot[tuple[str, str | None], Any] = Slot("shipments")
 """The problem as it is sent, by kind of executor and target."""
@@ -216,11 +219,10 @@ class ExecutorEngine:
                 self.problem,
                 self.precision,
                 self._journal,
-                least=self.mode.least,
                 steering=self.mode.steering,
                 given=self.mode.given,
             )
-        return self._recalling.evaluate(u, key, first)
+        return self._recalling.evaluate(u, key, first, padded_to=self.mode.padded_to)
 
     def receive(self, result: dict[str, Any], u: Float[np.ndarray, "n d"], first: int) -> Verdicts:
         """Return the verdicts of one block, and remember what it tells of its worker."""

@@ -43,9 +43,11 @@ from verifai_jax.systems.base import Outcome, System, outcome_of
 from verifai_jax.systems.blackbox._blackbox import plain_leaves
 
 BLOCK = 32
-"""Traces evaluated together, unless patience ends before there are so many."""
+"""Traces evaluated together, unless patience ends before there are so many: one program of one
+shape for all."""
 PATIENCE = 0.5
-"""Seconds after which traces are evaluated in smaller blocks, so that they are safe on disk."""
+"""Seconds after which traces are evaluated in smaller blocks, so that they are safe on disk: at
+most so much work is lost with the process."""
 
 
 class HostMonitor:
@@ -102,10 +104,8 @@ class HostEngine:
     - `journal`: where rows are kept as soon as they have a verdict, until their batch is finished.
     - `system`: simulated instead of the problem's own, such as one with a finer step.
     - `monitor`: one that is compiled already for the same formulas.
-    - `least`: rows that features are computed of together at least, a power of two, so that few
-      rows get theirs from the program that many would.
-    - `steering`: what is computed for a search beside the robustness; that of the monitor where one
-      is given.
+    - `steering`: what is computed for a search in addition to the robustness; that of the monitor
+      if one is given.
     - `keep_traces`: whether verdicts come with the traces, on the clock of the monitor.
     - `given`: whether points are rows of given features, as of `CubePoints`.
 
@@ -120,14 +120,13 @@ class HostEngine:
         *,
         system: System | None = None,
         monitor: HostMonitor | None = None,
-        least: int = 1,
         steering: Steering = NOTHING,
         keep_traces: bool = False,
         given: bool = False,
     ) -> None:
         self.given = given
         self.problem, self.precision, self.journal = problem, precision, journal
-        self.least, self.keep_traces = least, keep_traces
+        self.keep_traces = keep_traces
         self.system = problem.system if system is None else system
         if monitor is None and not steering.size:
             # The one of all engines of the problem, so that it compiles once.
@@ -155,19 +154,28 @@ class HostEngine:
         key: Key[Array, ""],
         first: int = 0,
         temperature: Float[np.ndarray, " n"] | Float[Array, ""] | float = 1.0,
+        *,
+        padded_to: int = 1,
+        keep_traces: bool | None = None,
+        journals: bool = True,
     ) -> Verdicts:
         """Simulate `n` points of the unit cube and decide which violate the property.
 
         **Arguments:** as of `engine.Engine.evaluate`; nothing is differentiated.
+
+        - `padded_to`: a power of two; features are computed of so many rows together at least, so
+          that few rows get theirs from the program that many would.
+        - `keep_traces`: as of the engine, for this call.
+        - `journals`: whether rows go to the journal, and come from it.
         """
         with in_precision(self.precision):
             u = np.asarray(rows)
-            points = pad_rows(u)
-            if len(points) < self.least:
-                points = np.concatenate([u, np.repeat(u[-1:], self.least - len(u), axis=0)])
+            points = pad_rows(u, max(padded_to, power_of_two(len(u))))
             features, keys, seeds = self._prepare(points, key, np.int32(first))
             features = jax.tree.map(lambda leaf: np.asarray(leaf)[: len(u)], features)
-            return self._verdicts(features, keys[: len(u)], np.asarray(seeds)[: len(u)], u, first)
+            keep = self.keep_traces if keep_traces is None else keep_traces
+            seeds, known = np.asarray(seeds)[: len(u)], u if journals else None
+            return self._verdicts(features, keys[: len(u)], seeds, known, first, keep)
 
     def evaluate_features(
         self, features: PyTree, seeds: Integer[np.ndarray, " n"], keys: Key[Array, " n"] | None
@@ -181,7 +189,7 @@ class HostEngine:
         - `keys`: that the seeds are made of, which a system needs that simulates batches.
         """
         with in_precision(self.precision):
-            return self._verdicts(features, keys, seeds, None, 0)
+            return self._verdicts(features, keys, seeds, None, 0, self.keep_traces)
 
     def _verdicts(
         self,
@@ -190,12 +198,13 @@ class HostEngine:
         seeds: Integer[np.ndarray, " n"],
         u: Float[np.ndarray, "n d"] | None,
         first: int,
+        keep_traces: bool,
     ) -> Verdicts:
         behaviour = self.problem.behaviour
         width = None if behaviour is None else behaviour.size
         formulas = len(self.problem.formulas)
         rows = _Rows(len(seeds), formulas, self.precision, width, self.monitor.steering.size)
-        if self.keep_traces:
+        if keep_traces:
             rows.traces = [None for _ in seeds]
         if self.system.can_simulate_batch:
             assert keys is not None

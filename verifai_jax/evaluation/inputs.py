@@ -53,7 +53,7 @@ class CubePoints(Inputs):
     **Arguments:**
 
     - `problem`: that says the space.
-    - `given`: whether rows are those of `given_rows`: points, and behind them the real numbers of
+    - `given`: whether rows are those of `given_rows`: points, followed by the real numbers of
       features that somebody gave, which are simulated as they are; NaN for those of the point.
     - `precision`: of what is given.
     """
@@ -110,7 +110,7 @@ class TableRows(Inputs):
 class WithParameters(Inputs):
     """Points of the unit cube, and a vector of parameters of the system that all rows share.
 
-    The coordinates are the parameters first and the point behind them.
+    The coordinates are the parameters, followed by the point.
 
     **Arguments:**
 

@@ -80,7 +80,7 @@ class Journal:
 
 
 def count_unfinished(folder: Path, rows: int) -> int:
-    """Count the finished simulations in `folder` behind the first `rows`, those of the table."""
+    """Count the finished simulations in `folder` after the first `rows`, those of the table."""
     return sum(row >= rows for row in _read(folder / JOURNAL))
 
 

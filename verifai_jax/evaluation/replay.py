@@ -1,6 +1,6 @@
 """One simulation looked at again, with its trace.
 
-replay(problem, row, key, number).trace             # the trace behind a row of a table
+replay(problem, row, key, number).trace             # the trace of a row of a table
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -29,11 +29,9 @@ from verifai_jax.core.progress import count_done
 from verifai_jax.core.text import format_error
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine
-from verifai_jax.evaluation.executor_engine import SHIPMENTS, TOGETHER, identity
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.inputs import TableRows
 from verifai_jax.evaluation.verdicts import Verdicts
-from verifai_jax.evaluation.worker import computing
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import System
 
@@ -42,7 +40,8 @@ ONE_BY_ONE = 16
 SEEDS = 32
 """Seeds of a host system's rows that are made in one call, so that one program makes all."""
 LANES = (64, 256)
-"""Rows that a device replays together, where there are more: the second number for very many."""
+"""Rows that a device replays together if there are more: the second number once two calls of the
+first would not do, since a call costs something whatever its size."""
 
 
 class Refiner:
@@ -224,6 +223,8 @@ class HostReplays:
         self._engine = HostEngine(problem, precision)
         self._executor = executor
         if executor is not None:
+            from verifai_jax.evaluation.executor_engine import SHIPMENTS, identity
+
             check_executor(executor)
             self._shipment = problem.programs.get(
                 SHIPMENTS,
@@ -277,6 +278,8 @@ class HostReplays:
     def _sent(
         self, features: PyTree, numbers: Int[np.ndarray, " n"], factor: int, anew: bool
     ) -> Verdicts:
+        from verifai_jax.evaluation.executor_engine import TOGETHER
+
         executor, system = self._executor, self.problem.system
         assert executor is not None
         backend = system.backend if system.backends else None
@@ -365,6 +368,8 @@ def replay_block(
 
     **Returns:** `rho`, `status`, `violated` and `messages` of the rows.
     """
+    from verifai_jax.evaluation.worker import computing
+
     backend, precision, factor, anew = how
     problem = shipment.thing
     if backend is not None:

@@ -42,7 +42,7 @@ class RowFunction(NamedTuple):
     - `precision`: of simulation, monitor and gradient.
     - `gradient`: whether the smooth robustness is differentiated.
     - `goals`: for an evaluation clause by clause.
-    - `steering`: what is computed for a search beside the robustness.
+    - `steering`: what is computed for a search in addition to the robustness.
     """
 
     problem: Problem

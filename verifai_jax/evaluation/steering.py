@@ -64,7 +64,7 @@ class Steering(NamedTuple):
 
 
 NOTHING = Steering()
-"""Nothing beside the robustness."""
+"""Nothing but the robustness."""
 
 
 def outcome_of(problem: Problem, trace: Trace) -> Float[Array, " outcome"]:

@@ -1,6 +1,6 @@
 """The monitor that travels with a rollout, so that no trace is stored.
 
-    monitor = streaming_monitor(problem)                # None where storing is better
+    monitor = streaming_monitor(problem)                # None if storing is better
     rho, status = monitor(features, key)                # as `verdicts.trace_verdict`
 
 Same robustness, bit for bit, up to twice as fast, and memory that does not grow with the horizon.
@@ -18,14 +18,15 @@ from verifai_jax.mtl import online
 from verifai_jax.problem.problem import Problem
 
 SMALL = 16
-"""Numbers that a monitor may hold to be worth carrying."""
+"""Numbers that a monitor may hold to be worth carrying: one with windows of samples, which it
+moves at every step, holds more."""
 
 Monitor = Callable[[PyTree, Key[Array, ""]], tuple[Float[Array, " formulas"], Int[Array, ""]]]
 """A function `(features, key) -> robustness, status`."""
 
 
 def streaming_monitor(problem: Problem) -> Monitor | None:
-    """Return the monitor of a problem; None where carrying it does not pay."""
+    """Return the monitor of a problem; None if carrying it does not pay."""
     system = problem.system
     if not system.can_fold or system.dt is None or problem.end != "hold":
         return None

@@ -29,7 +29,7 @@ class Verdicts(NamedTuple):
     - `rho`: `[n, formulas]`, hard robustness; NaN where the status is not OK.
     - `status`: `[n]`, codes of `Status`.
     - `violated`: `[n]`, whether the simulation ended properly and breaks a formula.
-    - `features`: the simulated values, `[n, ...]` each; None where the caller has them already.
+    - `features`: the simulated values, `[n, ...]` each; None if the caller has them already.
     - `gradient`: `[n, d]`, of the least smooth robustness by the coordinates; None unless wanted.
     - `clauses`: `[n, clauses]`, scaled values of the clauses of the goal that is nearest to being
       broken (`mtl.clauses`); None unless wanted.
@@ -37,8 +37,8 @@ class Verdicts(NamedTuple):
     - `messages`: what a host system raised, one a row, empty where nothing; None for systems that
       JAX traces.
     - `marks`: what each trace shows (`problem.behaviour`), -1 for nothing; None without one.
-    - `steering`: what a search is told beside (`evaluation.steering`); None unless wanted.
-    - `traces`: the traces themselves, None where there is none; None unless they are kept.
+    - `steering`: what else a search learns (`evaluation.steering`); None unless wanted.
+    - `traces`: the traces themselves, None if there is none; None unless they are kept.
     """
 
     rho: Float[np.ndarray, "n formulas"]
@@ -107,7 +107,7 @@ class RowVerdict(NamedTuple):
     - `holds`: `[formulas]`, or one truth value for all: the Boolean semantics.
     - `message`: what the system raised; empty where nothing.
     - `marks`: what its trace shows, `[marks]`; None without a trace, or a `problem.behaviour`.
-    - `steering`: what a search is told beside, `[steering]`; None unless there is a trace, and it
+    - `steering`: what else a search learns, `[steering]`; None unless there is a trace, and it
       is wanted.
     """
 
@@ -180,7 +180,7 @@ def trace_marks(problem: Problem, trace: Trace) -> Int[Array, " marks"]:
 
 
 def _counted(trace: Trace) -> Bool[Array, ""] | None:
-    """Return whether `valid` is a number of the trace's samples; None where it is left out."""
+    """Return whether `valid` is a number of the trace's samples; None if it is left out."""
     if trace.valid is None:
         return None
     valid = jnp.asarray(trace.valid)

@@ -46,9 +46,9 @@ class BlockMode(NamedTuple):
 
     - `lanes`: rows that a device works on together.
     - `gradient`, `clauses`, `precision`: as of `Engine`.
-    - `least`: rows that a host system's features are computed of together.
+    - `padded_to`: rows that a host system's features are computed of together.
     - `backend`: of a system that has several.
-    - `steering`: what is computed for a search beside the robustness.
+    - `steering`: what is computed for a search in addition to the robustness.
     - `given`: whether points are rows of given features, as of `CubePoints`.
     """
 
@@ -56,7 +56,7 @@ class BlockMode(NamedTuple):
     gradient: bool
     clauses: bool
     precision: str
-    least: int
+    padded_to: int
     backend: str | None
     steering: Steering
     given: bool = False
@@ -135,12 +135,10 @@ def _on_host(
     engine = problem.programs.get(
         HOST_ENGINES,
         mode,
-        lambda: HostEngine(
-            problem, mode.precision, least=mode.least, steering=mode.steering, given=mode.given
-        ),
+        lambda: HostEngine(problem, mode.precision, steering=mode.steering, given=mode.given),
     )
     started, engine.remarks = time.perf_counter(), Remarks()
-    verdicts = engine.evaluate(u, as_key(key), first)
+    verdicts = engine.evaluate(u, as_key(key), first, padded_to=mode.padded_to)
     return verdicts, time.perf_counter() - started, engine.remarks
 
 

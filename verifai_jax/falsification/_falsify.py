@@ -1,4 +1,4 @@
-"""The falsification loop: budgets, stopping, progress, storing, resuming.
+"""Runs: the checks and choices before the first simulation, of new runs and of resumed ones.
 
 run = falsify(problem, search="cross_entropy", budget=20_000, seed=0)
 run = falsify(problem, search=search.Gradient(patience=8), stop_after=10)
@@ -6,51 +6,38 @@ run = resume(run, budget=50_000)
 """
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from verifai_jax import search as searches
-from verifai_jax._version import __version__
-from verifai_jax.core.callbacks import Callback, check_callbacks, notify
+from verifai_jax.core.callbacks import Callback, check_callbacks
 from verifai_jax.core.compilation import tracing
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.precision import in_precision, reproducible_settings
-from verifai_jax.core.progress import SimulationProgress, shows_progress, write_line
-from verifai_jax.core.sources import Sources
-from verifai_jax.core.stopwatch import Stopwatch
-from verifai_jax.core.text import one_line
-from verifai_jax.core.user_errors import explain_user_error, format_user_error
-from verifai_jax.evaluation.backends import Choice, resolved
+from verifai_jax.core.progress import shows_progress
+from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
 from verifai_jax.falsification.model_changes import continued_with
-from verifai_jax.falsification.origin import origin_of
 from verifai_jax.falsification.run import (
     RECORD,
     Run,
     as_made,
     check_not_continued,
     load,
-    write_record,
 )
-from verifai_jax.falsification.silent_mistakes import (
-    cut_short_note,
-    nominal_note,
-    notes_after,
-    notes_before,
-)
-from verifai_jax.falsification.suggestions import Suggestions
-from verifai_jax.falsification.summary import first_message
+from verifai_jax.falsification.running import Ending, Running
+from verifai_jax.falsification.silent_mistakes import notes_before
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.falsification.validation import (
     AUTO,
     adapt_search,
+    batch_size,
     can_be_slow,
     check_first,
     check_gradient,
@@ -67,8 +54,6 @@ from verifai_jax.falsification.validation import (
     recorded_search,
     rows_of_first,
     slow_search,
-    space_as_data,
-    usual_batch,
     writing,
 )
 from verifai_jax.problem.problem import Problem
@@ -80,18 +65,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from verifai_jax.features.given import Rows
-
-
-RAISES = "an error of every simulation"
-"""What has stopped a run whose first simulations all raise."""
-
-
-class RunError(RuntimeError):
-    """The loop broke down, or nothing can succeed; `run` holds what was finished before."""
-
-    def __init__(self, message: str, run: Run) -> None:
-        super().__init__(message)
-        self.run = run
 
 
 @suggests_options
@@ -190,13 +163,15 @@ def falsify(
     callbacks = check_callbacks(callbacks)
     earlier = earlier_rows(warm_start, problem)
     in_precision(precision)
-    # Far from what is found already takes rounds, more than many at once.
     whole = stop_after is None and stop_when is None and max_seconds is None
-    usual = usual_batch(search, budget, stop_after, whole and not problem.black_box)
-    usual = min(16, budget) if diverse else usual
-    own_batch, batch = batch, min(usual if batch is None else batch, budget)
+
+    def batch_for(search: Search) -> int:
+        alone = whole and not problem.black_box
+        return batch_size(batch, search, budget, stop_after, alone, bool(diverse))
+
+    size = batch_for(search)
     choice = resolved(
-        problem, gradient=search.needs_derivatives, batch=batch, budget=budget, precision=precision,
+        problem, gradient=search.needs_derivatives, batch=size, budget=budget, precision=precision,
         wanted=backend,
     )  # fmt: skip
     problem = choice.problem
@@ -208,16 +183,15 @@ def falsify(
     if diverse:
         by = "inputs" if diverse is True else diverse
         search = searches.Diverse(search, capacity=max(256, stop_after or 0), by=by)
-    ends = _Ending(started, budget, max_seconds, stop_after, stop_when)
-    warm = earlier is not None
+    ends = Ending(started, budget, max_seconds, stop_after, stop_when)
     with new_folder(folder) as place:
         table = ErrorTable(tuple(problem.space.columns), place)
         rounds = Rounds(
-            problem, search, batch, seed, table, precision, place, confirm, executor, target, given,
+            problem, search, size, seed, table, precision, place, confirm, executor, target, given,
             suggests=asking is not None,
         )  # fmt: skip
         if asking is not None:
-            rounds.suggestions = Suggestions(replace(asking, search=search), problem, precision)
+            rounds.ask(replace(asking, search=search))
 
         def prepare() -> None:
             if earlier is not None:
@@ -227,20 +201,20 @@ def falsify(
                 return
             if keep_going and not chooses:
                 return
-            seconds = rounds.measure(min(batch, budget), timed=chooses)
+            seconds = rounds.measure(size, timed=chooses)
             if not chooses or (rounds.hopeless is not None and not keep_going):
                 return
             slow = slow_search(problem, seconds)
             if slow is not None:
-                usual = usual_batch(slow[0], budget, stop_after)
-                rounds.switch(*slow, min(own_batch or usual, budget))
+                rounds.switch(*slow, batch_for(slow[0]))
                 if earlier is not None:
                     rounds.warm(earlier)
 
-        return _run_rounds(
-            rounds, ends, seed, choice, progress, target, prepare, notes, callbacks, warm=warm,
-            keep_going=keep_going, lasting=lasting,
+        running = Running(
+            rounds, ends, choice, seed, target, notes, lasting, warm=earlier is not None,
+            keep_going=keep_going,
         )  # fmt: skip
+        return running.play(progress, prepare, callbacks)
 
 
 @suggests_options
@@ -329,7 +303,7 @@ def resume(
     **Raises:** `ValueError` for a run without its problem or its state, a model that has changed, a
     budget that is spent, or a folder that another process writes; as `falsify` otherwise.
     """
-    ends = _Ending(time.perf_counter(), 0, max_seconds, stop_after, stop_when)
+    ends = Ending(time.perf_counter(), 0, max_seconds, stop_after, stop_when)
     folder = Path(run) if isinstance(run, str | Path) else run.folder
     if not isinstance(run, Run) and not (Path(run) / RECORD).exists():
         load(run)  # Says what is missing; a lock would be written to what is no run.
@@ -354,7 +328,7 @@ def _resume(
     problem: Problem | None,
     search: Search | None,
     budget: int | None,
-    ends: "_Ending",
+    ends: Ending,
     progress: bool | None,
     callbacks: Sequence[Callback],
     executor: Executor | None,
@@ -405,9 +379,7 @@ def _resume(
     )  # fmt: skip
 
     if asking is not None:
-        rounds.suggestions = Suggestions(replace(asking, search=search), problem, run.precision)
-        rounds.suggestions.restore(checkpoint)
-        rounds.suggestions.check_source()
+        rounds.ask(replace(asking, search=search), checkpoint)
 
     rounds.checks = tuple(run.checks)
 
@@ -418,27 +390,17 @@ def _resume(
     ends = ends._replace(budget=budget, earlier=_seconds_of(run))
     lasting = (*run.lasting_notes, *([changed] if changed else []))
     notes = [*notes_before(problem, search)]
-    usual = min(usual_batch(search, budget, ends.stop_after), budget)
+    usual = batch_size(None, search, budget, ends.stop_after)
     if search.learns and usual != run.batch:
         notes.append(
             f"resumed in batches of {run.batch}: a run of {budget} simulations from the start has "
             f"batches of {usual} by default, and so other points"
         )
-    return _run_rounds(
-        rounds,
-        ends,
-        run.seed,
-        choice,
-        progress,
-        run.target,
-        prepare,
-        notes,
-        callbacks,
-        resumed=True,
-        sources=sources,
+    running = Running(
+        rounds, ends, choice, run.seed, run.target, notes, lasting, sources, resumed=True,
         keep_going=keep_going,
-        lasting=lasting,
-    )
+    )  # fmt: skip
+    return running.play(progress, prepare, callbacks)
 
 
 def _seconds_of(run: Run) -> dict[str, float]:
@@ -451,208 +413,3 @@ def _seconds_of(run: Run) -> dict[str, float]:
         CONFIRM: run.confirm_seconds,
         REST: rest,
     }
-
-
-class _Ending(NamedTuple):
-    """The conditions that end a run."""
-
-    started: float
-    budget: int
-    max_seconds: float | None
-    stop_after: int | None
-    stop_when: StoppingRule | None
-    earlier: Mapping[str, float] = MappingProxyType({})
-    """Seconds that an earlier part of the run has taken, by what they were spent on."""
-
-    @property
-    def seconds(self) -> float:
-        return time.perf_counter() - self.started
-
-    def reached(self, rounds: Rounds) -> str | None:
-        """Return the condition that ends the run after this round, if any does."""
-        if self.stop_after is not None and rounds.distinct >= self.stop_after:
-            return "stop_after"
-        if self.stop_when is not None and self.stop_when.done(
-            rounds.violating, len(rounds.table), rounds.without_verdict
-        ):
-            return "stop_when"
-        if len(rounds.table) >= self.budget:
-            return "budget"
-        if rounds.exhausted:
-            return "exhausted"
-        if self.max_seconds is not None and self.seconds >= self.max_seconds:
-            return "max_seconds"
-        return None
-
-
-def _run_rounds(
-    rounds: Rounds,
-    ends: _Ending,
-    seed: int,
-    choice: Choice,
-    progress: bool | None,
-    target: str | None,
-    prepare: Callable[[], None],
-    notes: Sequence[str] = (),
-    callbacks: Sequence[Callback] = (),
-    *,
-    warm: bool = False,
-    resumed: bool = False,
-    sources: Sequence[Mapping[str, Any]] | None = None,
-    keep_going: bool = False,
-    lasting: Sequence[str] = (),
-) -> Run:
-    """Compile, `prepare`, and play rounds until something ends them."""
-    problem, search, place = rounds.problem, rounds.search, rounds.folder
-    asked = rounds.suggestions
-    recorded = search if asked is None else asked.search
-    chosen = (f"backend {choice.backend}: {choice.why}",) if choice.why else ()
-    begun = time.time()
-    models = (problem.sources().to_json(),) if sources is None else tuple(sources)
-    # Checking and tracing are part of what a second run of the problem does not repeat.
-    watch = rounds.watch = Stopwatch(COMPILE, ends.started, ends.earlier)
-
-    def run(stopped: str) -> Run:
-        spent = dict(watch.seconds)
-        origin = origin_of(recorded, len(rounds.first))
-        return Run(
-            name=problem.name,
-            formulas={name: str(formula) for name, formula in problem.formulas.items()},
-            table=rounds.table,
-            search=repr(recorded),
-            seed=int(seed),
-            batch=rounds.batch,
-            stopped=stopped,
-            compile_seconds=spent.get(COMPILE, 0.0),
-            run_seconds=sum(spent.get(name, 0.0) for name in (SEARCH, SIMULATE, REST)),
-            confirm_seconds=spent.get(CONFIRM, 0.0),
-            search_seconds=spent.get(SEARCH, 0.0),
-            simulate_seconds=spent.get(SIMULATE, 0.0),
-            checks=rounds.checks,
-            version=__version__,
-            prior=origin == "prior",
-            origin=origin,
-            first=rounds.first.tolist(),
-            folder=place,
-            target=target,
-            problem=problem,
-            budget=int(ends.budget),
-            search_data=searches.to_json(recorded),
-            space_data=space_as_data(problem),
-            acceptance=rounds.acceptance,
-            checkpoint=rounds.checkpoint,
-            precision=rounds.precision,
-            backend=choice.backend,
-            confirm=rounds.confirms,
-            guide=None if problem.guide is None else problem.guide.to_json(),
-            sources=models,
-            derived=problem.system.derived,
-            notes=(*chosen, *lasting, *notes, *rounds.chosen, *rounds.notes),
-            lasting_notes=(*lasting, *rounds.chosen),
-        )
-
-    def settled() -> Sequence[Mapping[str, Any]]:
-        return tuple(
-            Sources.from_json(each).settled(begun).to_json() if each is models[-1] else each
-            for each in models
-        )
-
-    if place is not None:
-        with writing(place):
-            rounds.record_checksum = write_record(run("running"), place)
-    known = False
-    stopped, cause = None, None
-    try:
-        with SimulationProgress(problem.name, ends.budget, progress) as bar:
-            slow = problem.system.why_slow_to_compile(search.wants.derivatives)
-            if slow and bar.bar.show:
-                bar.note(slow)
-            elif slow and progress is not False:
-                write_line(f"note: {slow}")
-            with tracing():
-                rounds.compile(resumed)
-            if not resumed:
-                lasting = (*lasting, *nominal_note(problem, rounds.evaluate, search))
-            for note in (*lasting, *notes):
-                bar.note(note)
-            prepare()
-            if rounds.search is not search:
-                search = recorded = rounds.search
-                if place is not None:
-                    # Before any row, so that whoever resumes it does not choose again.
-                    with writing(place):
-                        rounds.record_checksum = write_record(run("running"), place)
-                for note in (*rounds.chosen, *rounds.notes):
-                    bar.note(note)
-            stopped = "exhausted" if rounds.exhausted else None
-            if rounds.hopeless is not None and not keep_going:
-                rounds.take_in_measured()
-                stopped = RAISES
-            with watch.on(REST):
-                while stopped is None:
-                    rounds.advance(min(rounds.batch, ends.budget - len(rounds.table)), ends.budget)
-                    bar.update(len(rounds.table), rounds.found, rounds.best)
-                    notify(callbacks, len(rounds.table), rounds.numbers)
-                    stopped = ends.reached(rounds)
-                    if stopped is None and rounds.hopeless is not None and not keep_going:
-                        stopped = RAISES
-                    if place is not None and not known:
-                        # A run that is killed knows what its first simulations read, too.
-                        known, models = True, settled()
-                        write_record(run("running"), place)
-                    if stopped is None:
-                        rounds.save(seldom=True)
-    except KeyboardInterrupt:
-        stopped = "interrupted"
-    except Exception as error:
-        stopped, cause = format_user_error(error), error
-    rounds.close()
-    models = settled()
-    result = run(stopped)
-    after = notes_after(rounds.table, result.formulas, search, warm)
-    if not rounds.exhausted:
-        simulated = len(rounds.table) - len(rounds.first)
-        after += cut_short_note(search, search.total(problem.space.cube), max(simulated, 0))
-    result = replace(result, notes=(*result.notes, *after))
-    try:
-        rounds.table.close()
-        rounds.save()
-        if place is not None:
-            write_record(result, place)
-    except OSError as error:
-        cause = cause or error
-    if cause is not None:
-        raise RunError(
-            _failure_message(problem.name, len(rounds.table), place, cause), result
-        ) from cause
-    if stopped == RAISES:
-        raise RunError(_hopeless_message(result, rounds.hopeless or "", ends.budget), result)
-    return result
-
-
-def _hopeless_message(run: Run, said: str, budget: int) -> str:
-    """Say what all simulations of a run raised, and how to simulate on."""
-    first = first_message(run)
-    said = one_line(said or ("" if first is None else first[1])).rstrip(".")
-    where = "" if run.folder is None else f" and in {run.folder}, which can be resumed"
-    return (
-        f"the run of {run.name!r} ended after {run.simulations:,} of {budget:,} simulations, since "
-        f"none succeeds: each raised{f' {said}' if said else ' an error'}. They are in the .run of "
-        f"this error{where}. keep_going=True, or --keep-going, simulates all"
-    )
-
-
-def _failure_message(name: str, simulations: int, place: Path | None, cause: Exception) -> str:
-    why = str(cause) if isinstance(cause, OSError) else explain_user_error(cause)
-    message = f"the run of {name!r} broke down after {simulations} simulations: {why}. "
-    if place is None:
-        return f"{message}They are in the .run of this error"
-    if isinstance(cause, OSError) and not place.is_dir():
-        return f"{message}{place} is there no more: all are in the .run of this error, to be saved"
-    if isinstance(cause, OSError):
-        return (
-            f"{message}All of them are in the .run of this error, and in {place} those up to the "
-            "last whole batch that could be written: make room there and resume it, or save the "
-            "run elsewhere"
-        )
-    return f"{message}They are in the .run of this error and in {place}, which can be resumed"

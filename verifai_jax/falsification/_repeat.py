@@ -42,7 +42,7 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Observations, Search
 
 SIMULATIONS_A_CALL = 512
-"""Of each seed between two looks at who has found a failure."""
+"""Of each seed between two looks at who has found a failure: so many at most are made in vain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +58,9 @@ class Trials(InNotebook):
     - `failures`: `[seeds, d]`, the first failing point of each seed in the unit cube, NaN without
       one.
     - `not_claimed`: `[seeds, simulations]`, which of the violating simulations are no failures by
-      closer replays, as in `falsify`; None where these were not asked for. Of a seed they end with
+      closer replays, as in `falsify`; None if these were not asked for. Of a seed they end with
       the first failure that is claimed, unless it was to go on.
-    - `differentiated`: `[seeds, simulations]`, which were differentiated; None where none or all
+    - `differentiated`: `[seeds, simulations]`, which were differentiated; None if none or all
       were.
     - `sources`: what the model was made of, as a run records it.
     """
@@ -163,8 +163,7 @@ def repeat(
       each seed only the first violations are replayed, until one is claimed (all of them without
       `stop_early`), those of all seeds together. False to count violations as simulated, which
       compiles nothing but the search.
-    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
-      once a minute elsewhere.
+    - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     A search that plans its rounds learns that an unclaimed violation is none, as in `falsify`. Any
     other that learns has its rounds compiled together and learns from them as simulated: behind a
@@ -244,7 +243,7 @@ def _first(failing: Bool[np.ndarray, "seeds simulations"]) -> Float[np.ndarray, 
 
 
 def _traced(problem: Problem, backend: str | None) -> Problem | None:
-    """Return the problem on a backend that JAX can trace; None where there is none."""
+    """Return the problem on a backend that JAX can trace; None if there is none."""
     names = (backend,) if backend is not None else problem.system.backends
     for candidate in (problem, *map(problem.on_backend, names)):
         if not candidate.black_box and (candidate.system.backend or backend) != "auto":

@@ -22,7 +22,7 @@ from verifai_jax.search.proposals import Proposals
 
 
 class _Round(NamedTuple):
-    """One round: its points, its place among those that were sent together, the state behind it."""
+    """One round: its points, where it begins among those sent together, the state after it."""
 
     points: Float[Any, "n d"]
     pending: Pending
@@ -75,7 +75,7 @@ class Ahead:
         return each.points, _rows(whole, part)
 
     def close(self) -> None:
-        """Cancel what is queued, and put the proposals back behind the last round taken."""
+        """Cancel what is queued, and put the proposals back to where the last round taken ended."""
         if self._rounds or self._failure is not None:
             for each in self._rounds:
                 each.pending.cancel()

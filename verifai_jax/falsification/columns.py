@@ -41,7 +41,7 @@ def cut(batch: Batch, begin: int, stop: int) -> Batch:
 
 
 def merge(batches: Sequence[Batch]) -> Columns:
-    """Return the columns of batches behind each other."""
+    """Return the columns of batches, one after another."""
     if len(batches) == 1:
         return batches[0][1]
     return {name: np.concatenate([batch[name] for _, batch in batches]) for name in batches[0][1]}
@@ -101,7 +101,7 @@ def wrong_column(columns: Columns, numbers: Sequence[str] = ()) -> str:
 
 
 _KINDS = {"violated": "b", "gradient_finite": "b", "differentiated": "b", "message": "O"}
-"""Kinds of NumPy's types that columns have, beside those of robustness."""
+"""Kinds of NumPy's types that columns have, except those of robustness."""
 _TEXTS = {str, float, type(None)}
 """Types in a column of texts; a NaN of pandas is an absent one."""
 _WORDS = {"b": "truth values", "f": "floating-point numbers", "O": "texts"}
@@ -136,7 +136,7 @@ def column_to_arrow(values: Shaped[np.ndarray, " n"]) -> "pa.Array":
 
 
 def checksum(values: Shaped[np.ndarray, " n"], before: int | None = None) -> int:
-    """Return the checksum of a column, of a part of it behind one with the checksum `before`."""
+    """Return the checksum of a column; of a part of it after one with the checksum `before`."""
     import pandas as pd
 
     if values.dtype == object and len(values) and not isinstance(values[0], str):

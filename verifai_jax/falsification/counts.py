@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from verifai_jax.evaluation.confirmations import NOT_CLAIMED, Repetitions
+from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.columns import Columns
 
 
@@ -49,6 +50,29 @@ class Counts:
     def best(self) -> int | None:
         """Number of the worst row, or of the nearest where none is claimed."""
         return self.nearest if self.worst is None else self.worst
+
+
+@dataclass
+class Tally:
+    """Counts over the rows of a run that is going on.
+
+    - `claimed`: counterexamples that closer replays did not refute.
+    - `violating`: simulations that violate the property.
+    - `without_verdict`: simulations that have none.
+    - `least`: the least robustness.
+    """
+
+    claimed: int = 0
+    violating: int = 0
+    without_verdict: int = 0
+    least: float = float("nan")
+
+    def add(self, verdicts: Verdicts, claimed: Bool[np.ndarray, " n"]) -> None:
+        """Count the rows of a round."""
+        self.claimed += int(np.sum(claimed))
+        self.violating += int(np.sum(verdicts.violated))
+        self.without_verdict += int(np.sum(~verdicts.proper))
+        self.least = float(np.fmin(self.least, np.fmin.reduce(verdicts.least)))
 
 
 def claimed_rows(columns: Columns) -> Bool[np.ndarray, " n"]:

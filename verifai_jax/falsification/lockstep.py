@@ -30,11 +30,11 @@ from verifai_jax.search.repetition import Repetition
 VALUES_AT_ONCE = 256
 """Simulations of one call without derivatives."""
 DERIVATIVES_AT_ONCE = 64
-"""Simulations of one call with derivatives."""
+"""Simulations of one call with derivatives, which need more memory each."""
 
 
 class SeedHistories(NamedTuple):
-    """The simulations of each seed, padded behind its last one.
+    """The simulations of each seed, padded after its last one.
 
     - `rho`: the least robustness; NaN where there is no simulation or no verdict.
     - `violated`: whether the simulation violates the property.

@@ -30,7 +30,7 @@ EVEN = "even_if_changed=True (--even-if-changed) goes on all the same, and notes
 
 
 def sources_of_row(recorded: Sequence[Mapping[str, Any]], row: int) -> Sources | None:
-    """Return what a row of a run was simulated with; None where it is not recorded."""
+    """Return what a row of a run was simulated with; None if it is not recorded."""
     parts = [Sources.from_json(part) for part in recorded]
     return next((part for part in reversed(parts) if part.first <= row), None)
 

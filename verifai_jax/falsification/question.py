@@ -27,9 +27,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SAMPLES = 16
-"""Samples of a signal that are shown, evenly spaced, the first and the last among them."""
+"""Samples of a signal that are shown, evenly spaced, the first and the last among them: a question
+has to stay short for whoever reads it."""
 SIGNALS = 8
-"""Signals that are shown at most, those of formulas first."""
+"""Signals that are shown at most, those of formulas first, for the same reason."""
 
 
 def describe_run(
@@ -169,7 +170,7 @@ def _signals(seen: Replay) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """Convert to what JSON has: no NumPy, no JAX, numbers of six digits, None where not finite."""
+    """Convert to what JSON has: no NumPy, no JAX, numbers of six digits, None if not finite."""
     if isinstance(value, Mapping):
         return {str(name): plain(each) for name, each in value.items()}
     if isinstance(value, list | tuple):

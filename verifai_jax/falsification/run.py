@@ -2,7 +2,7 @@
 
 run.summary()                      what failed, how often, the worst case
 run.table.counterexamples          a DataFrame
-run.replay(run.best)               the trace behind a row
+run.replay(run.best)               the trace of a row
 run.save("runs/mine"); vj.load("runs/mine", problem)
 """
 
@@ -53,7 +53,6 @@ from verifai_jax.falsification.record import (
 from verifai_jax.falsification.table import FINISHED, ErrorTable
 from verifai_jax.falsification.tail import TAIL
 from verifai_jax.features import FeatureSpace
-from verifai_jax.features.density import NoDensityError, log_density, tails
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Rulebook
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
@@ -105,9 +104,9 @@ class Run(InNotebook):
     - `sources`: what the model was made of when the run began, and again where it went on with
       another one: files with their hashes, and versions, as plain data; empty where that is not
       recorded.
-    - `derived`: what a verb made of the problem that it was given, as plain data; None where it was
+    - `derived`: what a verb made of the problem that it was given, as plain data; None if it was
       simulated as it was.
-    - `damage`: what of its files could not be read, in words; such a run cannot be resumed.
+    - `damage`: what of its files could not be read; such a run cannot be resumed.
     """
 
     _internal = frozenset((
@@ -313,6 +312,8 @@ class Run(InNotebook):
         """
         import pandas as pd
 
+        from verifai_jax.features.density import NoDensityError, log_density, tails
+
         rows = self.table.counterexamples if rows is None else rows
         space = self.space
         columns = {str(name): rows[name].to_numpy() for name in rows}
@@ -393,7 +394,7 @@ class Run(InNotebook):
     def _natively(
         self, number: int, values: "pd.Series | Mapping[str, Any]", stored: Mapping[str, Any]
     ) -> Replay | None:
-        """Replay a row that MJX simulated in native MuJoCo; None where that has another number.
+        """Replay a row that MJX simulated in native MuJoCo; None if that has another number.
 
         MJX compiles a program for it first, for half a minute where there are contacts.
         """
@@ -429,7 +430,7 @@ class Run(InNotebook):
         return late("verifai_jax.plotting.scatter", "plot_features")(self, path)
 
     def report(self, path: str | Path, **options: Any) -> Path:
-        """Write the evidence report on the run: one HTML file, and its claims as JSON beside it.
+        """Write the evidence report on the run: one HTML file, and its claims as JSON next to it.
 
         **Arguments:**
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 SEGMENT_ROWS = 1 << 20
-"""Rows of a closed segment."""
+"""Rows of a closed segment, which is read and checked as a whole."""
 SEGMENTS = "table"
 """Name of the folder of the segments."""
 FAILURES = "failures"

@@ -342,7 +342,7 @@ class _StoredRows:
                     )
                 )
                 return future
-            # The nominal features, which are looked at beside the rows.
+            # The nominal features, which are simulated in addition to the rows.
             future.set_result(function(*arguments))
             return future
         except Exception as error:

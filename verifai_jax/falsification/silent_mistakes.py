@@ -140,7 +140,7 @@ def cut_short_note(search: Search, total: int | None, simulated: int) -> tuple[s
     **Arguments:**
 
     - `search`: of the run; it has more points to propose.
-    - `total`: points of the whole search; None where it never ends.
+    - `total`: points of the whole search; None if it never ends.
     - `simulated`: points of it that were simulated.
     """
     if total is None or search.origin == "given" or simulated >= total:

@@ -9,8 +9,6 @@ Derivatives of clauses are wanted for some rounds only, so an evaluator of their
 which is compiled when it is needed.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -43,13 +41,13 @@ class Simulations:
     **Arguments:**
 
     - `problem`: on the backend that it runs on.
-    - `search`: what it wants decides what is computed beside the robustness.
+    - `search`: what it wants decides what is computed in addition to the robustness.
     - `batch`: simulations of a round at most.
     - `seed`: of the run.
     - `precision`, `journal`, `executor`, `target`, `steering`, `keep_traces`, `given`: as for
       `Evaluator`.
 
-    `hopeless` is what all of the rows that were timed raised; None where one did not.
+    `hopeless` is what all of the rows that were timed raised; None if one did not.
     """
 
     def __init__(
@@ -67,7 +65,7 @@ class Simulations:
         keep_traces: bool,
         given: bool = False,
     ) -> None:
-        self.batch, self.keep_traces = batch, keep_traces
+        self.batch, self.keep_traces, self._journals = batch, keep_traces, True
         evaluator = partial(
             Evaluator,
             problem,
@@ -145,7 +143,9 @@ class Simulations:
         if self._measured is not None:
             return self._after_measured(points, first)
         if self._differentiate is None:
-            return self.evaluate(points, temperature, first)
+            return self.evaluate(
+                points, temperature, first, keep_traces=self.keep_traces, journals=self._journals
+            )
         if differentiate:
             return self._differentiate(points, temperature, first)
         return self.evaluate(points, first=first)
@@ -162,15 +162,16 @@ class Simulations:
         points, raising = points[:ALWAYS], Raising()
         together = ALIKE if not timed and engine.system.can_simulate_each else 1
         seconds, parts = float("inf") if len(points) else 0.0, []
-        with self._as_in_a_batch(engine, keep_traces=True):
-            for row in range(0, len(points), together):
-                parts.append(self.evaluate(points[row : row + together], first=row))
-                raising.add(parts[-1].status, parts[-1].messages)
-                # Without the compilation of the monitor.
-                seconds = min(seconds, engine.simulation_seconds)
-                known = seconds < SLOW or row + 1 >= MEASURED
-                if known and (not raising.always or raising.reason is not None):
-                    break
+        for row in range(0, len(points), together):
+            some = points[row : row + together]
+            verdicts = self.evaluate(some, first=row, padded_to=self._whole_batch, keep_traces=True)
+            parts.append(verdicts)
+            raising.add(verdicts.status, verdicts.messages)
+            # Without the compilation of the monitor.
+            seconds = min(seconds, engine.simulation_seconds)
+            known = seconds < SLOW or row + 1 >= MEASURED
+            if known and (not raising.always or raising.reason is not None):
+                break
         self.hopeless = raising.reason
         self._measured = Verdicts.concatenate(parts) if parts else None
         return seconds
@@ -182,9 +183,7 @@ class Simulations:
         """
         self.batch = self.evaluate.batch = batch
         if keep_traces:
-            assert isinstance(self.evaluate.engine, HostEngine)
-            self.keep_traces = self.evaluate.engine.keep_traces = True
-            self.evaluate.engine.journal = None
+            self.keep_traces, self._journals = True, False
 
     def _after_measured(self, points: Float[Any, "n d"], first: int) -> Verdicts:
         """Return the verdicts of the first round, whose first rows are there."""
@@ -193,21 +192,18 @@ class Simulations:
         count = len(known.status)
         if len(points) <= count:
             return known
-        engine = self.evaluate.engine
-        assert isinstance(engine, HostEngine)
-        with self._as_in_a_batch(engine, keep_traces=self.keep_traces):
-            rest = self.evaluate(np.asarray(points)[count:], first=first + count)
+        rest = self.evaluate(
+            np.asarray(points)[count:],
+            first=first + count,
+            padded_to=self._whole_batch,
+            keep_traces=self.keep_traces,
+            journals=self._journals,
+        )
         if not self.keep_traces:
             known = known._replace(traces=None)
         return Verdicts.concatenate([known, rest])
 
-    @contextmanager
-    def _as_in_a_batch(self, engine: HostEngine, keep_traces: bool) -> Iterator[None]:
-        """Let rows that are simulated on their own be those of a whole batch, bit for bit."""
-        before = engine.least, engine.keep_traces
-        engine.least = power_of_two(self.batch)
-        engine.keep_traces = keep_traces
-        try:
-            yield
-        finally:
-            engine.least, engine.keep_traces = before
+    @property
+    def _whole_batch(self) -> int:
+        """Rows that rows on their own are padded to, to be those of a whole batch bit for bit."""
+        return power_of_two(self.batch)

@@ -88,7 +88,7 @@ class ErrorTable(InNotebook):
     **Attributes:**
 
     - `missing`: ranges of rows that are missing, as their files are damaged or gone.
-    - `damage`: what is damaged and what is missing, in words; empty where nothing is.
+    - `damage`: what is damaged and what is missing; empty if nothing is.
     - `changed`: whether rows are others than those that were written, so that no number of the
       table can be relied on.
 
@@ -114,7 +114,7 @@ class ErrorTable(InNotebook):
         self._folder = None if folder is None else folder.absolute()
         self._tail = None if self._folder is None else Tail(self._folder)
         self._segments: list[Segment] = []
-        # Batches behind the segments, each with the number of its first row.
+        # Batches after the segments, each with the number of its first row.
         self._batches: list[Batch] = []
         self._small = 0  # Batches at the end of these that are not joined yet.
         self._next = 0
@@ -546,7 +546,7 @@ class ErrorTable(InNotebook):
             self._next = first
 
     def distrust(self, sentence: str) -> None:
-        """Note that rows have changed since they were written, in words."""
+        """Note that rows have changed since they were written."""
         self.changed = True
         self._note(sentence)
 

@@ -6,7 +6,7 @@
 
 A frame is a header and an Arrow stream of one batch. The header has the number of the first row,
 the length of the stream, its checksum and one of its own: a batch of which a bit has changed is
-left out, those before and behind it are read. A batch that was being written when its process
+left out, those before and after it are read. A batch that was being written when its process
 died is no frame yet.
 """
 

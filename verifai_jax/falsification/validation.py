@@ -78,6 +78,26 @@ def usual_batch(
     return min(1 << (most.bit_length() - 1), 1 << max(3, (int(budget) // 20).bit_length() - 1))
 
 
+def batch_size(
+    asked: int | None,
+    search: Search,
+    budget: int,
+    stop_after: int | None = None,
+    whole: bool = False,
+    diverse: bool = False,
+) -> int:
+    """Return the simulations of a round.
+
+    **Arguments:**
+
+    - `asked`: what the user wants; the default when left out.
+    - `search`, `budget`, `stop_after`, `whole`: as of `usual_batch`.
+    - `diverse`: whether failures far from each other are wanted, which takes many small rounds.
+    """
+    usual = 16 if diverse else usual_batch(search, budget, stop_after, whole)
+    return min(usual if asked is None else asked, budget)
+
+
 def check_options(
     budget: object, batch: object, seed: object, max_seconds: object, stop_after: object
 ) -> None:
@@ -219,7 +239,7 @@ def _why_no_derivatives(problem: Problem) -> str | None:
 
 
 def _why_no_traces(problem: Problem, executor: Executor | None) -> str | None:
-    """Return why a search cannot learn from the traces of this problem; None where it can."""
+    """Return why a search cannot learn from the traces of this problem; None if it can."""
     if executor is not None:
         return "workers of an executor send no traces, which trace_surrogate learns from"
     if problem.rulebook is not None:
@@ -249,7 +269,7 @@ def can_be_slow(problem: Problem, executor: Executor | None) -> bool:
 def slow_search(problem: Problem, seconds: float) -> tuple[Search, str] | None:
     """Return the default search where a simulation takes so long, and a note that says why.
 
-    None where it takes not long enough for another search than the portfolio.
+    None if it takes not long enough for another search than the portfolio.
     """
     if seconds < SLOW:
         return None
@@ -315,7 +335,7 @@ def rows_of_first(first: Sequence[Sequence[float]], problem: Problem) -> np.ndar
 
 
 def space_as_data(problem: Problem) -> dict[str, Any] | None:
-    """Return the feature space as plain data; None where it has no such form."""
+    """Return the feature space as plain data; None if it has no such form."""
     try:
         return problem.space.to_json()
     except ValueError:

@@ -61,8 +61,7 @@ def train_detector(
     - `learning_rate`: of the first step.
     - `noise`: standard deviation of what is added to each pixel, anew in each step.
     - `seed`: of the weights, the order of the images and the noise.
-    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
-      once a minute elsewhere.
+    - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     **Returns:** the network, and the loss of each step.
 

@@ -56,8 +56,7 @@ def write_report(
     - `modes`: simulations spent on all ways of failing of a run and their probabilities, as
       `vj.modes` finds them; none when left out.
     - `problem`: of an estimate, or the baseline of a comparison, for its property and prior.
-    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
-      once a minute elsewhere.
+    - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     **Returns:** the path of the HTML file.
 

@@ -76,8 +76,7 @@ def train(
     - `callbacks`: functions called for each update, in groups every two seconds, with the
       environment steps so far and a dictionary of plain numbers: `update`, and `mean_return` where
       an episode ended in it.
-    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
-      once a minute elsewhere.
+    - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     **Returns:** the policy with its learning curve.
 

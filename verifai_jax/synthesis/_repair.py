@@ -100,8 +100,7 @@ def repair(
     - `gradient`: whether to follow gradients; by default where the system has them without
       changing the backend.
     - `max_seconds`: wall-clock seconds, of which a fifth is kept for the check.
-    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
-      once a minute elsewhere.
+    - `progress`: whether to show one line of progress; see `core.progress` for the default.
     - the others as in `falsify`.
 
     **Returns:** a `Repair`; after Ctrl-C what is finished, without the check.

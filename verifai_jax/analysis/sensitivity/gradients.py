@@ -36,8 +36,7 @@ def gradient_sensitivity(
     - `temperature`: of the smooth robustness that is differentiated; by default a hundredth of the
       standard deviation of the robustness. The bound holds for the smooth robustness, and as far
       as the gradients of the system are its true ones.
-    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
-      once a minute elsewhere.
+    - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     Source: Sobol and Kucherenko, Derivative based global sensitivity measures and their link with
     global sensitivity indices, Mathematics and Computers in Simulation 79 (2009).

@@ -43,8 +43,7 @@ def morris(
       probable cells, so that long-tailed features stay finite. A discrete one takes all of its
       values.
     - `of`: name of the formula; the least robustness of all when left out.
-    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
-      once a minute elsewhere.
+    - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     Sources: Morris, Factorial sampling plans for preliminary computational experiments,
     Technometrics 33 (1991); `mu_star` of Campolongo, Cariboni and Saltelli, An effective screening

@@ -38,8 +38,7 @@ def sobol_indices(
     - `samples`: base points `N`, best a power of two; `N (d + 2)` simulations for `d` coordinates,
       and `N` more where simulations are random.
     - `of`: name of the formula; the least robustness of all when left out.
-    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
-      once a minute elsewhere.
+    - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     Sources: first-order estimator of Saltelli et al., Variance based sensitivity analysis of model
     output, Computer Physics Communications 181 (2010); total of Jansen, Analysis of variance

@@ -1,0 +1,235 @@
+"""Proposals of the search of a run, and what it learns of the simulations.
+
+    learning = Learning(problem, search, key)
+    learning.begin(batch=32)                            # once its programs are being compiled
+    points = learning.proposals.next(32)
+    learning.learn(Batch(points, "search"), objective, verdicts, marks)
+
+A search minimises the robustness of the worst formula, or, where formulas have a priority, the one
+number of `problem.rulebook.Objective`; a guide adds its term. Some searches want more: marks of
+what was covered, what happened in a trace, or a model of the traces (`Surrogate`).
+"""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from verifai_jax.evaluation.steering import Steering
+from verifai_jax.evaluation.verdicts import Verdicts
+from verifai_jax.falsification.marks import MarkBook
+from verifai_jax.problem.problem import Problem
+from verifai_jax.problem.rulebook import Objective
+from verifai_jax.search import Search
+from verifai_jax.search.proposals import Proposals
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from verifai_jax.falsification.surrogates import Surrogate
+
+MAX_WARM = 2048
+"""Rows of an earlier table that a search starts with at most, the worst ones: a bound on what the
+first `tell` costs, whatever the length of that table."""
+
+Source = Literal["search", "first", "suggested"]
+"""Who gave the points of a round: the search, a person before it began, or a person on the way."""
+
+
+class Batch(NamedTuple):
+    """The points of a round.
+
+    - `points`: of the unit cube, or rows of given features (`given_rows`).
+    - `source`: who gave them.
+    - `cut`: whether the budget cut the round.
+    - `verdicts`: if workers have simulated them already.
+    """
+
+    points: Float[Any, "n row"]
+    source: Source
+    cut: bool = False
+    verdicts: Verdicts | None = None
+
+    @property
+    def given(self) -> bool:
+        """True if a person gave the points."""
+        return self.source != "search"
+
+
+class Learning:
+    """The search of a run with what it knows of the simulations; see the module's docstring.
+
+    **Arguments:**
+
+    - `problem`: of the run.
+    - `search`: of the run.
+    - `key`: of the search.
+
+    `surrogate` models the traces for a search that wants it, `marks` counts what was covered.
+    """
+
+    def __init__(self, problem: Problem, search: Search, key: Key[Array, ""]) -> None:
+        self.problem, self.search, self._key = problem, search, key
+        guided = problem.guide is not None and search.learns
+        self.steering = Steering(guide=guided, outcome=search.wants.outcomes)
+        self.marks = MarkBook(problem) if search.wants.marks else None
+        self.surrogate: Surrogate | None = None
+        self._objective = None if problem.rulebook is None else Objective(problem.rulebook)
+        self.proposals: Any = None
+        self.take(search)
+
+    def take(self, search: Search) -> None:
+        """Learn by this search from now on."""
+        self.search = search
+        if search.wants.traces is not None:
+            from verifai_jax.falsification.surrogates import Surrogate
+
+            self.surrogate = Surrogate(self.problem, search.wants.traces, self._key)
+
+    @property
+    def mark_width(self) -> int:
+        """Number of marks of a row at most; 0 if none are counted."""
+        return 0 if self.marks is None else self.marks.width
+
+    def begin(self, batch: int) -> None:
+        """Begin the proposals of the search."""
+        space = self.problem.space
+        improve = None if self.surrogate is None else self.surrogate.improve
+        self.proposals = Proposals(
+            self.search, space.cube, batch, self._key, space.constraint, self.mark_width, improve
+        )
+
+    @property
+    def distinct(self) -> int | None:
+        """Failures that are far from each other, of a search for diverse ones; else None."""
+        return self.proposals.distinct
+
+    @property
+    def acceptance(self) -> float | None:
+        """Share of proposed points that the constraint let through; None without one."""
+        if self.problem.space.where is None or self.proposals is None:
+            return None
+        return self.proposals.accepted / max(self.proposals.proposed, 1)
+
+    def objective(self, verdicts: Verdicts) -> Float[np.ndarray, " n"]:
+        """Return what the search minimises; with a priority it depends on the rows before."""
+        if self._objective is None:
+            return verdicts.least
+        return self._objective(verdicts.rho, verdicts.rho < 0)
+
+    def learn(
+        self,
+        batch: Batch,
+        objective: Float[np.ndarray, " n"],
+        verdicts: Verdicts,
+        marks: Int[np.ndarray, "n marks"] | None,
+    ) -> None:
+        """Let the search learn from a round.
+
+        **Arguments:**
+
+        - `batch`: its points, of the unit cube.
+        - `objective`: what the search minimises at each of them.
+        - `verdicts`: of its simulations.
+        - `marks`: of its simulations, for a search that wants them.
+        """
+        outcomes = None
+        if verdicts.steering is not None:
+            if self.steering.guide:
+                objective = self._guided(objective, verdicts.steering[:, 0])
+            if self.steering.outcome:
+                outcomes = verdicts.steering[:, int(self.steering.guide) :]
+        if batch.given:
+            self._learn_given(batch, objective, verdicts, outcomes)
+        else:
+            self._tell(objective, verdicts, marks, outcomes)
+        if self.surrogate is not None:
+            self.surrogate.learn(batch.points, verdicts)
+
+    def _learn_given(
+        self,
+        batch: Batch,
+        objective: Float[np.ndarray, " n"],
+        verdicts: Verdicts,
+        outcomes: Float[np.ndarray, "n outcome"] | None,
+    ) -> None:
+        """Let the search start from points that a person gave."""
+        self.proposals.remember(batch.points)
+        proper = verdicts.proper
+        points, rho = batch.points[proper], objective[proper].astype(np.float32)
+        outcomes = None if outcomes is None else outcomes[proper]
+        if batch.source == "first":
+            self.proposals.warm_start(points, rho, outcomes)
+            return
+        # The best ones last, so that none of a small batch takes their place.
+        order = np.argsort(-rho, kind="stable")
+        outcomes = None if outcomes is None else outcomes[order]
+        self.proposals.start_from(points[order], rho[order], outcomes)
+
+    def _tell(
+        self,
+        objective: Float[np.ndarray, " n"],
+        verdicts: Verdicts,
+        marks: Int[np.ndarray, "n marks"] | None,
+        outcomes: Float[np.ndarray, "n outcome"] | None,
+    ) -> None:
+        """Tell the search what came of its points, in float32 whatever the simulations do."""
+
+        def single(values: np.ndarray | None) -> np.ndarray | None:
+            return None if values is None else values.astype(np.float32)
+
+        self.proposals.tell(
+            objective.astype(np.float32),
+            verdicts.proper,
+            single(verdicts.gradient),
+            single(verdicts.clauses),
+            single(verdicts.clause_gradients),
+            marks,
+            outcomes,
+        )
+
+    def _guided(
+        self, rho: Float[np.ndarray, " n"], value: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " n"]:
+        """Return the objective with the term of the guide, if there is one."""
+        guide = self.problem.guide
+        return rho if guide is None or not self.steering.guide else guide.steer(rho, value)
+
+    def warm(self, table: "pd.DataFrame") -> None:
+        """Let the search learn from the rows of an earlier table."""
+        proper = table.loc[table["status"] == "ok"] if "status" in table else table
+        proper = proper.loc[np.isfinite(proper["rho"].to_numpy(np.float64))]
+        if len(proper) > MAX_WARM:
+            proper = proper.loc[proper["rho"].nsmallest(MAX_WARM).index.sort_values()]
+        if not len(proper):
+            return
+        rho = proper["rho"].to_numpy(np.float32)
+        names = [f"rho.{name}" for name in self.problem.formulas]
+        if self._objective is not None and all(name in proper for name in names):
+            each = proper[names].to_numpy(np.float64)
+            rho = self._objective(each, each < 0).astype(np.float32)
+        # What the guide says of these rows is unknown; it counts as the least good.
+        rho = self._guided(rho, np.full(len(rho), np.nan, np.float32))
+        self.proposals.warm_start(self.problem.space.points(proper), rho)
+
+    def checkpoint(self) -> dict[str, Any]:
+        """Return what it knows as entries of a checkpoint, but for the state of the search."""
+        state = {} if self._objective is None else self._objective.state
+        entries: dict[str, Any] = {f"objective.{name}": value for name, value in state.items()}
+        for part in (self.surrogate, self.marks):
+            entries |= {} if part is None else part.checkpoint()
+        return entries
+
+    def restore(self, checkpoint: Mapping[str, Any]) -> None:
+        """Go on from a checkpoint.
+
+        **Raises:** `ValueError` for a checkpoint of another search, space or batch size.
+        """
+        self.proposals.restore(checkpoint)
+        if self._objective is not None:
+            names = self._objective.state
+            self._objective.state = {name: checkpoint[f"objective.{name}"] for name in names}
+        for part in (self.surrogate, self.marks):
+            if part is not None:
+                part.restore(checkpoint)

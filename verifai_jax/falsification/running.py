@@ -1,0 +1,311 @@
+"""A run from its first compilation to its result: rounds until something ends them.
+
+    running = Running(rounds, Ending(started, budget), choice, seed)
+    run = running.play(progress=True)
+
+Whatever happens, what is finished is returned or stands in the `run` of the error; a run in a
+folder can be resumed from there.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from verifai_jax import search as searches
+from verifai_jax._version import __version__
+from verifai_jax.core.callbacks import Callback, notify
+from verifai_jax.core.compilation import tracing
+from verifai_jax.core.progress import SimulationProgress, write_line
+from verifai_jax.core.sources import Sources
+from verifai_jax.core.stopwatch import Stopwatch
+from verifai_jax.core.text import one_line
+from verifai_jax.core.user_errors import explain_user_error, format_user_error
+from verifai_jax.evaluation.backends import Choice
+from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
+from verifai_jax.falsification.origin import origin_of
+from verifai_jax.falsification.run import Run, write_record
+from verifai_jax.falsification.silent_mistakes import cut_short_note, nominal_note, notes_after
+from verifai_jax.falsification.summary import first_message
+from verifai_jax.falsification.validation import space_as_data, writing
+from verifai_jax.search import Search
+from verifai_jax.statistics.stopping import StoppingRule
+
+RAISES = "an error of every simulation"
+"""What has stopped a run whose first simulations all raise."""
+
+
+class RunError(RuntimeError):
+    """The loop broke down, or nothing can succeed; `run` holds what was finished before."""
+
+    def __init__(self, message: str, run: Run) -> None:
+        super().__init__(message)
+        self.run = run
+
+
+class Ending(NamedTuple):
+    """The conditions that end a run."""
+
+    started: float
+    budget: int
+    max_seconds: float | None
+    stop_after: int | None
+    stop_when: StoppingRule | None
+    earlier: Mapping[str, float] = MappingProxyType({})
+    """Seconds that an earlier part of the run has taken, by what they were spent on."""
+
+    @property
+    def seconds(self) -> float:
+        return time.perf_counter() - self.started
+
+    def reached(self, rounds: Rounds) -> str | None:
+        """Return the condition that ends the run after this round, if any does."""
+        if self.stop_after is not None and rounds.distinct >= self.stop_after:
+            return "stop_after"
+        if self.stop_when is not None and self.stop_when.done(
+            rounds.tally.violating, len(rounds.table), rounds.tally.without_verdict
+        ):
+            return "stop_when"
+        if len(rounds.table) >= self.budget:
+            return "budget"
+        if rounds.exhausted:
+            return "exhausted"
+        if self.max_seconds is not None and self.seconds >= self.max_seconds:
+            return "max_seconds"
+        return None
+
+
+@dataclass
+class Running:
+    """A run that is going on.
+
+    **Fields:**
+
+    - `rounds`: its rounds, not compiled yet.
+    - `ends`: the conditions that end it.
+    - `choice`: of its backend.
+    - `seed`: of its search and its simulations.
+    - `target`: name of the problem on the command line.
+    - `notes`: on what is likely a mistake.
+    - `lasting`: notes that are still true when the run goes on.
+    - `sources`: what the model is made of, of each part of the run; read now when left out.
+    - `resumed`: whether it goes on from a checkpoint.
+    - `warm`: whether the search starts from the rows of an earlier run.
+    - `keep_going`: whether to simulate on if all of the first simulations raise.
+    """
+
+    rounds: Rounds
+    ends: Ending
+    choice: Choice
+    seed: int
+    target: str | None = None
+    notes: Sequence[str] = ()
+    lasting: Sequence[str] = ()
+    sources: Sequence[Mapping[str, Any]] | None = None
+    resumed: bool = False
+    warm: bool = False
+    keep_going: bool = False
+    _models: tuple[Mapping[str, Any], ...] = field(default=(), init=False)
+
+    def play(
+        self,
+        progress: bool | None,
+        prepare: Callable[[], None],
+        callbacks: Sequence[Callback] = (),
+    ) -> Run:
+        """Compile, `prepare`, and play rounds until something ends them.
+
+        **Raises:** `RunError` with what is finished.
+        """
+        rounds, begun = self.rounds, time.time()
+        now = self.sources
+        self._models = (rounds.problem.sources().to_json(),) if now is None else tuple(now)
+        # Checking and tracing are part of what a second run of the problem does not repeat.
+        rounds.watch = Stopwatch(COMPILE, self.ends.started, self.ends.earlier)
+        self._write_record()
+        stopped, cause = None, None
+        try:
+            with SimulationProgress(rounds.problem.name, self.ends.budget, progress) as bar:
+                self._begin(bar, progress, prepare)
+                stopped = self._play_rounds(bar, callbacks, begun)
+        except KeyboardInterrupt:
+            stopped = "interrupted"
+        except Exception as error:
+            stopped, cause = format_user_error(error), error
+        rounds.close()
+        self._settle(begun)
+        result = self._with_notes_after(self.result(stopped))
+        try:
+            rounds.table.close()
+            rounds.save()
+            if rounds.folder is not None:
+                write_record(result, rounds.folder)
+        except OSError as error:
+            cause = cause or error
+        if cause is not None:
+            message = _failure_message(result.name, len(rounds.table), rounds.folder, cause)
+            raise RunError(message, result) from cause
+        if stopped == RAISES:
+            said = rounds.hopeless or ""
+            raise RunError(_hopeless_message(result, said, self.ends.budget), result)
+        return result
+
+    def _begin(
+        self, bar: SimulationProgress, progress: bool | None, prepare: Callable[[], None]
+    ) -> None:
+        """Compile, and say what was decided; `prepare` may choose another search."""
+        rounds, search = self.rounds, self.rounds.search
+        slow = rounds.problem.system.why_slow_to_compile(search.wants.derivatives)
+        if slow and bar.bar.show:
+            bar.note(slow)
+        elif slow and progress is not False:
+            write_line(f"note: {slow}")
+        with tracing():
+            rounds.compile(self.resumed)
+        if not self.resumed:
+            nominal = nominal_note(rounds.problem, rounds.evaluate, search)
+            self.lasting = (*self.lasting, *nominal)
+        for note in (*self.lasting, *self.notes):
+            bar.note(note)
+        prepare()
+        if rounds.search is not search:
+            # Before any row, so that whoever resumes it does not choose again.
+            self._write_record()
+            for note in (*rounds.chosen, *rounds.notes):
+                bar.note(note)
+
+    def _play_rounds(
+        self, bar: SimulationProgress, callbacks: Sequence[Callback], begun: float
+    ) -> str:
+        """Play rounds; return what has ended them."""
+        rounds, budget, settled = self.rounds, self.ends.budget, False
+        stopped = "exhausted" if rounds.exhausted else None
+        if self._is_hopeless:
+            rounds.take_in_measured()
+            return RAISES
+        with rounds.watch.on(REST):
+            while stopped is None:
+                rounds.advance(min(rounds.batch, budget - len(rounds.table)), budget)
+                bar.update(len(rounds.table), rounds.tally.claimed, rounds.tally.least)
+                notify(callbacks, len(rounds.table), rounds.numbers)
+                stopped = self.ends.reached(rounds)
+                if stopped is None and self._is_hopeless:
+                    stopped = RAISES
+                if rounds.folder is not None and not settled:
+                    # A run that is killed knows what its first simulations read, too.
+                    settled = True
+                    self._settle(begun)
+                    write_record(self.result("running"), rounds.folder)
+                if stopped is None:
+                    rounds.save(seldom=True)
+        return stopped
+
+    def _settle(self, begun: float) -> None:
+        """Note which files the simulations have read by now."""
+        if self._models:
+            last = Sources.from_json(self._models[-1]).settled(begun)
+            self._models = (*self._models[:-1], last.to_json())
+
+    @property
+    def _is_hopeless(self) -> bool:
+        """Whether more simulations would only raise the same, and nobody wants them."""
+        return self.rounds.hopeless is not None and not self.keep_going
+
+    def _write_record(self) -> None:
+        """Write the record of the run as it is now, for whoever resumes it."""
+        folder = self.rounds.folder
+        if folder is not None:
+            with writing(folder):
+                self.rounds.record_checksum = write_record(self.result("running"), folder)
+
+    def _with_notes_after(self, result: Run) -> Run:
+        """Return the result with notes on what all of its simulations have in common."""
+        rounds, search = self.rounds, self.rounds.search
+        after = notes_after(rounds.table, result.formulas, search, self.warm)
+        if not rounds.exhausted:
+            simulated = len(rounds.table) - len(rounds.first)
+            total = search.total(rounds.problem.space.cube)
+            after += cut_short_note(search, total, max(simulated, 0))
+        return replace(result, notes=(*result.notes, *after))
+
+    @property
+    def _recorded_search(self) -> Search:
+        """The search with the suggestions that it is wrapped in."""
+        asked = self.rounds.suggestions
+        return self.rounds.search if asked is None else asked.search
+
+    def result(self, stopped: str) -> Run:
+        """Return the run as it is now.
+
+        - `stopped`: what has ended it.
+        """
+        rounds, problem, search = self.rounds, self.rounds.problem, self._recorded_search
+        spent = dict(rounds.watch.seconds)
+        origin = origin_of(search, len(rounds.first))
+        why = self.choice.why
+        chosen = (f"backend {self.choice.backend}: {why}",) if why else ()
+        return Run(
+            name=problem.name,
+            formulas={name: str(formula) for name, formula in problem.formulas.items()},
+            table=rounds.table,
+            search=repr(search),
+            seed=int(self.seed),
+            batch=rounds.batch,
+            stopped=stopped,
+            compile_seconds=spent.get(COMPILE, 0.0),
+            run_seconds=sum(spent.get(name, 0.0) for name in (SEARCH, SIMULATE, REST)),
+            confirm_seconds=spent.get(CONFIRM, 0.0),
+            search_seconds=spent.get(SEARCH, 0.0),
+            simulate_seconds=spent.get(SIMULATE, 0.0),
+            checks=rounds.checks,
+            version=__version__,
+            prior=origin == "prior",
+            origin=origin,
+            first=rounds.first.tolist(),
+            folder=rounds.folder,
+            target=self.target,
+            problem=problem,
+            budget=int(self.ends.budget),
+            search_data=searches.to_json(search),
+            space_data=space_as_data(problem),
+            acceptance=rounds.learning.acceptance,
+            checkpoint=rounds.checkpoint,
+            precision=rounds.precision,
+            backend=self.choice.backend,
+            confirm=rounds.confirms,
+            guide=None if problem.guide is None else problem.guide.to_json(),
+            sources=self._models,
+            derived=problem.system.derived,
+            notes=(*chosen, *self.lasting, *self.notes, *rounds.chosen, *rounds.notes),
+            lasting_notes=(*self.lasting, *rounds.chosen),
+        )
+
+
+def _hopeless_message(run: Run, said: str, budget: int) -> str:
+    """Say what all simulations of a run raised, and how to simulate on."""
+    first = first_message(run)
+    said = one_line(said or ("" if first is None else first[1])).rstrip(".")
+    where = "" if run.folder is None else f" and in {run.folder}, which can be resumed"
+    return (
+        f"the run of {run.name!r} ended after {run.simulations:,} of {budget:,} simulations, since "
+        f"none succeeds: each raised{f' {said}' if said else ' an error'}. They are in the .run of "
+        f"this error{where}. keep_going=True, or --keep-going, simulates all"
+    )
+
+
+def _failure_message(name: str, simulations: int, place: Path | None, cause: Exception) -> str:
+    why = str(cause) if isinstance(cause, OSError) else explain_user_error(cause)
+    message = f"the run of {name!r} broke down after {simulations} simulations: {why}. "
+    if place is None:
+        return f"{message}They are in the .run of this error"
+    if isinstance(cause, OSError) and not place.is_dir():
+        return f"{message}{place} is there no more: all are in the .run of this error, to be saved"
+    if isinstance(cause, OSError):
+        return (
+            f"{message}All of them are in the .run of this error, and in {place} those up to the "
+            "last whole batch that could be written: make room there and resume it, or save the "
+            "run elsewhere"
+        )
+    return f"{message}They are in the .run of this error and in {place}, which can be resumed"
