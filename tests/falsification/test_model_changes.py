@@ -138,10 +138,10 @@ def test_a_run_that_recorded_no_model_says_so(folder):
     (folder / "run.json").write_text(json.dumps(sealed(record)))
     steeper = slope(STEEPER)
     run = vj.load(folder, steeper)
-    assert run.sources == ()
+    assert not run.sources
     assert run.changes() == ()
     assert "is not recorded" in run.replay(0).finding
-    assert vj.resume(folder, steeper, budget=12, progress=False).sources == ()
+    assert not vj.resume(folder, steeper, budget=12, progress=False).sources
 
 
 def test_a_damaged_record_of_it_is_refused(folder):
