@@ -181,7 +181,7 @@ def test_a_number_is_the_choice_before_it_is_an_index(choices, value, choice):
         domain.check(value, "c")
     else:
         value = choices[1]
-        assert domain._place(value) == 1
+        assert domain._index_of(value) == 1
         return
     index = domain.coerce(value)
     assert domain.to_columns(np.asarray(index)[None], "c")["c"].tolist() == [choice]

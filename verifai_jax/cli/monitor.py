@@ -17,8 +17,7 @@ from verifai_jax.core.text import printable
 
 if TYPE_CHECKING:
     from verifai_jax.core.trace import Trace
-    from verifai_jax.mtl.columns import LeftOut
-from verifai_jax.mtl import Formula
+    from verifai_jax.mtl import Formula
 
 
 @command()
@@ -64,6 +63,7 @@ def monitor(
     import jax
 
     from verifai_jax import mtl
+    from verifai_jax.mtl.columns import LeftOut
 
     if (explain or plot is not None) and compat is not None:
         raise click.UsageError("--explain and --plot do not go with --compat")

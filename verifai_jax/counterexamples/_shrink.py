@@ -40,7 +40,6 @@ from verifai_jax.counterexamples.selection import (
 )
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.run import Run
-from verifai_jax.features.continuous import Continuous
 from verifai_jax.problem.problem import Problem
 
 ORDERS = ("count", "distance")
@@ -123,8 +122,8 @@ class Shrunk(Drawn, InNotebook):
         name = self.problem.name
         domains = self.problem.space.domains.values()
         # A distribution has no width: what counts is the probability between two values.
-        unbounded = any(isinstance(domain, Continuous) for domain in domains)
-        unit = "prior, in probability" if unbounded else "range"
+        thins_out = any(any(domain.tailed) for domain in domains)
+        unit = "prior, in probability" if thins_out else "range"
         if not self.count:
             lines = [
                 f"{name}: the nominal features fail themselves, with robustness {self.rho:z.4g}; "
