@@ -68,7 +68,7 @@ def test_report_on_disk(found, tmp_path):
     assert "x &lt;= 0.3" in page or "&lt;= " in page
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("failing", ["none", "one", "three", "all", "any", "empty", "single"])
 def test_odd_tables(failing, tmp_path):
     frame = failing_table(60)
@@ -109,7 +109,7 @@ def test_only_constant_columns():
     assert "nothing varies" in str(found)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_runs_are_described_by_their_search(tmp_path):
     def system(features, key):
         broken = features["a"] > 0.9

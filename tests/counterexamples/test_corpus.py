@@ -144,7 +144,7 @@ def test_bad_files_are_named_and_do_not_stop_the_others(tmp_path):
         never.save_counterexamples(tmp_path)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_command(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "spec.py").write_text(

@@ -95,7 +95,7 @@ def edges():
     return vj.falsify(problem_of("edge", 3, edge), "uniform", 512, batch=512, progress=False)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_edge_of_two_half_spaces(edges):
     for seed, row in enumerate(starts(edges, 3)):
         checked(edges, row, EDGE, EDGE[1], seed=seed)
@@ -328,7 +328,7 @@ def test_half_spaces(d):
         checked(run, row, fewest_of_half(a, 0.3), 0.3, seed=seed, others=seed % 2 == 0)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("d", [2, 4, 6])
 def test_the_nearer_of_two_modes(d):
     run = vj.falsify(problem_of("modes", d, two_modes), "uniform", 4096, batch=4096, progress=False)
@@ -355,7 +355,7 @@ def test_curved_boundaries():
         checked(run, row, (1, 0.2), 0.2, seed=seed, others=seed % 2 == 0)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_robustness_of_two_values():
     def yes_or_no(u):
         return jnp.where((u[0] > 0.75) & (u[2] < 0.3), -1.0, 1.0)

@@ -42,7 +42,7 @@ def lists_what_rebuilds_it(small):
     return True
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("cars", [[FAST], [SLOW, SLOW, FAST], [FAST] * 4])
 def test_the_items_of_nominal_stay(cars):
     small = shrunk("always fastest < 30", cars)
@@ -53,7 +53,7 @@ def test_the_items_of_nominal_stay(cars):
     assert lists_what_rebuilds_it(small)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_added_items_are_counted_and_listed_wherever_they_are(tmp_path):
     small = shrunk("always many < 4", [SLOW] * 4)
     assert list(small.changed) == ["cars.length", *(f"cars[{i}].{n}" for i in (2, 3) for n in "xv")]

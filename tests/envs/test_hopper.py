@@ -100,7 +100,7 @@ def test_an_ordinary_day_is_safe(name):
     assert min(seen.rho.values()) > 0.05
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_few_samples_find_a_failure():
     problem = specs.upright.on_backend("native")
     run = vj.falsify(problem, "uniform", 64, batch=64, seed=0)
@@ -185,7 +185,7 @@ def test_a_row_is_the_same_simulation_in_any_batch():
         np.testing.assert_array_equal(trace["pitch"], whole["pitch"][:count])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_replays_are_exact():
     run = vj.falsify(specs.upright, "uniform", 70, batch=64, backend="native")
     for row in (int(run.best.name), 69):

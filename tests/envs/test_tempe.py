@@ -115,7 +115,7 @@ def test_notice_helps_those_too_who_start_too_near_to_halt():
     assert (simulate(points, notice=0.0) < 0.02).mean() > 0.15
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_system_agrees_with_an_independent_simulation():
     points = features_of(3, 200)
     system = jax.jit(jax.vmap(lambda row: jnp.min(specs.accident.system(row, KEY)["gap"])))
@@ -186,7 +186,7 @@ def test_the_scenes_of_the_scenic_program_have_the_same_curve():
         assert fisher_exact(table)[1] > 0.01 / len(notices)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_most_collisions_happen_between_cars_that_hide_each_other():
     both = vj.Problem(
         "both", specs.views, model.tempe(), {"safe": specs.SAFE, "premise": specs.PREMISE}

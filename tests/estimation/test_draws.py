@@ -72,7 +72,7 @@ def test_noise_alone_is_counted():
     assert answer.prior.simulations > 8000
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_problem_that_draws_is_estimated_as_one():
     def system(features, key):
         margin = 5.0 - features["x0"] - 0.45 * jax.random.normal(key)

@@ -78,7 +78,7 @@ def traced():
     return vj.falsify(problem_of(ramp), "uniform", 200, batch=64).table.all
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_lock_step_gives_the_table_of_the_traced_system(traced):
     table = vj.falsify(problem_of(LockStep()), "uniform", 200, batch=64).table.all
     assert (table["message"] == "").all()

@@ -154,7 +154,7 @@ def test_islands_inside_a_box_are_modes_with_their_areas():
     assert found.low / 1.01 <= areas.sum() <= found.high * 1.01
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_mode_is_replayed_explained_and_shrunk(found, tmp_path):
     assert found[0].replay().violated
     assert "margin" in found[0].cause

@@ -70,7 +70,7 @@ def test_every_form_is_simulated_as_it_is(problem, precision):
     assert one.loc[0].equals(table.loc[2].rename(0))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_rows_before_a_search_and_suggestions(tmp_path):
     options = {"batch": 8, "first": [ROW], "folder": tmp_path / "run"}
     run = vj.falsify(PROBLEM, "cross_entropy", 16, **options)

@@ -33,7 +33,7 @@ def test_agrees_with_runs_of_the_same_seeds(problem, name):
         np.testing.assert_allclose(rho, run.table.all["rho"], atol=2e-4)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_says_how_soon_and_how_surely(problem):
     trials = vj.repeat(problem, "gradient", 300, batch=4, seeds=12)
     assert trials.falsified == 12
@@ -68,7 +68,7 @@ def test_refuses_what_needs_the_host(problem):
         vj.repeat(problem, "uniform", 8, seeds=[])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("search", ["uniform", "portfolio"])
 @pytest.mark.parametrize("spec", ["always k < 7", "always k <= 7"])
 def test_a_failure_is_what_it_is_in_falsify(search, spec):

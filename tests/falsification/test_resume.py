@@ -124,7 +124,7 @@ class Own(search.Uniform):
     """A search that verifai_jax does not know by name."""
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_black_box_with_everything_that_a_space_has(tmp_path):
     def cars(features):
         items = features["cars"]

@@ -173,7 +173,7 @@ def plateau(f, key):
     return vj.Trace({"x": jnp.maximum(0.0, 1 - mean / 0.2)[None].repeat(2)}, dt=1.0)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["gradient", "portfolio"])
 def test_descents_start_from_suggestions_whenever_they_come(name):
     space = {each: vj.Box(0.0, 1.0) for each in NAMES}

@@ -66,7 +66,7 @@ def test_resumed_it_proposes_the_same(tmp_path):
     assert len(whole.checkpoint["surrogate.rho"]) == 32
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_rows_without_a_trace_and_of_other_lengths_are_simulated_as_well():
     def odd(features):
         trace = oscillator(features)
@@ -114,7 +114,7 @@ def test_compiled_systems_keep_the_monitored_signals():
     assert Evaluator(traced_problem(), 4)(u).traces is None
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_system_that_jax_traces_is_learned_as_a_black_box_is():
     run = vj.falsify(traced_problem(), SMALL, 64, batch=8, seed=1, progress=False, stop_after=1)
     assert run.search.startswith("TraceSurrogate(")

@@ -33,7 +33,7 @@ SPACE = FeatureSpace(
 BASE = {"x": 2, "n": 0, "gear": 3, "alg": "a", "wind": [0, 0], "cars": []}
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "wanted"),
     [

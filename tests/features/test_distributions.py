@@ -60,7 +60,7 @@ class TestEveryDistribution:
         values = np.asarray(jax.vmap(domain.from_unit)(u), np.float64)
         assert scipy.stats.kstest(values, REFERENCES[domain].cdf).pvalue > 1e-3
 
-    @pytest.mark.thorough
+    @pytest.mark.slow
     def test_ends_and_their_slopes_are_finite(self, domain):
         ends = jnp.array([0.0, 1.0], jnp.float32)
         slope = jax.grad(lambda u: domain.from_unit(u[None]))

@@ -112,7 +112,7 @@ def test_refused(make, message):
         make()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("hold", ["linear", "constant"])
 def test_refined_spaces_hold_the_same_functions(hold):
     signal = Signal(Box(-1, 1), 4, hold=hold)

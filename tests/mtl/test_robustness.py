@@ -90,7 +90,7 @@ def test_lanes_within_lanes_and_a_temperature_for_each(batch):
             np.testing.assert_allclose(values[i, j], rho(x[i, j], taus[j]), rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_whole_signal_in_batches_with_its_gradient(batch):
     x, y = batch["x"][:4], batch["y"][:4]
     formula = parse("F[0,1] (x > y)")

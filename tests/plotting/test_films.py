@@ -55,7 +55,7 @@ def share_of_red(picture):
     return float(((picture[..., 0] > 90) & (picture[..., 1:].max(-1) < 70)).mean())
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [2.0, 60.0], ids=["near", "far"])
 def test_a_film_sees_what_moves(gl, speed):
     motion = rolling(speed=speed)
@@ -207,7 +207,7 @@ def test_an_environment_that_draws_nothing_says_so():
         seen.animate()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_brax_environment_is_drawn_by_mujoco(gl):
     pytest.importorskip("brax")
 

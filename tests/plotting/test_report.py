@@ -78,7 +78,7 @@ def pushed(features, key):
     return vj.Trace({f"s{k}": k * clock for k in range(7)} | {"x": wind, "y": clock}, dt=0.25)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_replay_shows_inputs_and_the_bounds_of_all_formulas(tmp_path):
     wind = vj.Signal(vj.Box(1, 2), knots=2, duration=1.0)
     specs = {"low": "always (x > 0.5 & abs(y) < 0.5)", "high": "always (9 > x & x < 8 & x < 7)"}

@@ -154,7 +154,7 @@ def test_claims_cite_evidence_and_assumptions(report):
     assert json.loads(block) == claims
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_without_its_problem_a_run_is_reported_too(folder, tmp_path):
     path = tmp_path / "gallery.html"
     command = ["report", str(folder), "--without-problem", "--output", str(path)]

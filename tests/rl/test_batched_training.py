@@ -68,7 +68,7 @@ def test_going_on_is_the_same_as_going_through(group, policies):
     assert training.seconds(0) > 0
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_goes_on_in_other_company_compiles_nothing_new(group, policies, compiled):
     other = [replace(c, algorithm=replace(c.algorithm, horizon=64)) for c in group]
     list(BatchedTraining(other).advance({0: 256}))

@@ -120,6 +120,7 @@ class TestWithScenic:
         assert float(scene["ego"]["z"]) == pytest.approx(2.25)
         assert float(scene["ego"]["pitch"]) == pytest.approx(0.2)
 
+    @pytest.mark.slow
     def test_a_run_over_compiled_scenes(self, tmp_path):
         program = vj.scenic(GALLERY / "cones.scenic")
 

@@ -66,7 +66,7 @@ def asked(search, cube, rho, rounds, batch=8, valid=True):
     return np.concatenate(seen), state
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("value", "valid"),
     [
@@ -153,7 +153,7 @@ def test_small_and_large_batches(search, batch):
     assert np.mean(late[:, ::2]) < 0.3
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_contract_of_expected_improvement():
     """That of Thompson sampling, the default, is among those of all searches."""
     cube = Cube((3, 0, 9), weights=((0.7, 0.2, 0.1), None, None), ordered=(False, True, True))

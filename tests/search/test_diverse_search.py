@@ -128,7 +128,7 @@ def modes_found(search, d, count, batch, rounds, seeds, after):
     return np.asarray(jax.jit(jax.vmap(one))(centres, radii, keys))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_all_modes_are_found_where_the_plain_search_finds_few():
     d, count = 4, 6
     plain = modes_found(CrossEntropy(), d, count, 32, 120, 10, after=100)
@@ -185,7 +185,7 @@ def test_what_is_near_a_failure_is_told_as_worse_than_safe():
     assert float(seen.rho[3]) == np.float32(0.3)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_gradient_is_that_of_the_raised_robustness():
     cube, search = Cube((0, 0, 0)), Diverse(Descent(), radius=0.3)
     state = search.init(jax.random.key(0), cube, 4)

@@ -120,7 +120,7 @@ def test_sampled_functions_have_the_moments_of_the_posterior(process):
     assert np.all(np.abs(std) > 0.03)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_fitting_finds_the_coordinates_that_matter():
     rng = np.random.default_rng(4)
     x = rng.random((96, 3))

@@ -14,7 +14,7 @@ from verifai_jax.search.portfolio import OPENING, TAKEN
 CUBE = Cube((0,) * 4)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_no_descent_starts_twice_from_one_of_the_best_points():
     def hilly(u):  # Many hollows, and no failure.
         return 2 + jnp.sum(jnp.cos(23 * u) + (u - 0.4) ** 2)

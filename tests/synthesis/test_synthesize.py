@@ -150,7 +150,7 @@ def black_box(features):
     return vj.Trace({"x": x, "u": rate * x}, dt=0.1)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_black_box_with_a_choice_and_simulations_that_raise():
     problem = vj.Problem(
         "box",

@@ -96,7 +96,7 @@ def test_ctrl_c_is_no_row():
         outcome_of(lambda: blackbox(interrupted)({}))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [None, 1])
 def test_a_message_that_utf8_cannot_hold_is_stored(tmp_path, workers):
     system = blackbox(troubled, workers=workers)

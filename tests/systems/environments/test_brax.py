@@ -200,7 +200,7 @@ def test_falsified_in_batches(changed):
     assert 0 < len(run.table.counterexamples) < 64
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_keeps_the_contract_of_systems():
     system = brax(Slide(), jitter, steps=30, features={"mass": "mass[0]", "drag": "drag"})
     check_system(system, vj.FeatureSpace({"mass": vj.Box(1.0, 4.0), "drag": vj.Box(0.0, 1.0)}))

@@ -159,7 +159,7 @@ def test_falsified_in_batches():
     assert run.replay(run.table.counterexamples.index[0]).trace.length < 51
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_keeps_the_contract_of_systems():
     system = gymnax(
         "CartPole-v1", coin, steps=50, features=["masspole"], initial={"spin": "theta_dot"}

@@ -85,7 +85,7 @@ def test_a_problem_with_it_is_falsified():
     assert len(run.table.failed) == 0
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_each_solver_that_is_known_can_be_used():
     diffrax = pytest.importorskip("diffrax")
     solvers = _solvers(diffrax)
