@@ -4,7 +4,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import equinox
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,7 +36,7 @@ def check_same(loaded, function, size=3):
         np.testing.assert_allclose(loaded.act(observation), function(observation), rtol=1e-6)
 
 
-def test_flax_and_equinox():
+def test_flax():
     module = Actor()
     variables = module.init(jax.random.key(0), jnp.zeros(3))
     loaded = policy((module, variables))
@@ -45,6 +44,11 @@ def test_flax_and_equinox():
     assert len(jax.tree.leaves(loaded)) == 4
     other = NnxActor(nnx.Rngs(0))
     check_same(policy(other), other)
+
+
+@pytest.mark.thorough
+def test_equinox():
+    equinox = pytest.importorskip("equinox")
     mlp = equinox.nn.MLP(3, 2, 4, 1, key=jax.random.key(1))
     check_same(policy(mlp), mlp)
 
