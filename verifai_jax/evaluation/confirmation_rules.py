@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from verifai_jax.core.text import listed
 from verifai_jax.evaluation.confirmations import (
     CHECK_TEXTS,
     FINER,
@@ -172,8 +173,7 @@ def describe_disagreement(
 
 
 def _and(names: Sequence[str]) -> str:
-    words = [CHECK_TEXTS[name] for name in names]
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+    return listed([CHECK_TEXTS[name] for name in names])
 
 
 def _moved(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from verifai_jax.core.notebook import InNotebook
+from verifai_jax.core.text import listed
 from verifai_jax.core.trace import Status
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ def describe_checks(checks: Collection[str], *, of_step: bool = True) -> str:
         parts.append("one rounding of the features away")
     if "simulator" in checks:
         parts.append("in the other simulator")
-    text = " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
+    text = listed(parts)
     if text and of_step and "quarter_step" not in checks:
         exact = EXACT_STEP in checks
         text += "; the step belongs to the system" if exact else "; no finer step could be tried"

@@ -224,7 +224,7 @@ def _label(search: Search) -> str:
 
 
 def _why_no_derivatives(problem: Problem) -> str | None:
-    """Return why a search cannot follow derivatives on this problem; None where it can."""
+    """Return why a search cannot follow derivatives on this problem; None if it can."""
     if problem.black_box:
         return "the system is a black box"
     if problem.rulebook is not None:

@@ -114,7 +114,7 @@ class Policy:
 
     - `weights`: pytree of arrays.
     - `compute(weights, observation, memory) -> (outputs, memory)`: a pure function; the memory is
-      None where there is none.
+      None for a network without memory.
     - `initial_memory`: what it remembers at the start of an episode; None for a policy that
       remembers nothing.
     - `normaliser`: applied to observations first; None for none.

@@ -7,6 +7,7 @@ policy(torch_module, observation=np.zeros(48))
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -107,8 +108,7 @@ def policy(
     if stated:
         low_, high_ = (() if v is None else bounds(v, n) for v, n in ((low, "low"), (high, "high")))
         changes["actions"] = Actions(action or "clip", low_, high_)
-    fields = ("weights", "compute", "initial_memory", "normaliser", "actions")
-    loaded = type(loaded)(**({name: getattr(loaded, name) for name in fields} | changes))
+    loaded = replace(loaded, **changes)
     if stack > 1:
         if observation is None:
             raise PolicyError("stack= needs observation=, an example of a single observation")

@@ -4,13 +4,12 @@ policy = from_object(model, observation=np.zeros(8))
 """
 
 import contextlib
-import inspect
 import io
 import json
 import logging
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -28,6 +27,7 @@ from verifai_jax.policies.base import Policy
 from verifai_jax.policies.errors import PolicyError
 from verifai_jax.policies.onnx_graph import read_onnx
 from verifai_jax.policies.sb3 import read_sb3
+from verifai_jax.systems.environments.episode import count_required, without_extras
 
 log = logging.getLogger("verifai_jax.policies")
 
@@ -70,7 +70,7 @@ def from_object(source: object, observation: ArrayLike | None, batched: bool) ->
             None if a is not None else leaf for a, leaf in zip(arrays, leaves, strict=True)
         )
         return Policy(arrays, _Rebuilt(structure, rest))
-    if _count(source) == 2:
+    if count_required(source) == 2:
         return RandomPolicy((), _Function(source, batched))
     return Policy((), _Function(source, batched))
 
@@ -80,22 +80,12 @@ def _is_a(source: object, module: str, name: str) -> bool:
     return any((c.__module__, c.__name__) == (module, name) for c in type(source).__mro__)
 
 
-def _count(function: Callable[..., Any]) -> int | None:
-    """Count the arguments without a default."""
-    try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):
-        return None
-    plain = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    return sum(p.kind in plain and p.default is p.empty for p in parameters)
-
-
 class RandomPolicy(Policy):
     """A policy that draws: a function of `(observation, key)`, such as those of Brax."""
 
     def act(self, observation: PyTree, key: Key[Array, ""]) -> Any:
         """Return an action drawn with the random key of the step."""
-        return self.actions(_Function.first(self.compute.function(observation, key)))  # pyright: ignore
+        return self.actions(without_extras(self.compute.function(observation, key)))  # pyright: ignore
 
 
 jax.tree_util.register_dataclass(
@@ -112,7 +102,7 @@ class _Applied:
     module: Any
 
     def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
-        return _Function.first(self.module.apply(weights, observation)), None
+        return without_extras(self.module.apply(weights, observation)), None
 
 
 @dataclass(frozen=True)
@@ -123,7 +113,7 @@ class _Merged:
 
     def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
         nnx = require("flax.nnx", extra="policies")
-        return _Function.first(nnx.merge(self.graph, weights)(observation)), None
+        return without_extras(nnx.merge(self.graph, weights)(observation)), None
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +125,7 @@ class _Rebuilt:
 
     def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
         leaves = [r if w is None else w for w, r in zip(weights, self.rest, strict=True)]
-        return _Function.first(jax.tree.unflatten(self.structure, leaves)(observation)), None
+        return without_extras(jax.tree.unflatten(self.structure, leaves)(observation)), None
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,12 +138,6 @@ class _Function:
     function: Callable[..., Any]
     batched: bool = False
 
-    @staticmethod
-    def first(result: Any) -> Any:
-        """Return the action of `(action, extras)`, which Brax's policies return."""
-        pair = isinstance(result, tuple) and len(result) == 2
-        return result[0] if pair and isinstance(result[1], Mapping) else result
-
     @cached_property
     def forms(self) -> dict[Any, Any]:
         """Shapes of observations that the host computes, with the form of the action."""
@@ -164,15 +148,13 @@ class _Function:
         key = str(shapes)
         if key not in self.forms:
             try:
-                traced = self.first(self.function(observation))
+                traced = without_extras(self.function(observation))
                 return jax.tree.map(jnp.asarray, traced), None
             except Exception as error:
                 self.forms[key] = self._form(observation, error)
-        if (form := self.forms[key]) is None:
-            return self.first(self.function(observation)), None
         action = jax.pure_callback(
             self._on_host,
-            form,
+            self.forms[key],
             observation,
             vmap_method="broadcast_all" if self.batched else "sequential",
         )
@@ -180,7 +162,7 @@ class _Function:
 
     def _on_host(self, observation: PyTree) -> Any:
         seen = jax.tree.map(np.asarray, observation)
-        return jax.tree.map(_plain, self.first(self.function(seen)))
+        return jax.tree.map(_plain, without_extras(self.function(seen)))
 
     def _form(self, observation: PyTree, error: Exception) -> Any:
         """Return the form of the action on the host, and say what it costs.

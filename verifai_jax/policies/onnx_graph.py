@@ -146,14 +146,15 @@ def read_onnx(
     weights = {n: jnp.asarray(a) for n, a in arrays.items() if a.dtype.kind == "f" and a.size}
     constants = {n: a for n, a in arrays.items() if n not in weights}
     made = [o.name for o in graph.output]
-    pairs = _memory(fed, graph.output, memory, what)
-    left = [i for i in fed if i.name not in dict(pairs)]
+    feeds = dict(_memory(fed, graph.output, memory))
+    left = [i for i in fed if i.name not in feeds]
+    remembered = [i for i in fed if i.name in feeds]
     if not left:
         raise PolicyError(f"{what} has no input for an observation")
     inputs = {i.name: len(i.type.tensor_type.shape.dim) for i in left}
-    chosen = _output([n for n in made if n not in dict(pairs).values()], output, made, what)
-    start = tuple(jnp.zeros(_shape(i)) for i in fed if i.name in dict(pairs)) or None
-    ordered = tuple((i.name, dict(pairs)[i.name]) for i in fed if i.name in dict(pairs))
+    chosen = _output([n for n in made if n not in feeds.values()], output, made, what)
+    start = tuple(jnp.zeros(_shape(i)) for i in remembered) or None
+    ordered = tuple((i.name, feeds[i.name]) for i in remembered)
     return Graph(nodes, constants, inputs, ordered, chosen), weights, start
 
 
@@ -265,7 +266,7 @@ def _shape(value: Any) -> tuple[int, ...]:
 
 
 def _memory(
-    fed: Sequence[Any], made: Sequence[Any], stated: Mapping[str, str] | None, what: str
+    fed: Sequence[Any], made: Sequence[Any], stated: Mapping[str, str] | None
 ) -> list[tuple[str, str]]:
     """Return the inputs that are memory with the outputs that are their next values."""
     if stated is not None:

@@ -387,7 +387,7 @@ def _pool(largest: bool) -> Callable[..., Any]:
             sizes = zip(x.shape[2:], spans, strides, around, strict=True)
             for i, (size, span, s, (low, high)) in enumerate(sizes):
                 more = -(size + low + high - span) % s
-                # A window that would begin in the padding behind the end is left out.
+                # A window that would begin in the padding after the end is left out.
                 begins = size + low + high + more - span
                 beyond[i] = more - s if more and begins >= size + low else more
 

@@ -167,15 +167,11 @@ def _network(
     kind, space = observed
     prefixes = [f"{features}{n}features_extractor." for n in ("pi_", "")]
     extractor = next((p for p in prefixes if any(n.startswith(p) for n in weights)), None)
-    if kind == "Box" and extractor is None:
-        return Mlp(activation), linear_layers(weights, names, what)
-    if kind in ("Discrete", "MultiDiscrete", "MultiBinary") and extractor is None:
-        if kind == "MultiBinary":
-            return Mlp(activation), linear_layers(weights, names, what)
-        counts = np.atleast_1d(space["n"] if kind == "Discrete" else space["nvec"])
-        return Mlp(activation, tuple(int(n) for n in counts.ravel())), linear_layers(
-            weights, names, what
-        )
+    categories = {"Box": None, "MultiBinary": None, "Discrete": "n", "MultiDiscrete": "nvec"}
+    if kind in categories and extractor is None:
+        counts = [] if (name := categories[kind]) is None else np.ravel(space[name])
+        network = Mlp(activation, tuple(int(n) for n in counts))
+        return network, linear_layers(weights, names, what)
     convolutions = [f"{extractor}cnn.{i}" for i in (0, 2, 4)]
     image = len(space.get("_shape") or ()) == 3 and options.get("normalize_images", True) is True
     if kind != "Box" or not image or not all(f"{n}.weight" in weights for n in convolutions):

@@ -107,7 +107,7 @@ class Diverse(Wrapper[DiverseState]):
     def wants(self) -> Wants:
         inner = self.search.wants
         outcomes = inner.outcomes or self.by == "behaviour"
-        # A model of the traces would lead back to archived failures, of which it knows nothing.
+        # A model of the traces knows nothing of archived failures, and would lead back to them.
         return replace(inner, outcomes=outcomes, traces=None)
 
     @staticmethod

@@ -152,7 +152,7 @@ class System(ForUsers):
     ) -> tuple[Carry, Int[Array, ""]]:
         """Simulate, and let `carry = update(carry, sample)` take in each sample; none is stored.
 
-        Behind an early end the last valid sample comes again, until the end of the duration.
+        After an early end the last valid sample repeats until the last step.
 
         **Returns:** the last carry, and the status of the simulation.
         """

@@ -227,7 +227,7 @@ def policy_function(policy: object, memory: PyTree = None) -> Decide:
     forms = f"({', '.join(given)}) or ({', '.join(given)}, key)"
     if not callable(function):
         raise ValueError(f"policy must be a function of {forms}; got {policy!r}")
-    needed = _count_required(function)
+    needed = count_required(function)
     if needed is not None and not len(given) <= needed <= len(given) + 1:
         raise ValueError(f"policy must be a function of {forms}; got one of {needed} arguments")
     random, sees = needed == len(given) + 1, sees_features(function)
@@ -238,17 +238,19 @@ def policy_function(policy: object, memory: PyTree = None) -> Decide:
         last = (key,) if random else ()
         options = {"features": features} if sees else {}
         if memory is None:
-            action = function(observation, *last, **options)
-            # Policies of Brax return what they drew with, too.
-            if isinstance(action, tuple) and len(action) == 2 and isinstance(action[1], dict):
-                action = action[0]
-            return action, remembered
+            return without_extras(function(observation, *last, **options)), remembered
         decided = function(observation, remembered, *last, **options)
         if not (isinstance(decided, tuple) and len(decided) == 2):
             raise ValueError(f"policy must return (action, memory); got {outline(decided)}")
         return decided
 
     return decide
+
+
+def without_extras(decided: Any) -> Any:
+    """Return the action of `(action, extras)`, as policies of Brax return it; else the action."""
+    pair = isinstance(decided, tuple) and len(decided) == 2
+    return decided[0] if pair and isinstance(decided[1], Mapping) else decided
 
 
 def first_memory(policy: object, memory: PyTree) -> PyTree:
@@ -271,7 +273,7 @@ def sees_features(function: Callable[..., Any]) -> bool:
         return False
 
 
-def _count_required(function: Callable[..., Any]) -> int | None:
+def count_required(function: Callable[..., Any]) -> int | None:
     """Count the arguments without a default but `features`; None for any or an unknown number."""
     try:
         parameters = inspect.signature(function).parameters.values()
