@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from verifai_jax.augmentation.task import Weights
-from verifai_jax.core.cache import Arrays
+from verifai_jax.store.log import Arrays
 
 _ORDER = "columns"
 """Array with the names of a table's columns, in their order."""

@@ -274,7 +274,7 @@ def _describe_place(folder: Path, record: str, missing: str) -> str:
 
 def is_sweep(folder: Path) -> bool:
     """Return whether a folder is one that `verifai-jax sweep` has written."""
-    return any((folder / name).is_file() for name in ("sweep.json", "sweep.sqlite"))
+    return any((folder / name).is_file() for name in ("sweep.json", "sweep.cache"))
 
 
 def split_names(text: str) -> list[str]:

@@ -1,28 +1,24 @@
 """Rows of a batch that is not finished yet, on disk as soon as they have a verdict.
 
     journal = Journal(folder)
-    journal.add(row, point, verdict)                    # appended and flushed
+    journal.add(row, point, verdict)                    # in the log when it returns
     journal.recall(first, points)                       # {i: verdict} of those that are there
     journal.settle(rows)                                # the table and its checkpoint have so many
 
 For simulators of which one simulation takes minutes: a run that is killed in the middle of a batch
-does not simulate its finished rows again. A row is recalled only for the same point, and only if
-its line is the one that was written: each begins with its checksum.
+does not simulate its finished rows again. A row is recalled only for the same point.
 """
 
-import hashlib
-import json
-import zlib
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 from jaxtyping import Float
 
 from verifai_jax.evaluation.verdicts import RowVerdict
+from verifai_jax.store.log import Log
 
-JOURNAL = "inflight.jsonl"
-"""Name of the journal in a run's folder."""
+JOURNAL = "inflight.rows"
+"""Name of the journal in a run's folder, a log with an entry a row."""
 
 
 class Journal:
@@ -30,33 +26,19 @@ class Journal:
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / JOURNAL
-        self._file: IO[str] | None = None
-        self._known = _read(self.path)
+        self._log = Log(self.path)
+        self._known = _read(self._log)
         self._last = max(self._known, default=-1)
 
     def add(self, row: int, point: Float[np.ndarray, " d"], verdict: RowVerdict) -> None:
-        """Keep a row; it is on disk when this returns.
+        """Keep a row; it is with the operating system when this returns.
 
         **Raises:** `OSError` where it cannot be written.
         """
-        entry = {
-            "row": row,
-            "point": _fingerprint(point),
-            "rho": np.asarray(verdict.rho, np.float64).tolist(),
-            "status": int(verdict.status),
-            "holds": np.asarray(verdict.holds).tolist(),
-            "message": verdict.message,
-            "marks": None if verdict.marks is None else np.asarray(verdict.marks).tolist(),
-            "steering": None if verdict.steering is None else verdict.steering.tolist(),
-        }
+        arrays = {name: value for name, value in verdict._asdict().items() if value is not None}
+        entry = {name: np.asarray(value) for name, value in arrays.items()}
         self._last = max(self._last, row)
-        if self._file is None:
-            self._file = open(self.path, "a")  # noqa: SIM115 - lives as long as the run
-            if self._file.tell():
-                self._file.write("\n")  # The last line may have been cut off.
-        text = json.dumps(entry)
-        self._file.write(f"{zlib.crc32(text.encode()):08x} {text}\n")
-        self._file.flush()
+        self._log.put({str(row): {"point": np.asarray(point, np.float32), **entry}})
 
     def recall(self, first: int, points: Float[np.ndarray, "n d"]) -> dict[int, RowVerdict]:
         """Return the known rows from `first` on, of the same points, by their place among them."""
@@ -64,50 +46,30 @@ class Journal:
             return {}
         found = {}
         for i, point in enumerate(points):
-            fingerprint, verdict = self._known.get(first + i, ("", None))
-            if verdict is not None and fingerprint == _fingerprint(point):
-                found[i] = verdict
+            known = self._known.get(first + i)
+            if known is not None and np.array_equal(known[0], np.asarray(point, np.float32)):
+                found[i] = known[1]
         return found
 
     def settle(self, rows: int) -> None:
         """Forget the journal once the table and its checkpoint have all of its rows."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None
         if self._last < rows:
             self._known = {}
-            self.path.unlink(missing_ok=True)
+            self._log.clear()
 
 
 def count_unfinished(folder: Path, rows: int) -> int:
     """Count the finished simulations in `folder` after the first `rows`, those of the table."""
-    return sum(row >= rows for row in _read(folder / JOURNAL))
+    return sum(row >= rows for row in _read(Log(folder / JOURNAL)))
 
 
-def _fingerprint(point: Float[np.ndarray, " d"]) -> str:
-    return hashlib.sha256(np.ascontiguousarray(point, np.float32).tobytes()).hexdigest()[:16]
-
-
-def _read(path: Path) -> dict[int, tuple[str, RowVerdict]]:
-    if not path.is_file():
-        return {}
+def _read(log: Log) -> dict[int, tuple[np.ndarray, RowVerdict]]:
     known = {}
-    for line in path.read_bytes().split(b"\n"):
-        checksum, _, text = line.partition(b" ")
-        if checksum != f"{zlib.crc32(text):08x}".encode():
-            continue  # It has changed, or was being written when the process died.
+    for name, arrays in log.entries():
         try:
-            entry = json.loads(text)
-            marks, steering = entry.get("marks"), entry.get("steering")
-            verdict = RowVerdict(
-                np.asarray(entry["rho"], np.float64),
-                int(entry["status"]),
-                np.asarray(entry["holds"], bool),
-                str(entry["message"]),
-                None if marks is None else np.asarray(marks, np.int32),
-                None if steering is None else np.asarray(steering, np.float32),
-            )
-            known[int(entry["row"])] = (str(entry["point"]), verdict)
+            point, status = arrays.pop("point"), int(arrays.pop("status"))
+            message = str(arrays.pop("message"))
+            known[int(name)] = point, RowVerdict(status=status, message=message, **arrays)
         except (ValueError, KeyError, TypeError):
             continue  # Of another program.
     return known

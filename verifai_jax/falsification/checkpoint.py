@@ -1,11 +1,10 @@
-"""The state of a search on disk: named arrays in one NumPy file, replaced whole.
+"""The state of a search on disk: named arrays in a log of one entry, which is replaced whole.
 
-With them stand a checksum of their names, types, shapes and bytes, one of the rows of the table
-that the search has seen, and one of what the record says of the run: none of the three is
-exchanged for that of another run, or of another moment, unnoticed.
+With them stand a checksum of the rows of the table that the search has seen, and one of what the
+record says of the run: none of the three is exchanged for that of another run, or of another
+moment, unnoticed.
 """
 
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,19 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from verifai_jax.core.text import format_error, printable
+from verifai_jax.store.files import DamagedError
+from verifai_jax.store.log import Log, write_log
 
-STATE = "search.npz"
+STATE = "search.state"
 """Name of the checkpoint in a run's folder."""
 ROWS_CHECKSUM = "rows.checksum"
-"""Entry for the rows that the search has seen, `ErrorTable.digest`."""
+"""Array with the checksum of the rows that the search has seen, `ErrorTable.digest`."""
 RECORD_CHECKSUM = "record.checksum"
-"""Entry for what the record says of the run, `record_checksum`."""
-_CHECKSUM = "checksum"
-
-
-class CheckpointError(ValueError):
-    """An error for a checkpoint that is damaged."""
+"""Array with that of what the record says of the run, `record.deciding_checksum`."""
+_ENTRY = "search"
 
 
 def write_checkpoint(
@@ -42,46 +38,27 @@ def write_checkpoint(
     - `rows_checksum`: of these rows.
     - `record_checksum`: of the record.
     """
-    partial = folder / f"{STATE}.part"
-    arrays: dict[str, Any] = {name: _plain(value) for name, value in checkpoint.items()}
+    arrays = {name: _plain(value) for name, value in checkpoint.items()}
     arrays[ROWS_CHECKSUM] = np.array(rows_checksum, np.uint32)
     arrays[RECORD_CHECKSUM] = np.array(record_checksum, np.uint32)
-    arrays[_CHECKSUM] = np.array(_checksum(arrays), np.uint32)
-    with open(partial, "wb") as file:
-        np.savez(file, **arrays)
-    partial.replace(folder / STATE)
+    write_log(folder / STATE, {_ENTRY: arrays})
 
 
 def read_checkpoint(folder: Path) -> dict[str, Any] | None:
     """Return the checkpoint in `folder`; None if there is none.
 
-    **Raises:** `CheckpointError` for one that cannot be read.
+    **Raises:** `DamagedError` for one that cannot be read.
     """
     file = folder / STATE
     if not file.exists():
         return None
-    try:
-        with open(file, "rb") as opened, np.load(opened, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-    except Exception as error:  # The bytes of an archive can be wrong in any way.
-        why = "it is empty" if isinstance(error, EOFError) else printable(format_error(error), 300)
-        raise CheckpointError(f"{file} is damaged: {why}") from error
-    stored = arrays.pop(_CHECKSUM, None)
-    if stored is None or stored.shape != () or stored != _checksum(arrays):
-        raise CheckpointError(f"{file} is damaged: its arrays have changed since it was written")
+    arrays = Log(file).get(_ENTRY)
+    if arrays is None:
+        raise DamagedError(f"{file} is damaged: it holds no state of a search")
     rows = arrays.get("rows")
     if rows is None or rows.shape != () or rows.dtype.kind not in "iu" or rows < 0:
-        raise CheckpointError(f"{file} is damaged: it does not say how many rows its search saw")
+        raise DamagedError(f"{file} is damaged: it does not say how many rows its search saw")
     return arrays
-
-
-def _checksum(arrays: Mapping[str, np.ndarray]) -> int:
-    checksum = 0
-    for name in sorted(set(arrays) - {_CHECKSUM}):
-        value = arrays[name]
-        head = repr((name, value.dtype.str, value.shape)).encode()
-        checksum = zlib.crc32(value.tobytes(), zlib.crc32(head, checksum))
-    return checksum
 
 
 def _plain(value: ArrayLike) -> np.ndarray:

@@ -1,24 +1,19 @@
 """The record of a run, `run.json`: everything about it but its table and its checkpoint."""
 
-import json
 import re
-import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from verifai_jax.core.seals import is_intact
-from verifai_jax.core.sources import Sources
 from verifai_jax.core.text import one_line
-from verifai_jax.falsification.origin import ORIGINS
 from verifai_jax.falsification.segments import SEGMENTS, list_segments
 from verifai_jax.falsification.table import FINISHED
 from verifai_jax.falsification.tail import TAIL
+from verifai_jax.store import files
+from verifai_jax.store.files import DamagedError
 
 RECORD = "run.json"
 """Name of the file with everything about a run but its table and its checkpoint."""
-FORMAT = 3
-"""Number of the format of a run's files; others are refused."""
 
 DECIDING = (
     "features",
@@ -37,44 +32,36 @@ DECIDING = (
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Read the record of a run, and check that it has what a run needs.
+    """Read the record of a run.
 
-    **Raises:** `FileNotFoundError` where there is none; `ValueError` for one that is damaged or of
-    another format. Both say where the rows are, which are none the worse for it.
+    **Raises:** `FileNotFoundError` where there is none; `DamagedError` for one that is damaged.
+    Both say where the rows are, which are none the worse for it.
     """
     file = folder / RECORD
     if not file.is_file():
         raise FileNotFoundError(f"no run in {folder}: {RECORD} is missing{_rows_beside(folder)}")
     try:
-        record = json.loads(file.read_text())
-    except (ValueError, RecursionError):
-        record = None
-    if not isinstance(record, dict) or not isinstance(record.get("format"), int):
-        raise ValueError(
-            f"no run in {folder}: its {RECORD} is damaged, or of another program"
-            f"{_rows_beside(folder)}"
-        )
-    if record.get("format") != FORMAT:
-        raise ValueError(
-            f"{file} has format {one_line(repr(record.get('format')), 40)}, and this version of "
-            f"verifai_jax reads format {FORMAT}: load it with the version that wrote it, "
-            f"{one_line(str(record.get('version', 'unknown')), 40)}"
-        )
-    for name, fits in _FORMS.items():
-        if name not in record or not fits(record[name]):
-            what = f"has no {name!r}" if name not in record else f"has {name!r} of another form"
-            raise ValueError(f"{file} is damaged: it {what}{_rows_beside(folder)}")
-    if not is_intact(record):
-        raise ValueError(
-            f"{file} is damaged: its content has changed since it was written{_rows_beside(folder)}"
-        )
-    return record
+        return files.read_record(file)
+    except DamagedError as error:
+        raise DamagedError(f"no run in {folder}: {error}{_rows_beside(folder)}") from error
 
 
-def record_checksum(record: Mapping[str, Any]) -> int:
+def check_entries(record: Mapping[str, Any], folder: Path, names: Sequence[str]) -> None:
+    """Refuse the record of a version of verifai_jax with other entries than these.
+
+    **Raises:** `DamagedError`.
+    """
+    if other := sorted(record.keys() ^ set(names)):
+        version = one_line(str(record.get("version", "unknown")), 40)
+        raise DamagedError(
+            f"{folder / RECORD} is of another version of verifai_jax, {version}, which can load "
+            f"it: {one_line(', '.join(map(repr, other)), 80)} is not in both{_rows_beside(folder)}"
+        )
+
+
+def deciding_checksum(record: Mapping[str, Any]) -> int:
     """Return a checksum of the entries of a record that decide what the rows of its run are."""
-    deciding = {name: record.get(name) for name in DECIDING}
-    return zlib.crc32(json.dumps(deciding, sort_keys=True).encode())
+    return files.record_checksum({name: record.get(name) for name in DECIDING})
 
 
 def numeric_features(record: Mapping[str, Any]) -> tuple[str, ...]:
@@ -101,86 +88,3 @@ def _rows_beside(folder: Path) -> str:
     if list_segments(folder / SEGMENTS) or (folder / TAIL).is_file():
         return f"; the rows are in {folder}: vj.ErrorTable.load(folder, features)"
     return ""
-
-
-def _is_text(value: object) -> bool:
-    return isinstance(value, str)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _is_count(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
-
-
-def _is_flag(value: object) -> bool:
-    return isinstance(value, bool)
-
-
-def _is_texts(value: object) -> bool:
-    return isinstance(value, list) and all(isinstance(each, str) for each in value)
-
-
-def _is_mapping(value: object) -> bool:
-    return value is None or isinstance(value, dict)
-
-
-def _is_space(value: object) -> bool:
-    if not isinstance(value, dict) or not isinstance(value.get("features"), list):
-        return value is None
-    pairs = all(
-        isinstance(each, list)
-        and len(each) == 2
-        and isinstance(each[0], str)
-        and isinstance(each[1], dict)
-        for each in value["features"]
-    )
-    return pairs and (value.get("where", 0) is None or isinstance(value.get("where"), str))
-
-
-def _is_sources(value: object) -> bool:
-    if not isinstance(value, list):
-        return False
-    try:
-        return all(isinstance(Sources.from_json(part), Sources) for part in value)
-    except ValueError:
-        return False
-
-
-_FORMS: dict[str, Callable[[Any], bool]] = {
-    "features": _is_texts,
-    "name": _is_text,
-    "formulas": lambda value: isinstance(value, dict) and all(map(_is_text, value.values())),
-    "search": _is_text,
-    "seed": _is_count,
-    "batch": _is_count,
-    "stopped": _is_text,
-    "compile_seconds": _is_number,
-    "run_seconds": _is_number,
-    "version": _is_text,
-    "prior": _is_flag,
-    "target": lambda value: True,
-    "budget": _is_count,
-    "search_data": _is_mapping,
-    "space_data": _is_space,
-    "acceptance": lambda value: value is None or _is_number(value),
-    "precision": lambda value: value in ("float32", "float64"),
-    "backend": lambda value: value is None or _is_text(value),
-    "notes": _is_texts,
-    "lasting_notes": _is_texts,
-    "confirm": _is_flag,
-    "confirm_seconds": _is_number,
-    "search_seconds": _is_number,
-    "simulate_seconds": _is_number,
-    "checks": _is_texts,
-    "first": lambda value: isinstance(value, list),
-    "guide": _is_mapping,
-    "origin": lambda value: value in ("", *ORIGINS),
-    "sources": _is_sources,
-    "derived": _is_mapping,
-}
-"""What each entry of a record must be."""
-RECORDED = tuple(name for name in _FORMS if name != "features")
-"""Entries of a record that are attributes of its run."""

@@ -6,9 +6,8 @@ run.replay(run.best)               the trace of a row
 run.save("runs/mine"); vj.load("runs/mine", problem)
 """
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +15,8 @@ import numpy as np
 
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
-from verifai_jax.core.locks import write_lock
 from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.seals import sealed
-from verifai_jax.core.sources import Change
+from verifai_jax.core.sources import Change, Sources
 from verifai_jax.core.text import one_line
 from verifai_jax.evaluation.confirmations import describe_checks
 from verifai_jax.evaluation.replay import Replay, replay
@@ -27,7 +24,6 @@ from verifai_jax.falsification.checkpoint import (
     RECORD_CHECKSUM,
     ROWS_CHECKSUM,
     STATE,
-    CheckpointError,
     read_checkpoint,
     write_checkpoint,
 )
@@ -42,13 +38,11 @@ from verifai_jax.falsification.model_changes import (
     sources_of_row,
 )
 from verifai_jax.falsification.record import (
-    DECIDING,
-    FORMAT,
     RECORD,
-    RECORDED,
+    check_entries,
+    deciding_checksum,
     numeric_features,
     read_record,
-    record_checksum,
 )
 from verifai_jax.falsification.table import FINISHED, ErrorTable
 from verifai_jax.falsification.tail import TAIL
@@ -57,6 +51,9 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Rulebook
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
 from verifai_jax.statistics.confidence_sequences import anytime_interval
+from verifai_jax.store import files
+from verifai_jax.store.files import DamagedError
+from verifai_jax.store.locks import write_lock
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -474,16 +471,23 @@ class Run(InNotebook):
         return self.summary()
 
 
+RECORDED = tuple(
+    field.name
+    for field in fields(Run)
+    if field.name not in ("table", "folder", "problem", "checkpoint", "damage")
+)
+"""Attributes of a run that are entries of its record; `features`, those of its table, is another.
+"""
+
+
 def write_record(run: Run, folder: Path) -> int:
     """Write everything about a run but its table to `run.json`; return its checksum."""
-    record = {"format": FORMAT, "features": list(run.table.features)}
-    for name in RECORDED:
-        record[name] = getattr(run, name)
-    record = sealed(json.loads(json.dumps(record)))
-    partial = folder / f"{RECORD}.part"
-    partial.write_text(json.dumps(record, indent=2) + "\n")
-    partial.replace(folder / RECORD)
-    return record_checksum(record)
+    return deciding_checksum(files.write_record(folder / RECORD, _as_record(run)))
+
+
+def _as_record(run: Run) -> dict[str, Any]:
+    features = {"features": list(run.table.features)}
+    return features | {name: getattr(run, name) for name in RECORDED}
 
 
 def check_not_continued(run: Run, folder: Path) -> None:
@@ -496,12 +500,12 @@ def check_not_continued(run: Run, folder: Path) -> None:
     if not (folder / RECORD).exists():
         return
     record = read_record(folder)
-    own = {name: getattr(run, name) for name in DECIDING if name != "features"}
-    own["features"] = list(run.table.features)
     remedy = "load it, vj.load(folder, problem), or save this one elsewhere, run.save(folder)"
-    if record_checksum(record) != record_checksum(json.loads(json.dumps(own))):
-        raise ValueError(f"{folder} holds another run by now, of {record['name']!r}; {remedy}")
-    rows = ErrorTable.count_rows(folder)
+    if deciding_checksum(record) != deciding_checksum(_as_record(run)):
+        raise ValueError(f"{folder} holds another run by now, of {record.get('name')!r}; {remedy}")
+    rows = 0
+    if ErrorTable.exists(folder):
+        rows = len(ErrorTable.load(folder, run.table.features))
     if rows > run.simulations:
         raise ValueError(
             f"somebody has gone on with the run in {folder}: it has {rows} simulations by now, "
@@ -521,11 +525,14 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
     Of a run whose checkpoint is damaged the table is there; its `damage` says what is not.
 
     **Raises:** `FileNotFoundError` for a folder without a run; `ValueError` for a record or a table
-    that is damaged, a record of another format, or a problem whose name, formulas or features
+    that is damaged, a record of another version, or a problem whose name, formulas or features
     differ from the recorded ones.
     """
     folder = Path(path)
     record = read_record(folder)
+    check_entries(record, folder, ("features", *RECORDED))
+    for part in record["sources"]:
+        Sources.from_json(part)  # Before anything is made of it.
     features = tuple(record["features"])
     if problem is not None:
         problem = as_simulated(problem, record)
@@ -551,10 +558,10 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
     damage, checkpoint = [table.damage] if table.damage else [], None
     try:
         checkpoint = read_checkpoint(folder)
-    except CheckpointError as error:
+    except DamagedError as error:
         damage.append(f"{error}; its rows are there all the same: {ANEW}")
     seen = int(checkpoint["rows"]) if checkpoint else 0
-    if checkpoint and checkpoint[RECORD_CHECKSUM] != record_checksum(record):
+    if checkpoint and checkpoint[RECORD_CHECKSUM] != deciding_checksum(record):
         damage.append(
             f"{folder / RECORD} is not the one that {STATE} was written with: the run's search, "
             f"seed, options or formulas have changed; {ANEW}"

@@ -6,16 +6,13 @@
     table.unconfirmed       the others: refuted, or not sure
     table.safe              rows that ended properly and kept it
 
-On disk the batches of a growing table are appended to its tail (`tail.py`), each with a checksum; a
-process that dies loses at most the batch in flight. Every 1 048 576 rows become a segment
-(`segments.py`), and leave memory. A finished table that has no segment is one Parquet file,
-`table.parquet`; a longer one is the folder `table/` of its segments.
+On disk the batches of a growing table are appended to its tail (`tail.py`), a log; a process that
+dies loses at most the batch in flight. Every 1 048 576 rows become a segment (`segments.py`), and
+leave memory. A finished table that has no segment is one Parquet file, `table.parquet`; a longer
+one is the folder `table/` of its segments.
 """
 
-import contextlib
-import json
 import warnings
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,13 +21,12 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from verifai_jax.core.notebook import InNotebook, frame_html
-from verifai_jax.core.text import format_error, printable
 from verifai_jax.falsification import segments
 from verifai_jax.falsification.columns import (
     ROW,
     Batch,
     Columns,
-    checksum,
+    column_checksum,
     cut,
     from_frame,
     length,
@@ -45,14 +41,16 @@ from verifai_jax.falsification.segments import (
     SEGMENTS,
     Segment,
     TableError,
+    damaged,
     list_segments,
     parquet,
     remove_segments,
     standing_out,
     write_segment,
-    write_whole,
 )
-from verifai_jax.falsification.tail import TAIL, Tail, read_tail, replace_tail
+from verifai_jax.falsification.tail import TAIL, read_tail, tail_entry
+from verifai_jax.store.files import record_checksum, write_whole
+from verifai_jax.store.log import Log, write_log
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -96,7 +94,7 @@ class ErrorTable(InNotebook):
     """
 
     _internal = frozenset((
-        "append", "blocks", "close", "count_rows", "counts", "damage", "digest", "exists",
+        "append", "blocks", "close", "counts", "damage", "digest", "exists",
         "load", "missing", "resumed",
     ))  # fmt: skip
 
@@ -112,7 +110,7 @@ class ErrorTable(InNotebook):
         self.damage = ""
         self.changed = False
         self._folder = None if folder is None else folder.absolute()
-        self._tail = None if self._folder is None else Tail(self._folder)
+        self._tail = None if self._folder is None else Log(self._folder / TAIL)
         self._segments: list[Segment] = []
         # Batches after the segments, each with the number of its first row.
         self._batches: list[Batch] = []
@@ -144,7 +142,7 @@ class ErrorTable(InNotebook):
         if self._tail is None:
             return
         if self._next - self._begin < segments.SEGMENT_ROWS:
-            self._tail.append(first, to_arrow(batch))
+            self._tail.put(tail_entry(first, to_arrow(batch)))
             return
         while self._next - self._begin >= segments.SEGMENT_ROWS:
             self._close_segment(segments.SEGMENT_ROWS)
@@ -153,9 +151,9 @@ class ErrorTable(InNotebook):
             (begin, {name: values.copy() for name, values in rest.items()})
             for begin, rest in self._batches
         ]
-        self._tail.restart()
+        self._tail.clear()
         for begin, rest in self._batches:
-            self._tail.append(begin, to_arrow(rest))
+            self._tail.put(tail_entry(begin, to_arrow(rest)))
 
     def close(self) -> None:
         """Turn what the tail holds into Parquet.
@@ -164,8 +162,7 @@ class ErrorTable(InNotebook):
         """
         if self._tail is None:
             return
-        tail, self._tail = self._tail, None
-        tail.close()
+        self._tail = None
         assert self._folder is not None
         if not self._segments:
             self._write_finished(self._folder)
@@ -305,19 +302,6 @@ class ErrorTable(InNotebook):
             or bool(list_segments(folder / SEGMENTS))
         )
 
-    @staticmethod
-    def count_rows(folder: Path) -> int:
-        """Return how many rows the table in a folder has, whether its files are whole or not."""
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        stops = [segment.stop for segment in list_segments(folder / SEGMENTS)]
-        stops += [first + batch.num_rows for first, batch in read_tail(folder)]
-        if (folder / FINISHED).is_file():
-            with contextlib.suppress(pa.ArrowException, OSError):
-                stops.append(pq.read_metadata(folder / FINISHED).num_rows)
-        return max(stops, default=0)
-
     def resumed(self, rows: int, folder: Path | None = None) -> "ErrorTable":
         """Return a table with the first `rows` rows of this one, to which more can be appended.
 
@@ -342,7 +326,8 @@ class ErrorTable(InNotebook):
             table._hold(first, part)
         table._join()
         # Whenever the process dies, what is left has these rows: the tail first, then the others.
-        replace_tail(folder, begin, to_arrow(merge(table._batches)) if table._batches else None)
+        rest = tail_entry(begin, to_arrow(merge(table._batches))) if table._batches else {}
+        write_log(folder / TAIL, rest)
         remove_segments(folder, begin)
         (folder / FINISHED).unlink(missing_ok=True)
         return table
@@ -352,19 +337,7 @@ class ErrorTable(InNotebook):
 
         **Raises:** `OSError` where they cannot be written; `TableError` where rows are missing.
         """
-        if self.missing:
-            raise TableError(f"a table that misses rows is not copied: {self.damage}")
-        if folder.absolute() == self._folder:
-            table = self.resumed(self._next, folder)
-        elif self._next < segments.SEGMENT_ROWS:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._write_finished(folder)
-            remove_segments(folder, 0)
-            (folder / TAIL).unlink(missing_ok=True)
-            return ErrorTable.load(folder, self.features)
-        else:
-            table = ErrorTable(self.features, folder)
-            table._replace_by(self._parts(0, self._next))
+        table = self.resumed(self._next, folder)
         table.close()
         return table
 
@@ -381,10 +354,11 @@ class ErrorTable(InNotebook):
         checksums = dict(checksums)
         for _, columns in self._parts(known_to, rows):
             for name, values in columns.items():
-                checksums[name] = checksum(values, checksums.get(name))
+                checksums[name] = column_checksum(values, checksums.get(name))
         self._digested = begin, rows, checksums
-        names = [segment.path.name for segment in closed]
-        return zlib.crc32(json.dumps([names, sorted(checksums.items())]).encode())
+        return record_checksum(
+            {"columns": checksums, "segments": [each.path.name for each in closed]}
+        )
 
     def _notebook_parts(self) -> Iterator[str]:
         if self.changed:
@@ -586,7 +560,7 @@ def _read_finished(path: Path) -> "pd.DataFrame":
     except PermissionError:
         raise
     except Exception as error:  # Bytes can be wrong in any way.
-        raise TableError(f"{path} is damaged: {printable(format_error(error), 300)}") from error
+        raise damaged(path, error) from error
     wrong = np.flatnonzero(frame.index.to_numpy() != np.arange(len(frame)))
     if len(wrong):
         raise TableError(

@@ -12,7 +12,6 @@ from verifai_jax import search as searches
 from verifai_jax.core.checks import check_count, check_positive
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.executors import Executor
-from verifai_jax.core.locks import LOCK, write_lock
 from verifai_jax.core.text import format_error, one_line
 from verifai_jax.falsification.run import RECORD, Run
 from verifai_jax.falsification.table import ErrorTable
@@ -22,6 +21,7 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.search.contract import check_contract
 from verifai_jax.statistics.stopping import StoppingRule
+from verifai_jax.store.locks import LOCK, write_lock
 from verifai_jax.systems.base import System
 
 if TYPE_CHECKING:
@@ -429,7 +429,7 @@ def new_folder(folder: str | Path | None) -> Iterator[Path | None]:
 
 def _check_empty(place: Path) -> None:
     # A process that dies before its first record leaves a part of one.
-    leftover = {f"{RECORD}.part", LOCK}
+    leftover = {f".{RECORD}.part", LOCK}
     if place.exists() and (not place.is_dir() or {p.name for p in place.iterdir()} - leftover):
         if (place / RECORD).is_file():
             raise ValueError(

@@ -8,14 +8,14 @@ import threading
 
 import pytest
 
-from verifai_jax.core.locks import LOCK, FolderInUse, write_lock
+from verifai_jax.store.locks import LOCK, FolderInUse, write_lock
 
 fcntl = pytest.importorskip("fcntl")
 
 HOLDS = """
 import sys, time
 from pathlib import Path
-from verifai_jax.core.locks import write_lock
+from verifai_jax.store.locks import write_lock
 with write_lock(Path(sys.argv[1])):
     print("holds", flush=True)
     time.sleep(60)
@@ -48,8 +48,8 @@ def test_within_a_process(tmp_path):
     with write_lock(tmp_path):
         with pytest.raises(FolderInUse, match=r"by this process .+ already"), write_lock(tmp_path):
             pass
-        with write_lock(tmp_path / "a.sqlite"), write_lock(tmp_path / "b.sqlite"):
-            assert (tmp_path / "a.sqlite.lock").exists()
+        with write_lock(tmp_path / "a.cache"), write_lock(tmp_path / "b.cache"):
+            assert (tmp_path / "a.cache.lock").exists()
     with pytest.raises(KeyError), write_lock(tmp_path):
         raise KeyError
     with write_lock(tmp_path), write_lock(None):
@@ -60,7 +60,7 @@ def test_within_a_process(tmp_path):
 FORKS = """
 import os, sys
 from pathlib import Path
-from verifai_jax.core.locks import write_lock
+from verifai_jax.store.locks import write_lock
 ends, goes = os.pipe()
 with write_lock(Path(sys.argv[1])):
     child = os.fork()

@@ -46,21 +46,6 @@ if hasattr(os, "register_at_fork"):
 
 
 @contextlib.contextmanager
-def returning_once() -> Iterator[None]:
-    """Run code of the user that may fork: only the process that entered goes on behind it.
-
-    A copy of this process that comes back, as where an `exec` fails, ends without a word: it would
-    answer for its parent, and write into the folder of its parent's run.
-    """
-    owner = os.getpid()
-    try:
-        yield
-    finally:
-        if os.getpid() != owner:
-            os._exit(1)
-
-
-@contextlib.contextmanager
 def write_lock(place: Path | None) -> Iterator[None]:
     """Be the only one who writes to a place; None is no place.
 

@@ -1,0 +1,117 @@
+"""Files that are there whole or not at all, records in JSON, the checksum of all that is stored.
+
+write_whole(path, content)
+with replacing("report.html") as partial:
+    partial.write_text(page)                    # takes the place of report.html at the end
+write_record(path, {"seed": 0})
+read_record(path)                               # DamagedError, where it has changed since
+"""
+
+import contextlib
+import json
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from verifai_jax.core.text import one_line
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+_CHECKSUM = "checksum"
+"""Entry of a record with the checksum of the others."""
+
+
+class DamagedError(ValueError):
+    """An error for a file that is not as it was written."""
+
+
+def checksum(content: "bytes | memoryview | pa.Buffer", before: int = 0) -> int:
+    """Return the checksum of bytes (CRC-32), that of what comes `before` them included.
+
+    It finds damage, not forgery: what a file holds is never executed, whoever wrote it.
+    """
+    return zlib.crc32(content, before)
+
+
+def write_whole(path: Path, content: "pa.Buffer | bytes") -> Path:
+    """Write a file such that a reader never meets a half of it; return its path.
+
+    **Raises:** `OSError` where it cannot be written; what was at `path` stays.
+    """
+    partial = path.with_name(f".{path.name}.part")  # Readers of a folder leave it out.
+    try:
+        with open(partial, "wb") as file:
+            file.write(content)
+        partial.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):  # What little room there is, others need.
+            partial.unlink(missing_ok=True)
+        raise
+    return path
+
+
+@contextlib.contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Yield the path of a file to write, which replaces the one at `path` once it is whole.
+
+    Its ending is that of `path`, which tells some libraries the format. Folders that it needs are
+    made. Where writing fails, the file that was at `path` stays.
+
+    **Raises:** `OSError` that names `path`, for whatever the file system refuses.
+    """
+    path = Path(path)
+    partial = path.with_name(f".{path.stem}.part{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield partial
+        partial.replace(path)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise type(error)(f"{path} cannot be written ({reason}); give another path") from error
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+
+
+def write_record(path: Path, record: Mapping[str, Any]) -> dict[str, Any]:
+    """Write plain data as JSON with a checksum, whole; return it as it is read back.
+
+    **Raises:** `OSError` where it cannot be written.
+    """
+    stored = json.loads(json.dumps(record))
+    write_whole(path, f"{json.dumps(sealed(stored), indent=2)}\n".encode())
+    return stored
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """Read what `write_record` has written.
+
+    **Raises:** `FileNotFoundError` where there is none; `DamagedError` for what is no record, or
+    not as it was written.
+    """
+    try:
+        record = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise
+    except (ValueError, RecursionError, OSError) as error:
+        why = f"it cannot be read as JSON ({one_line(str(error))})"
+        raise DamagedError(f"{path} is damaged, or of another program: {why}") from error
+    if not isinstance(record, dict) or _CHECKSUM not in record:
+        raise DamagedError(f"{path} is damaged, or of another program: it has no checksum")
+    own = record.pop(_CHECKSUM)
+    if own != record_checksum(record):
+        raise DamagedError(f"{path} is damaged: its content has changed since it was written")
+    return record
+
+
+def record_checksum(record: Mapping[str, Any]) -> int:
+    """Return the checksum of plain data."""
+    return checksum(json.dumps(record, sort_keys=True).encode())
+
+
+def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return plain data with its checksum, as it stands in a file."""
+    content = {name: value for name, value in record.items() if name != _CHECKSUM}
+    return {**content, _CHECKSUM: record_checksum(content)}
