@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from verifai_jax.cli import arguments, doctor
 from verifai_jax.cli.doctor import TESTED, bad_pairs
 from verifai_jax.cli.main import main
-from verifai_jax.falsification.run import load
+from verifai_jax.falsification.run_folder import load
 from verifai_jax.store.files import sealed
 
 ROOT = Path(__file__).parents[2]

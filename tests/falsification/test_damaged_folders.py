@@ -13,9 +13,8 @@ import pytest
 import verifai_jax as vj
 from verifai_jax.cli.json_output import describe_run
 from verifai_jax.falsification import segments
-from verifai_jax.falsification.checkpoint import STATE
 from verifai_jax.falsification.loop import Rounds
-from verifai_jax.falsification.record import RECORD
+from verifai_jax.falsification.run_folder import RECORD, STATE
 from verifai_jax.falsification.table import FINISHED, ErrorTable
 from verifai_jax.falsification.tail import TAIL
 from verifai_jax.store.locks import LOCK

@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.falsification.checkpoint import (
+from verifai_jax.falsification.run_folder import (
+    RECORD,
     RECORD_CHECKSUM,
     ROWS_CHECKSUM,
     STATE,
     write_checkpoint,
 )
-from verifai_jax.falsification.record import RECORD
 from verifai_jax.falsification.tail import TAIL
 from verifai_jax.store.files import sealed
 from verifai_jax.store.locks import LOCK, FolderInUse, write_lock

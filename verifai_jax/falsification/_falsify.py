@@ -24,13 +24,8 @@ from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
 from verifai_jax.falsification.model_changes import continued_with
-from verifai_jax.falsification.run import (
-    RECORD,
-    Run,
-    as_made,
-    check_not_continued,
-    load,
-)
+from verifai_jax.falsification.run import Run
+from verifai_jax.falsification.run_folder import RECORD, as_made, check_not_continued, load
 from verifai_jax.falsification.running import Ending, Running
 from verifai_jax.falsification.silent_mistakes import notes_before
 from verifai_jax.falsification.table import ErrorTable

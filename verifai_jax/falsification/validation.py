@@ -13,7 +13,8 @@ from verifai_jax.core.checks import check_count, check_positive
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.text import format_error, one_line
-from verifai_jax.falsification.run import RECORD, Run
+from verifai_jax.falsification.run import Run
+from verifai_jax.falsification.run_folder import RECORD
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.features.given import Rows, check_columns, given_features, given_rows
 from verifai_jax.problem.dependence import has_gradient, without_derivative

@@ -4,10 +4,9 @@ from dataclasses import dataclass
 
 from verifai_jax.core.text import format_features
 from verifai_jax.evaluation.confirmations import UNDECIDED, describe_checks
-from verifai_jax.falsification.checkpoint import STATE
 from verifai_jax.falsification.no_rate import why_no_rate
-from verifai_jax.falsification.record import RECORD
 from verifai_jax.falsification.run import Run
+from verifai_jax.falsification.run_folder import RECORD, STATE
 from verifai_jax.falsification.table import FINISHED
 from verifai_jax.falsification.tail import TAIL
 from verifai_jax.mtl import parse
