@@ -94,10 +94,9 @@ def test_what_is_damaged_is_computed_anew(tmp_path, caplog):
     cache.put({"whole": {"x": np.arange(2.0)}})
     changed(tmp_path / "sweep.cache", np.arange(8.0).tobytes(), bytes(64))
     cache = Cache(tmp_path)
-    assert cache.get("whole") is not None
+    assert cache.names() == ["whole"]
     assert cache.get("piece") is None
-    assert "is damaged in 'piece': its bytes have changed" in caplog.text
-    assert "it is computed anew" in caplog.text
+    assert "is damaged: what cannot be read of it is computed anew" in caplog.text
     assert cache.remember("piece", lambda: {"x": np.arange(8.0)})["x"][7] == 7
     caplog.clear()
     np.testing.assert_array_equal(cache.get("piece")["x"], np.arange(8.0))
@@ -123,7 +122,7 @@ def test_a_cache_that_does_not_say_what_it_is_of_is_refused(tmp_path, what):
     cache.claim(ABOUT)
     cache.put({"one": {"x": np.zeros(3)}})
     changed(tmp_path / "augmentation.cache", what, what.upper())
-    told = r"augmentation\.cache is (damaged|no cache of an)"
+    told = r"augmentation\.cache is damaged: it does not say what its work is of"
     with pytest.raises(CacheError, match=told):
         Cache(tmp_path, "augmentation").claim(ABOUT)
 

@@ -1,6 +1,5 @@
 """Logs: entries come back as they were, whatever became of those beside them."""
 
-import contextlib
 import json
 import os
 import shutil
@@ -19,7 +18,7 @@ import pytest
 from hypothesis import strategies
 
 from verifai_jax.store.files import DamagedError, checksum
-from verifai_jax.store.log import _CHECKSUM, _HEADER, MARK, Log, write_log
+from verifai_jax.store.log import _HEADER, MARK, Log, write_log
 
 
 @hypothesis.settings(max_examples=50, deadline=None)
@@ -104,20 +103,21 @@ def test_the_last_entry_of_a_name_counts(tmp_path):
 def test_a_forged_log_is_damaged_in_words(tmp_path):
     path = tmp_path / "a.log"
     for form in (
-        3, [], [3], [["a", 3]], [["a", [3]]], [["b", []]], [[["a"], []]], *(
-            [["a", [["x", kind, shape]]]]
+        3, [], [3], [["a", 3]], [["a", 8, [3]]], [["b", 0, []]], [[["a"], []]], [["a", -1, []]],
+        [["a", 10**18, []]], *(
+            [["a", 8, [["x", kind, shape]]]]
             for kind, shape in (
-                ("O", [1]), ("f8", [-1]), ("f8", [10**30]), ("U9999999", [1]), ({}, []), ("(2", [1])
+                ("O", [1]), ("f8", [3]), ("f8", [10**30]), ("U9999999", [1]), ({}, []), ("(2", [1])
             )
         ),
     ):  # fmt: skip
         head, body = json.dumps(form).encode(), b"12345678"
-        header = _HEADER.pack(MARK, len(head), len(body), checksum(body))
-        own = _CHECKSUM.pack(checksum(head, checksum(header)))
-        path.write_bytes(b"".join((header, own, head, body)))
-        for name in (*Log(path).names(), "a"):
-            with contextlib.suppress(DamagedError):
-                Log(path).get(name)
+        begin = _HEADER.pack(MARK, len(head), len(body), 0)[:-4]
+        own = checksum(head + body, checksum(begin))
+        path.write_bytes(_HEADER.pack(MARK, len(head), len(body), own) + head + body)
+        assert not Log(path).damaged
+        assert Log(path).get("a") is None
+        assert dict(Log(path).entries()).keys() <= {"b"}
     path.unlink()
     path.mkdir()
     with pytest.raises(DamagedError, match=r"a\.log is damaged: it is not a file"):
@@ -160,7 +160,7 @@ def test_killed_and_copied_at_any_moment_it_has_what_was_put_before(tmp_path):
             found = {name: entry["x"] for name, entry in Log(file).entries()}
             assert [*found] == [str(i) for i in range(-1, len(found) - 1)]
             assert all((x == int(name)).all() for name, x in found.items())
-        assert len(found) > before
+        assert len(found) >= max(before, 1)
 
 
 def test_a_reader_meets_whole_entries_while_it_grows(tmp_path):

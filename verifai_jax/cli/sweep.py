@@ -200,7 +200,7 @@ def _read_command(place: Path) -> dict[str, Any]:
     note = Cache(place).note("command")
     if note is None:
         raise CacheError(
-            f"the sweep in {place} was begun in Python, and Python has to go on with it: call "
+            f"the sweep in {place} was begun in Python, or its command is damaged: call "
             f"vj.sweep(study, ..., folder={str(place)!r}) again"
         )
     if (

@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -280,22 +280,16 @@ def _write(log: Log, first: int, u: Float[np.ndarray, "n d"], verdicts: Verdicts
         log.put({f"{first}-{first + len(u)}": arrays})
 
 
-def _blocks(log: Log) -> Iterator[tuple[range, Callable[[], dict[str, np.ndarray]]]]:
-    """Yield the rows of each block, and what reads it, where it is damaged with an error."""
+def _blocks(log: Log) -> Iterator[tuple[range, Log, str]]:
+    """Yield the rows of each block, its log, and its name there."""
     for name in log.names():
         if match := re.fullmatch(r"(\d+)-(\d+)", name):
-            rows = range(int(match[1]), int(match[2]))
-            yield rows, partial(_read, log, name)
+            yield range(int(match[1]), int(match[2])), log, name
 
 
 @lru_cache(maxsize=4)
-def _read(log: Log, name: str) -> dict[str, np.ndarray]:
-    try:
-        block = log.get(name)
-    except DamagedError as error:
-        raise DamagedError(f"{error}; run its part again, which makes it anew") from error
-    assert block is not None
-    return block
+def _read(log: Log, name: str) -> dict[str, np.ndarray] | None:
+    return log.get(name)
 
 
 class _StoredRows:
@@ -303,7 +297,7 @@ class _StoredRows:
 
     _max_workers = 1
 
-    def __init__(self, blocks: Sequence[tuple[range, Callable[[], dict[str, np.ndarray]]]]) -> None:
+    def __init__(self, blocks: Sequence[tuple[range, Log, str]]) -> None:
         self._blocks = sorted(blocks, key=lambda block: (block[0].start, block[0].stop))
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any) -> "Future[dict[str, Any]]":
@@ -347,10 +341,11 @@ class _StoredRows:
 
     def _parts(self, first: int, u: np.ndarray) -> Iterator[dict[str, np.ndarray]]:
         at = first
-        for rows, read in self._blocks:
+        for rows, log, name in self._blocks:
             if rows.stop <= at or rows.start > at or at >= first + len(u):
                 continue
-            stored = read()
+            if (stored := _read(log, name)) is None:
+                continue
             stop = min(rows.stop, first + len(u))
             cut = slice(at - rows.start, stop - rows.start)
             if not np.array_equal(stored["u"][cut], u[at - first : stop - first]):

@@ -5,8 +5,8 @@
         cache.remember("train/...", lambda: {"x": np.arange(3)})
 
 A cache is a log (`log.py`) that maps the name of a pure computation to the arrays that it returned.
-An entry that is damaged is one that is missing: it is computed anew, and a warning says so. What
-the cache is of is noted in it: one of which that cannot be read is refused.
+What is damaged is missing: it is computed anew, and a warning says so. What the cache is of is
+noted in it: one of which that cannot be read is refused.
 """
 
 import contextlib
@@ -56,10 +56,9 @@ class Cache:
         self._own: set[str] = set()
         self._reused: set[str] = set()
         try:
-            with self._telling("cannot be read"):
-                damaged = self._log.damaged
-        except DamagedError as error:
-            raise CacheError(str(error)) from error
+            damaged = self._log.damaged
+        except (OSError, DamagedError) as error:
+            raise CacheError(f"{self.path} cannot be read: {error}") from error
         if damaged and not self._log.names():
             raise CacheError(f"{self.path} is no cache: it is a file of another kind, or damaged")
         if damaged:
@@ -115,28 +114,20 @@ class Cache:
     def note(self, name: str, value: object = None) -> Any:
         """Return the plain data stored under a name, after storing `value` where one is given."""
         if value is not None:
-            with self._telling(*_WRITING):
+            with self._writing():
                 self._log.put_json(f"{_NOTE}{name}", value)
-        try:
-            return self._log.get_json(f"{_NOTE}{name}")
-        except DamagedError as error:
-            raise CacheError(f"{error}; restore it from a copy, or give another folder") from error
+        return self._log.get_json(f"{_NOTE}{name}")
 
     def get(self, name: str) -> dict[str, np.ndarray] | None:
         """Return the arrays of a finished computation; None if it is missing or damaged."""
-        try:
-            with self._telling("cannot be read"):
-                arrays = self._log.get(name)
-        except DamagedError as error:
-            log.warning("%s; it is computed anew", error)
-            return None
+        arrays = self._log.get(name)
         if arrays is not None and name not in self._own:
             self._reused.add(name)
         return arrays
 
     def put(self, entries: Mapping[str, Arrays]) -> None:
         """Store finished computations, all or none of them."""
-        with self._telling(*_WRITING):
+        with self._writing():
             self._log.put(entries)
         self.computed += len(entries)
         self._own.update(entries)
@@ -170,20 +161,14 @@ class Cache:
         return sorted(name for name in self._log.names() if not name.startswith(_NOTE))
 
     @contextlib.contextmanager
-    def _telling(self, what: str, hint: str = "") -> Iterator[None]:
-        """Turn what the file system refuses into `CacheError`."""
+    def _writing(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
-            reason = error.strerror or error
-            raise CacheError(f"{self.path} {what}: {reason}{hint}") from error
-
-
-_WRITING = (
-    "cannot be written",
-    "; what was finished is in it: make room if the disk is full, and begin again",
-)
-"""What `_telling` says of writing."""
+            raise CacheError(
+                f"{self.path} cannot be written: {error.strerror or error}; what was finished is "
+                "in it: make room if the disk is full, and begin again"
+            ) from error
 
 
 def cache_file(folder: Path, kind: str = "sweep") -> Path:

@@ -5,10 +5,10 @@
     log.get("7")                                    # {"rho": array([0.1])}
 
 What is put together is one frame: a header, the names of entries and arrays with their types and
-shapes in JSON, and the bytes of the arrays. Both parts have a checksum. So a process that dies at
-any moment leaves all frames but the one that it was writing; a copy of a log that is growing is a
-log; it needs no lock to be read, nor a right to write; and damage costs the frames that it is in,
-since the next one is found by its mark. Nothing in a log is executed.
+shapes in JSON, and the bytes of the arrays, all under one checksum. So a process that dies at any
+moment leaves all frames but the one that it was writing; a copy of a log that is growing is a log;
+it needs no lock to be read, nor a right to write; and a frame that is damaged is one that is
+missing, since the next one is found by its mark. Nothing in a log is executed.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ import struct
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import IO, Any, Literal, NamedTuple, TypeAlias
+from typing import IO, Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -32,20 +32,13 @@ Arrays: TypeAlias = Mapping[str, np.ndarray]
 MARK = b"VJX1"
 """First bytes of each frame."""
 _HEADER = struct.Struct("<4sIQI")
-"""Mark, length of the names, length of the bytes, checksum of the bytes."""
-_CHECKSUM = struct.Struct("<I")
-"""Checksum of header and names, between the two."""
+"""Mark, length of the names, length of the bytes, checksum of both."""
 _PLAIN = re.compile(r"[<>|=]?[biufU]\d{1,9}")
 """NumPy's types of the arrays that can be stored: of numbers and texts."""
 _JSON = "json"
 """Array of an entry that is plain data."""
-
-
-class _Frame(NamedTuple):
-    head: bytes
-    begin: int
-    size: int
-    checksum: int
+_Place: TypeAlias = tuple[int, int, list[Any]]
+"""Where the bytes of an entry begin, how many they are; name, type and shape of its arrays."""
 
 
 class Log:
@@ -59,7 +52,7 @@ class Log:
     def __init__(self, path: Path | None) -> None:
         self.path = path
         self._memory = io.BytesIO()
-        self._frames: dict[str, _Frame] | None = None
+        self._places: dict[str, _Place] | None = None
         self._damaged = False
 
     def put(self, entries: Mapping[str, Arrays]) -> None:
@@ -67,10 +60,10 @@ class Log:
 
         **Raises:** `TypeError` for arrays of objects; `OSError` where they cannot be written.
         """
-        content = _encode(entries)
+        frame = _encode(entries)
         try:
             with self._opened("ab") as file:
-                begin, rest = file.seek(0, os.SEEK_END), memoryview(content)
+                begin, rest = file.seek(0, os.SEEK_END), memoryview(frame)
                 try:
                     while rest:
                         rest = rest[file.write(rest) :]
@@ -80,26 +73,23 @@ class Log:
                     raise
         except OSError as error:
             raise type(error)(error.errno, error.strerror, str(self.path)) from error
-        if self._frames is not None:
-            self._frames |= dict.fromkeys(entries, _frame_at(content, begin))
+        if self._places is not None:
+            self._places.update(_places(frame, begin))
 
     def get(self, name: str) -> dict[str, np.ndarray] | None:
-        """Return an entry; None where there is none.
-
-        **Raises:** `DamagedError` for one that is damaged.
-        """
-        if name not in self._index():
+        """Return an entry; None where there is none, or it is damaged."""
+        if (place := self._index().get(name)) is None:
             return None
         with self._opened("rb") as file:
-            return self._entry(file, name)
+            return _decode(file, place)
 
     def entries(self) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-        """Yield the entries that are whole, each with its name."""
-        if names := self.names():
+        """Yield all entries with their names, in the order in which they came first."""
+        if places := [*self._index().items()]:
             with self._opened("rb") as file:
-                for name in names:
-                    with contextlib.suppress(DamagedError):
-                        yield name, self._entry(file, name)
+                for name, place in places:
+                    if (entry := _decode(file, place)) is not None:
+                        yield name, entry
 
     def put_json(self, name: str, value: object) -> None:
         """Append plain data as an entry.
@@ -109,15 +99,10 @@ class Log:
         self.put({name: {_JSON: np.frombuffer(json.dumps(value).encode(), np.uint8)}})
 
     def get_json(self, name: str) -> Any:
-        """Return the plain data of an entry; None where there is none.
-
-        **Raises:** `DamagedError` for one that is damaged.
-        """
-        try:
-            entry = self.get(name)
+        """Return the plain data of an entry; None where there is none, or it is damaged."""
+        entry = self.get(name)
+        with contextlib.suppress(ValueError, RecursionError):
             return None if entry is None else json.loads(entry[_JSON].tobytes())
-        except (ValueError, KeyError, RecursionError) as error:
-            raise DamagedError(f"{self.path} is damaged in {name!r}: it is no JSON") from error
 
     def names(self) -> list[str]:
         """Return the names of all entries, in the order in which they came first."""
@@ -131,7 +116,7 @@ class Log:
 
     def clear(self) -> None:
         """Remove the file."""
-        self._frames = None
+        self._places = None
         if self.path is not None:
             self.path.unlink(missing_ok=True)
 
@@ -142,33 +127,25 @@ class Log:
         # What is appended stays in no buffer, which a forked process would write once more.
         return open(self.path, mode, 0 if mode == "ab" else -1)
 
-    def _index(self) -> dict[str, _Frame]:
-        """Find the frames of the file, the last one of each name."""
-        if self._frames is None:
-            frames: dict[str, _Frame] = {}
+    def _index(self) -> dict[str, _Place]:
+        """Find the frames of the file: the place of the last entry of each name.
+
+        **Raises:** `DamagedError` for what is no file.
+        """
+        if self._places is None:
+            places: dict[str, _Place] = {}
             self._damaged = False
             try:
                 with self._opened("rb") as file:
-                    for frame in _find_frames(file):
-                        self._damaged |= frame is None
-                        if frame is not None:
-                            frames |= dict.fromkeys((name for name, _ in _forms(frame)), frame)
+                    for found in _find_frames(file):
+                        self._damaged |= found is None
+                        places.update(found or {})
             except FileNotFoundError:
                 pass
             except IsADirectoryError as error:
                 raise DamagedError(f"{self.path} is damaged: it is not a file") from error
-            self._frames = frames
-        return self._frames
-
-    def _entry(self, file: IO[bytes], name: str) -> dict[str, np.ndarray]:
-        frame = self._index()[name]
-        body = _body_of(file, frame)
-        if body is None:
-            raise DamagedError(f"{self.path} is damaged in {name!r}: its bytes have changed")
-        try:
-            return _decode(frame, body)[name]
-        except (ValueError, TypeError, KeyError, OverflowError) as error:
-            raise DamagedError(f"{self.path} is damaged in {name!r}: {error}") from error
+            self._places = places
+        return self._places
 
 
 def write_log(path: Path, entries: Mapping[str, Arrays]) -> None:
@@ -179,60 +156,49 @@ def write_log(path: Path, entries: Mapping[str, Arrays]) -> None:
     write_whole(path, _encode(entries) if entries else b"")
 
 
-def _find_frames(file: IO[bytes]) -> Iterator[_Frame | None]:
-    """Yield the frames of a file; None where there is damage, but for that of bytes in a frame."""
+def _find_frames(file: IO[bytes]) -> Iterator[dict[str, _Place] | None]:
+    """Yield the entries of each frame of a file; None where there is damage."""
     end, at = file.seek(0, os.SEEK_END), file.seek(0)
-    while begin := file.read(_HEADER.size + _CHECKSUM.size):
-        try:
+    while header := file.read(_HEADER.size):
+        with contextlib.suppress(struct.error, ValueError):
+            _, head, body, _ = _HEADER.unpack(header)
             # Damaged lengths are larger than any memory.
-            length = min(_HEADER.unpack_from(begin)[1], end - at)
-            frame = _frame_at(begin + file.read(length), at)
-        except (struct.error, ValueError):
-            yield None
-            at = _find_mark(file, at + 1)
+            yield _places(header + file.read(min(head + body, end - at)), at)
+            at += _HEADER.size + head + body
             continue
-        yield frame
-        at = file.seek(min(frame.begin + frame.size, end))
-        # One that was being written when its process died would hide those that came later.
-        torn = file.read(len(MARK)) != MARK and _body_of(file, frame) is None
-        at = _find_mark(file, frame.begin) if torn else file.seek(at)
+        yield None
+        file.seek(at + 1)
+        rest = file.read()
+        found = rest.find(MARK)
+        at = file.seek(at + 1 + (len(rest) if found < 0 else found))
 
 
-def _frame_at(content: bytes, at: int) -> _Frame:
-    """Return the frame that begins with `content`, which has its names at least.
-
-    - `at`: place of the content in the file.
+def _places(frame: bytes, begin: int) -> dict[str, _Place]:
+    """Return where the entries of a frame are in a file, in which it begins at `begin`.
 
     **Raises:** `ValueError` for what is no frame, or has changed.
     """
-    mark, length, size, body = _HEADER.unpack_from(content)
-    begin = _HEADER.size + _CHECKSUM.size + length
-    head = content[_HEADER.size + _CHECKSUM.size : begin]
-    (own,) = _CHECKSUM.unpack_from(content, _HEADER.size)
-    if mark != MARK or len(head) < length or own != _checksum_of(content[: _HEADER.size], head):
+    mark, head, body, own = _HEADER.unpack_from(frame)
+    if (
+        mark != MARK
+        or len(frame) != _HEADER.size + head + body
+        or own != _checksum(frame[: _HEADER.size], frame[_HEADER.size :])
+    ):
         raise ValueError("no frame")
-    return _Frame(head, at + begin, size, body)
+    places: dict[str, _Place] = {}
+    at = begin + _HEADER.size + head
+    # A checksum is no proof of who wrote it: another program's entries are none.
+    with contextlib.suppress(ValueError, TypeError, RecursionError):
+        for name, size, arrays in json.loads(frame[_HEADER.size : _HEADER.size + head]):
+            if not 0 <= size <= begin + len(frame) - at:
+                break
+            places[str(name)] = at, int(size), list(arrays)
+            at += int(size)
+    return places
 
 
-def _checksum_of(header: bytes, head: bytes) -> int:
-    return checksum(head, checksum(header))
-
-
-def _body_of(file: IO[bytes], frame: _Frame) -> bytes | None:
-    """Return the bytes of a frame; None where they have changed, or are not all there."""
-    if frame.begin + frame.size > file.seek(0, os.SEEK_END):
-        return None
-    file.seek(frame.begin)
-    body = file.read(frame.size)
-    return body if checksum(body) == frame.checksum else None
-
-
-def _find_mark(file: IO[bytes], at: int) -> int:
-    """Go to the next place from `at` on where a frame may begin, or to the end; return it."""
-    file.seek(at)
-    rest = file.read()
-    found = rest.find(MARK)
-    return file.seek(at + (len(rest) if found < 0 else found))
+def _checksum(header: bytes, content: bytes) -> int:
+    return checksum(content, checksum(header[: _HEADER.size - 4]))
 
 
 def _encode(entries: Mapping[str, Arrays]) -> bytes:
@@ -241,31 +207,27 @@ def _encode(entries: Mapping[str, Arrays]) -> bytes:
         for key, value in arrays.items():
             if not _PLAIN.fullmatch(value.dtype.str):
                 raise TypeError(f"numbers and texts can be stored; {key} is {value.dtype}")
-        forms.append((name, [(key, v.dtype.str, v.shape) for key, v in arrays.items()]))
+        size = sum(value.nbytes for value in arrays.values())
+        forms.append((name, size, [(key, v.dtype.str, v.shape) for key, v in arrays.items()]))
         parts += [value.tobytes() for value in arrays.values()]
-    head, body = json.dumps(forms).encode(), b"".join(parts)
-    header = _HEADER.pack(MARK, len(head), len(body), checksum(body))
-    return b"".join((header, _CHECKSUM.pack(_checksum_of(header, head)), head, body))
+    head, size = json.dumps(forms).encode(), sum(map(len, parts))
+    content, header = b"".join((head, *parts)), _HEADER.pack(MARK, len(head), size, 0)
+    return _HEADER.pack(MARK, len(head), size, _checksum(header, content)) + content
 
 
-def _forms(frame: _Frame) -> list[tuple[str, Any]]:
-    """Return the names of the entries of a frame, each with the forms of its arrays."""
-    try:
-        return [(str(name), arrays) for name, arrays in json.loads(frame.head)]
-    except (ValueError, TypeError, RecursionError):
-        return []  # Of another program: a checksum is no proof of who wrote it.
-
-
-def _decode(frame: _Frame, body: bytes) -> dict[str, dict[str, np.ndarray]]:
-    entries: dict[str, dict[str, np.ndarray]] = {}
-    at = 0
-    for name, arrays in _forms(frame):
-        own = entries[name] = {}
+def _decode(file: IO[bytes], place: _Place) -> dict[str, np.ndarray] | None:
+    """Read an entry; None for one of another program."""
+    begin, size, arrays = place
+    entry: dict[str, np.ndarray] = {}
+    with contextlib.suppress(ValueError, TypeError, OverflowError):
+        file.seek(begin)
+        data, at = file.read(size), 0
         for key, kind, shape in arrays:
             if not _PLAIN.fullmatch(kind):  # NumPy evaluates others.
-                raise ValueError(f"{key} is {kind}")
+                return None
             dtype = np.dtype(kind)
-            size = dtype.itemsize * int(np.prod(shape, dtype=np.int64))
-            own[key] = np.frombuffer(body[at : at + size], dtype).reshape(shape).copy()
-            at += size
-    return entries
+            width = dtype.itemsize * int(np.prod(shape, dtype=np.int64))
+            entry[str(key)] = np.frombuffer(data[at : at + width], dtype).reshape(shape).copy()
+            at += width
+        return entry
+    return None
