@@ -189,7 +189,6 @@ class Augmentation(InNotebook):
         **Raises:** `FolderInUse` where another process writes it.
         """
         place = Path(folder)
-        place.mkdir(parents=True, exist_ok=True)
         with write_lock(place):
             with replacing(place / TABLE) as partial:
                 self.table.to_parquet(partial)

@@ -71,7 +71,6 @@ def save_run(run: Run, folder: Path) -> Path:
 
     **Raises:** as `Run.save`.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     with write_lock(folder):
         check_not_continued(run, folder)
         table = run.table.save(folder)

@@ -30,9 +30,10 @@ from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.run_folder import write_record
 from verifai_jax.falsification.silent_mistakes import cut_short_note, nominal_note, notes_after
 from verifai_jax.falsification.summary import first_message
-from verifai_jax.falsification.validation import space_as_data, writing
+from verifai_jax.falsification.validation import space_as_data
 from verifai_jax.search import Search
 from verifai_jax.statistics.stopping import StoppingRule
+from verifai_jax.store.locks import writing
 
 RAISES = "an error of every simulation"
 """What has stopped a run whose first simulations all raise."""

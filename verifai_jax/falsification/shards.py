@@ -42,15 +42,13 @@ from verifai_jax.falsification.validation import (
     adapt_search,
     check_options,
     check_search,
-    locked,
     usual_batch,
-    writing,
 )
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.search.proposals import Proposals
 from verifai_jax.store.files import DamagedError
-from verifai_jax.store.locks import LOCK
+from verifai_jax.store.locks import LOCK, write_lock, writing
 from verifai_jax.store.log import Log
 
 SHARD = "shard.rows"
@@ -164,9 +162,7 @@ def simulate_shard(
         "shard": [shard.number, shard.of],
         "sources": problem.sources().to_json(),
     }
-    with writing(place):
-        place.mkdir(parents=True, exist_ok=True)
-    with locked(place):
+    with write_lock(place):
         log = Log(place / SHARD)
         _claim(log, record)
         rows = shard.rows(budget, _unit(problem, batch))

@@ -1,7 +1,7 @@
 """Checks of the options of `falsify` and `resume`, before anything compiles."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -27,18 +27,6 @@ from verifai_jax.systems.base import System
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-@contextmanager
-def writing(place: Path | None) -> Iterator[None]:
-    """Turn what a file system refuses into one line that says what to do."""
-    try:
-        yield
-    except OSError as error:
-        raise ValueError(
-            f"folder {str(place)!r} cannot be written ({error.strerror or error}); give one that "
-            "can be, or none to keep the run in memory"
-        ) from error
 
 
 MOST_AT_ONCE = 32_768
@@ -398,20 +386,6 @@ def earlier_rows(warm_start: object, problem: Problem) -> "pd.DataFrame | None":
 
 
 @contextmanager
-def locked(folder: Path | None) -> Iterator[None]:
-    """Be the only one who writes to the folder of a run.
-
-    **Raises:** `FolderInUse` where another process does, `ValueError` where it cannot be written.
-    """
-    with ExitStack() as held:
-        with writing(folder):
-            if folder is not None:
-                folder.mkdir(parents=True, exist_ok=True)
-            held.enter_context(write_lock(folder))
-        yield
-
-
-@contextmanager
 def new_folder(folder: str | Path | None) -> Iterator[Path | None]:
     """Make the folder for a new run, and be the only one who writes to it.
 
@@ -423,7 +397,7 @@ def new_folder(folder: str | Path | None) -> Iterator[Path | None]:
     place = Path(folder)
     if not (place / LOCK).exists():  # Whoever writes there is told by the lock.
         _check_empty(place)
-    with locked(place):
+    with write_lock(place):
         _check_empty(place)  # Another run may have begun in it, and ended, since.
         yield place
 

@@ -180,16 +180,10 @@ def cache_file(folder: Path, kind: str = "sweep") -> Path:
 def locked_cache(folder: str | Path | None, kind: str = "sweep") -> Iterator[Cache]:
     """Open a cache, and be the only one who writes to its folder.
 
-    **Raises:** `FolderInUse`, which names the process that writes to it; `CacheError` where it
-    cannot be written, and as `Cache`.
+    **Raises:** `FolderInUse`, which names the process that writes to it; `ValueError` where it
+    cannot be written; as `Cache`.
     """
-    with contextlib.ExitStack() as held:
-        if folder is not None:
-            try:
-                Path(folder).mkdir(parents=True, exist_ok=True)
-                held.enter_context(write_lock(Path(folder)))
-            except OSError as error:
-                raise CacheError(f"{folder} cannot be written: {error}") from error
+    with write_lock(None if folder is None else Path(folder)):
         yield Cache(folder, kind)
 
 

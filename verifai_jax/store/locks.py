@@ -23,12 +23,12 @@ except ImportError:
     fcntl = None
 
 LOCK = "writer.lock"
-"""Name of the file in a folder that is being written; `NAME.lock` beside a file NAME that is."""
+"""Name of the file in a folder that is being written."""
 _NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}
 
 
 class FolderInUse(ValueError):
-    """An error for a folder or file that another process is writing."""
+    """An error for a folder that another process is writing."""
 
 
 _held: "weakref.WeakSet[FileIO]" = weakref.WeakSet()
@@ -46,26 +46,35 @@ if hasattr(os, "register_at_fork"):
 
 
 @contextlib.contextmanager
-def write_lock(place: Path | None) -> Iterator[None]:
-    """Be the only one who writes to a place; None is no place.
+def write_lock(folder: Path | None) -> Iterator[None]:
+    """Be the only one who writes to a folder, which is made; with None, nothing is locked.
 
-    **Arguments:**
-
-    - `place`: a folder that exists, or a file in one.
-
-    **Raises:** `FolderInUse`, which names the process that has the lock; `OSError` where the file
-    of the lock cannot be written.
+    **Raises:** `FolderInUse`, which names the process that has the lock; `ValueError` for a folder
+    that cannot be written.
     """
-    if place is None or fcntl is None:
+    if folder is None:
         yield
         return
-    path = place / LOCK if place.is_dir() else place.with_name(f"{place.name}.lock")
-    file, owner = _acquire(path, place), os.getpid()
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        file, owner = _acquire(folder), os.getpid()
     try:
         yield
     finally:
-        if os.getpid() == owner:
-            _release(file, path)
+        if file is not None and os.getpid() == owner:
+            _release(file, folder / LOCK)
+
+
+@contextlib.contextmanager
+def writing(folder: Path | None) -> Iterator[None]:
+    """Turn what a file system refuses into one line that says what to do."""
+    try:
+        yield
+    except OSError as error:
+        raise ValueError(
+            f"folder {str(folder)!r} cannot be written ({error.strerror or error}); give one that "
+            "can be, or none to keep the results in memory"
+        ) from error
 
 
 def _release(file: FileIO, path: Path) -> None:
@@ -76,8 +85,10 @@ def _release(file: FileIO, path: Path) -> None:
     file.close()
 
 
-def _acquire(path: Path, place: Path) -> FileIO:
-    assert fcntl is not None
+def _acquire(folder: Path) -> FileIO | None:
+    path = folder / LOCK
+    if fcntl is None:
+        return None
     while True:
         file = FileIO(path, "r+", opener=_open)
         try:
@@ -85,7 +96,7 @@ def _acquire(path: Path, place: Path) -> FileIO:
         except BlockingIOError:
             owner = file.read(200).decode(errors="replace")
             file.close()
-            raise FolderInUse(_in_use(place, owner)) from None
+            raise FolderInUse(_in_use(folder, owner)) from None
         except OSError as error:
             if error.errno not in _NO_LOCKS:
                 file.close()
@@ -106,7 +117,7 @@ def _open(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
 
 
-def _in_use(place: Path, owner: str) -> str:
+def _in_use(folder: Path, owner: str) -> str:
     process, _, host = owner.partition(" ")
     if not (process.isdecimal() and host.isprintable()):
         who = "another process"
@@ -114,4 +125,6 @@ def _in_use(place: Path, owner: str) -> str:
         who = f"this process ({process}) already"
     else:
         who = f"process {process} on {host}"
-    return f"{str(place)!r} is being written by {who}; wait until that ends, or give another place"
+    return (
+        f"{str(folder)!r} is being written by {who}; wait until that ends, or give another folder"
+    )

@@ -76,7 +76,6 @@ def write_sweep(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> Pat
 
     **Raises:** `FolderInUse` where another process writes it.
     """
-    (folder / POLICIES).mkdir(parents=True, exist_ok=True)
     with write_lock(folder):
         _write_files(stored, table, folder)
     return folder
@@ -86,6 +85,7 @@ def _write_files(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> No
     record = stored.record
     # The record is written last: a folder without it holds no sweep.
     (folder / RECORD).unlink(missing_ok=True)
+    (folder / POLICIES).mkdir(exist_ok=True)
     for old in (folder / POLICIES).glob("*.npz"):
         old.unlink()
     mixed = _mixed_columns(table)
