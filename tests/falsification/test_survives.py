@@ -73,6 +73,7 @@ def test_a_full_disk_stops_the_run_with_nothing_lost(problem, whole, tmp_path, m
     def append(self, columns):
         # The disk is full from the fourth batch on: what is written goes nowhere.
         if len(self) == 48 and self._tail is not None:
+            self._tail.close()
             self._tail.path = Path("/dev/full")
         rows(self, columns)
 

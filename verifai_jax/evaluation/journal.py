@@ -9,6 +9,7 @@ For simulators of which one simulation takes minutes: a run that is killed in th
 does not simulate its finished rows again. A row is recalled only for the same point.
 """
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +27,8 @@ class Journal:
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / JOURNAL
-        self._log = Log(self.path)
-        self._known = _read(self._log)
+        self._known = _read(Log(self.path))
+        self._log = Log(self.path)  # It is not read: what is put is not looked up.
         self._last = max(self._known, default=-1)
 
     def add(self, row: int, point: Float[np.ndarray, " d"], verdict: RowVerdict) -> None:
@@ -35,10 +36,18 @@ class Journal:
 
         **Raises:** `OSError` where it cannot be written.
         """
-        arrays = {name: value for name, value in verdict._asdict().items() if value is not None}
-        entry = {name: np.asarray(value) for name, value in arrays.items()}
+        entry = {
+            "point": np.asarray(point, np.float32).tolist(),
+            "rho": np.asarray(verdict.rho, np.float64).tolist(),
+            "status": int(verdict.status),
+            "holds": np.asarray(verdict.holds).tolist(),
+            "message": verdict.message,
+            "marks": None if verdict.marks is None else verdict.marks.tolist(),
+            "steering": None if verdict.steering is None else verdict.steering.tolist(),
+        }
         self._last = max(self._last, row)
-        self._log.put({str(row): {"point": np.asarray(point, np.float32), **entry}})
+        # In JSON, which takes less time than many small arrays.
+        self._log.put_json(str(row), entry)
 
     def recall(self, first: int, points: Float[np.ndarray, "n d"]) -> dict[int, RowVerdict]:
         """Return the known rows from `first` on, of the same points, by their place among them."""
@@ -65,11 +74,19 @@ def count_unfinished(folder: Path, rows: int) -> int:
 
 def _read(log: Log) -> dict[int, tuple[np.ndarray, RowVerdict]]:
     known = {}
-    for name, arrays in log.entries():
-        try:
-            point, status = arrays.pop("point"), int(arrays.pop("status"))
-            message = str(arrays.pop("message"))
-            known[int(name)] = point, RowVerdict(status=status, message=message, **arrays)
-        except (ValueError, KeyError, TypeError):
-            continue  # Of another program.
+    for name in log.names():
+        with contextlib.suppress(ValueError, KeyError, TypeError):  # Of another program.
+            entry = log.get_json(name)
+            marks, steering = entry["marks"], entry["steering"]
+            known[int(name)] = (
+                np.asarray(entry["point"], np.float32),
+                RowVerdict(
+                    np.asarray(entry["rho"], np.float64),
+                    int(entry["status"]),
+                    np.asarray(entry["holds"], bool),
+                    str(entry["message"]),
+                    None if marks is None else np.asarray(marks, np.int32),
+                    None if steering is None else np.asarray(steering, np.float32),
+                ),
+            )
     return known

@@ -19,8 +19,9 @@ import re
 import struct
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
+from io import FileIO
 from pathlib import Path
-from typing import IO, Any, Literal, TypeAlias
+from typing import IO, Any, TypeAlias
 
 import numpy as np
 
@@ -52,6 +53,7 @@ class Log:
     def __init__(self, path: Path | None) -> None:
         self.path = path
         self._memory = io.BytesIO()
+        self._file: FileIO | io.BytesIO | None = None
         self._places: dict[str, _Place] | None = None
         self._damaged = False
 
@@ -62,15 +64,17 @@ class Log:
         """
         frame = _encode(entries)
         try:
-            with self._opened("ab") as file:
-                begin, rest = file.seek(0, os.SEEK_END), memoryview(frame)
-                try:
-                    while rest:
-                        rest = rest[file.write(rest) :]
-                except OSError:
-                    with contextlib.suppress(OSError):  # What little room there is, others need.
-                        file.truncate(begin)
-                    raise
+            if self._file is None:
+                # No buffer, which a forked process would write once more.
+                self._file = self._memory if self.path is None else FileIO(self.path, "a")
+            begin, rest = self._file.seek(0, os.SEEK_END), memoryview(frame)
+            try:
+                while rest:
+                    rest = rest[self._file.write(rest) :]
+            except OSError:
+                with contextlib.suppress(OSError):  # What little room there is, others need.
+                    self._file.truncate(begin)
+                raise
         except OSError as error:
             raise type(error)(error.errno, error.strerror, str(self.path)) from error
         if self._places is not None:
@@ -80,13 +84,13 @@ class Log:
         """Return an entry; None where there is none, or it is damaged."""
         if (place := self._index().get(name)) is None:
             return None
-        with self._opened("rb") as file:
+        with self._opened() as file:
             return _decode(file, place)
 
     def entries(self) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
         """Yield all entries with their names, in the order in which they came first."""
         if places := [*self._index().items()]:
-            with self._opened("rb") as file:
+            with self._opened() as file:
                 for name, place in places:
                     if (entry := _decode(file, place)) is not None:
                         yield name, entry
@@ -101,7 +105,7 @@ class Log:
     def get_json(self, name: str) -> Any:
         """Return the plain data of an entry; None where there is none, or it is damaged."""
         entry = self.get(name)
-        with contextlib.suppress(ValueError, RecursionError):
+        with contextlib.suppress(ValueError, KeyError, RecursionError):
             return None if entry is None else json.loads(entry[_JSON].tobytes())
 
     def names(self) -> list[str]:
@@ -116,16 +120,22 @@ class Log:
 
     def clear(self) -> None:
         """Remove the file."""
+        self.close()
         self._places = None
         if self.path is not None:
             self.path.unlink(missing_ok=True)
 
-    def _opened(self, mode: Literal["ab", "rb"]) -> AbstractContextManager[IO[bytes]]:
-        if self.path is None:
-            self._memory.seek(0)
-            return contextlib.nullcontext(self._memory)
-        # What is appended stays in no buffer, which a forked process would write once more.
-        return open(self.path, mode, 0 if mode == "ab" else -1)
+    def close(self) -> None:
+        """Close the file; what is put later opens it again."""
+        file, self._file = self._file, None
+        if file is not None and file is not self._memory:
+            file.close()
+
+    def __del__(self) -> None:
+        self.close()
+
+    def _opened(self) -> AbstractContextManager[IO[bytes]]:
+        return contextlib.nullcontext(self._memory) if self.path is None else open(self.path, "rb")
 
     def _index(self) -> dict[str, _Place]:
         """Find the frames of the file: the place of the last entry of each name.
@@ -136,7 +146,7 @@ class Log:
             places: dict[str, _Place] = {}
             self._damaged = False
             try:
-                with self._opened("rb") as file:
+                with self._opened() as file:
                     for found in _find_frames(file):
                         self._damaged |= found is None
                         places.update(found or {})
