@@ -106,6 +106,15 @@ def read_record(path: Path) -> dict[str, Any]:
     return record
 
 
+def plain(value: object) -> Any:
+    """Return data as it is read back from JSON: NumPy's as numbers and lists, what is none as text."""
+
+    def convert(each: Any) -> Any:
+        return each.tolist() if hasattr(each, "tolist") else str(each)
+
+    return json.loads(json.dumps(value, default=convert))
+
+
 def record_checksum(record: Mapping[str, Any]) -> int:
     """Return the checksum of plain data."""
     return checksum(json.dumps(record, sort_keys=True).encode())

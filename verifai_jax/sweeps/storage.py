@@ -23,7 +23,7 @@ from verifai_jax.core.text import one_line
 from verifai_jax.features import FeatureSpace
 from verifai_jax.rl.policy import Policy, load_policy, save_policy
 from verifai_jax.store import files
-from verifai_jax.store.files import DamagedError, checksum
+from verifai_jax.store.files import DamagedError, checksum, plain
 from verifai_jax.store.locks import write_lock
 from verifai_jax.sweeps.record import Curve, SweepRecord
 
@@ -89,7 +89,7 @@ def _write_files(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> No
     for old in (folder / POLICIES).glob("*.npz"):
         old.unlink()
     mixed = _mixed_columns(table)
-    texts = {name: [json.dumps(_plain(v)) for v in table[name]] for name in mixed}
+    texts = {name: [json.dumps(plain(v)) for v in table[name]] for name in mixed}
     table.assign(**texts).to_parquet(folder / TABLE)
     for i, policy in enumerate(record.policies):
         if policy is not None:
@@ -102,21 +102,21 @@ def _write_files(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> No
         arrays[f"{configuration}/{seed}/steps"] = np.asarray(curve.steps)
         arrays[f"{configuration}/{seed}/mean_return"] = np.asarray(curve.mean_return)
     np.savez_compressed(folder / CURVES, **arrays)  # pyright: ignore[reportArgumentType]
-    data = {name: _plain(getattr(record, name)) for name in _PLAIN}
+    data = {name: getattr(record, name) for name in _PLAIN}
     data |= {
         "complete": record.complete,
         "rows": record.rows,
         "sources": list(record.sources),
-        "used": _plain(stored.used),
+        "used": stored.used,
         "mixed": mixed,
-        "worst": _plain(record.worst),
+        "worst": record.worst,
         "space": _space_to_json(stored.space),
         "checksums": {
             file.relative_to(folder).as_posix(): checksum(file.read_bytes())
             for file in _files(folder, record.rows)
         },
     }
-    files.write_record(folder / RECORD, data)
+    files.write_record(folder / RECORD, plain(data))
 
 
 def _files(folder: Path, rows: int) -> list[Path]:
@@ -250,18 +250,3 @@ def _space_from_json(data: Mapping[str, Any] | None) -> FeatureSpace | None:
         return None if data is None else FeatureSpace.from_json({**data, "where": None})
     except ValueError:
         return None
-
-
-def _plain(value: object) -> Any:
-    """Convert NumPy numbers and tuples to what JSON has."""
-    if isinstance(value, Mapping):
-        return {str(name): _plain(entry) for name, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, np.generic):
-        return value.item()
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    return str(value)
