@@ -107,7 +107,7 @@ def read_record(path: Path) -> dict[str, Any]:
 
 
 def plain(value: object) -> Any:
-    """Return data as it is read back from JSON: NumPy's as numbers and lists, what is none as text."""
+    """Return data as JSON has it: arrays as lists, and a text of what it does not have."""
 
     def convert(each: Any) -> Any:
         return each.tolist() if hasattr(each, "tolist") else str(each)
