@@ -9,6 +9,7 @@ read_record(path)                               # DamagedError, where it has cha
 
 import contextlib
 import json
+import os
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -62,7 +63,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
     **Raises:** `OSError` that names `path`, for whatever the file system refuses.
     """
     path = Path(path)
-    partial = path.with_name(f".{path.stem}.part{path.suffix}")
+    # Several processes may write it at once, such as tests of one problem.
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
