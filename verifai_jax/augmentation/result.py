@@ -24,8 +24,8 @@ from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.precision import reproducible_settings
+from verifai_jax.core.whole_files import replacing
 from verifai_jax.statistics.paired import PairedDifference
-from verifai_jax.store.files import replacing
 from verifai_jax.store.locks import write_lock
 
 TABLE, ADDED, SUMMARY = "table.parquet", "added.parquet", "summary.txt"

@@ -15,12 +15,12 @@ import numpy as np
 
 from verifai_jax.core.figure import Axes, Figure, new_figure
 from verifai_jax.core.text import format_seconds
+from verifai_jax.core.whole_files import replacing
 from verifai_jax.mtl._explain import Explanation, Node, heading
 from verifai_jax.mtl.evaluate import Evaluator
 from verifai_jax.mtl.formula import Term
 from verifai_jax.mtl.semantics import hard
 from verifai_jax.mtl.setting import prepare
-from verifai_jax.store.files import replacing
 
 HOLDS, FAILS, PATH, QUIET = "#0a8f6a", "#cf3f21", "#1b2a41", "#7b8794"
 _MAX_ROWS = 14

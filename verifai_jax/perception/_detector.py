@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from verifai_jax.core.whole_files import replacing
 from verifai_jax.perception.camera import STATIC, described
-from verifai_jax.store.files import replacing
 
 FORMAT = "verifai_jax detector 1"
 

@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
+from verifai_jax.core.whole_files import replacing
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.plotting.film import LAST, MOST_FRAMES, MOST_WANTED, check_film
 from verifai_jax.plotting.gymnasium_film import episode_of, film_episode
 from verifai_jax.plotting.mujoco_motion import can_draw, record
 from verifai_jax.plotting.mujoco_scene import film
 from verifai_jax.plotting.style import DPI, new_figure
-from verifai_jax.store.files import replacing
 
 FRAMES_PER_SECOND = 25
 SIZE = (572, 330)

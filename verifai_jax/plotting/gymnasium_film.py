@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
+from verifai_jax.core.whole_files import replacing
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.plotting.film import (
     Frame,
@@ -16,7 +17,6 @@ from verifai_jax.plotting.film import (
     gif,
     labelled,
 )
-from verifai_jax.store.files import replacing
 from verifai_jax.systems.blackbox._blackbox import plain_leaves, seed_of
 from verifai_jax.systems.environments import EpisodeFunction
 

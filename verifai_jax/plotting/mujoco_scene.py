@@ -20,10 +20,10 @@ import numpy as np
 from jaxtyping import Int, UInt8
 
 from verifai_jax.core.errors import require
+from verifai_jax.core.whole_files import replacing
 from verifai_jax.plotting.film import BACKGROUND, Frame, check_film, film_samples, gif, labelled
 from verifai_jax.plotting.mujoco_motion import Motion
 from verifai_jax.plotting.mujoco_view import best_view, named_view
-from verifai_jax.store.files import replacing
 
 FRAMES_PER_SECOND = 20
 SIZE = (480, 320)

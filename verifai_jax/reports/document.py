@@ -13,6 +13,7 @@ from verifai_jax.comparison.result import Comparison
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.whole_files import replacing
 from verifai_jax.estimation.result import Estimate
 from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
@@ -23,7 +24,6 @@ from verifai_jax.reports.page import render
 from verifai_jax.reports.run_question import About
 from verifai_jax.reports.run_report import run_page
 from verifai_jax.reports.sweep_report import sweep_page
-from verifai_jax.store.files import replacing
 from verifai_jax.sweeps.result import Sweep
 
 

@@ -27,8 +27,8 @@ from verifai_jax.core.checks import check_count, is_number
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.sources import made_here, sources_of
 from verifai_jax.core.text import one_line
+from verifai_jax.core.whole_files import replacing
 from verifai_jax.rl.task.task import Action, Continuous, Discrete
-from verifai_jax.store.files import replacing
 
 Layer = tuple[Float[Array | np.ndarray, "... _ _"], Float[Array | np.ndarray, "... _"]]
 Layers = tuple[Layer, ...]

@@ -1,17 +1,14 @@
 """Files that are there whole or not at all, records in JSON, the checksum of all that is stored.
 
 write_whole(path, content)
-with replacing("report.html") as partial:
-    partial.write_text(page)                    # takes the place of report.html at the end
 write_record(path, {"seed": 0})
 read_record(path)                               # DamagedError, where it has changed since
 """
 
 import contextlib
 import json
-import os
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,30 +48,6 @@ def write_whole(path: Path, content: "pa.Buffer | bytes") -> Path:
             partial.unlink(missing_ok=True)
         raise
     return path
-
-
-@contextlib.contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
-    """Yield the path of a file to write, which replaces the one at `path` once it is whole.
-
-    Its ending is that of `path`, which tells some libraries the format. Folders that it needs are
-    made. Where writing fails, the file that was at `path` stays.
-
-    **Raises:** `OSError` that names `path`, for whatever the file system refuses.
-    """
-    path = Path(path)
-    # Several processes may write it at once, such as tests of one problem.
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield partial
-        partial.replace(path)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise type(error)(f"{path} cannot be written ({reason}); give another path") from error
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
 
 
 def write_record(path: Path, record: Mapping[str, Any]) -> dict[str, Any]:

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
+from verifai_jax.core.whole_files import replacing
 from verifai_jax.plotting.style import new_figure, show_or_save
 from verifai_jax.rl import Continuous, Policy
-from verifai_jax.store.files import replacing
 
 
 def test_a_file_is_replaced_once_it_is_whole(tmp_path):
