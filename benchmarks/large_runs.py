@@ -23,7 +23,7 @@ import time
 from pathlib import Path
 
 SIZES = (1_000_000, 10_000_000, 100_000_000)
-MOST_IN_MEMORY = 50_000_000
+MAX_IN_MEMORY = 50_000_000
 """Rows beyond which a run without a folder is left out."""
 
 
@@ -118,7 +118,7 @@ def main() -> None:
         seconds = 0.0
         try:
             for place, resumes in (("", False), (folder, False), (folder, False), (killed, True)):
-                if not place and rows > MOST_IN_MEMORY:
+                if not place and rows > MAX_IN_MEMORY:
                     continue
                 if resumes:
                     kill_in_the_middle(rows, killed, seconds)

@@ -25,7 +25,7 @@ from scipy.stats import ncx2, norm
 
 import verifai_jax as vj
 
-LEAST = 0.005
+MIN_MASS = 0.005
 """Part of the probability from which a mode has to be found."""
 
 
@@ -202,7 +202,7 @@ def measure(shape: str, dim: int, count: int, budget: int, seeds: int) -> str:
     """One line of the table."""
     planted = SHAPES[shape](dim, count)
     masses = planted.masses
-    wanted = np.flatnonzero(masses >= LEAST * masses.sum())
+    wanted = np.flatnonzero(masses >= MIN_MASS * masses.sum())
     complete = covered = intervals = extra = 0
     farthest, started = 1.0, time.perf_counter()
     for seed in range(seeds):

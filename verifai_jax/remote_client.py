@@ -48,9 +48,9 @@ SHORTEST_PAUSE, LONGEST_PAUSE = 0.05, 2.0
 """Seconds between two attempts to connect."""
 GREETING_SECONDS = 10.0
 """Seconds within which a server must say hello."""
-GREETING_BYTES, MOST_BYTES = 1 << 16, 16 << 20
+GREETING_BYTES, MAX_BYTES = 1 << 16, 16 << 20
 """Bytes of a server's hello, and of any later message, beyond which it is none."""
-MOST_LOGGED = 20
+MAX_LOGGED = 20
 """Errors of one server that are logged."""
 RESERVED = ("dt", "times", "valid")
 """Names in a result that are no signals."""
@@ -241,7 +241,7 @@ class _Connection:
                 self.socket = _encrypted(self.socket, tls, host)
             self._greet(token, name)
             self.socket.settimeout(None)
-            self._most = MOST_BYTES
+            self._most = MAX_BYTES
         except BaseException:
             self.socket.close()
             raise
@@ -321,7 +321,7 @@ class _Connection:
                     raise EOFError("the run has ended")
                 case "error":
                     self._told += 1
-                    if self._told <= MOST_LOGGED:
+                    if self._told <= MAX_LOGGED:
                         log.warning("the server says: %s", plain(message.get("message")))
                     if message.get("fatal") and not self.welcome:
                         raise _refusal(message)

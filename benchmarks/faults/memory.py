@@ -10,7 +10,7 @@ from pathlib import Path
 import verifai_jax as vj
 from benchmarks.faults import kills
 
-MOST_GROWTH_GB = 0.3
+MAX_GROWTH_GB = 0.3
 """Memory beyond that of its rows by which a run may grow once it is under way."""
 EVERY = 1.0
 """Seconds between two looks at the memory."""

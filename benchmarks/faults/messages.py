@@ -27,7 +27,7 @@ TOKEN = "a secret of the fuzzer"
 CLIENTS = 4
 POINTS = 6
 """Honest simulations beside each hostile connection."""
-MOST_MEMORY_GB = 1.0
+MAX_MEMORY_GB = 1.0
 """Resident memory by which this process may grow: 256 MiB of messages, and what Python adds."""
 
 
@@ -67,7 +67,7 @@ class Fire:
                 raise Broken(f"row {index} of an honest client: {outcome.message!r}")
         if seen != set(range(POINTS)):
             raise Broken(f"only rows {sorted(seen)} came back")
-        if _memory() - self._memory > MOST_MEMORY_GB:
+        if _memory() - self._memory > MAX_MEMORY_GB:
             raise Broken(f"the process has grown by {_memory() - self._memory:.1f} GB")
         return "by a client with the token" if insider else "by a stranger"
 

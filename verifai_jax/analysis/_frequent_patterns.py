@@ -30,7 +30,7 @@ from verifai_jax.core.text import counted, format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
-MOST_COMBINATIONS = 50_000
+MAX_COMBINATIONS = 50_000
 
 
 @dataclass(frozen=True)
@@ -264,9 +264,9 @@ def _frequent(
             count = int(np.count_nonzero(covered))
             if count < least:
                 continue
-            if len(combinations) == MOST_COMBINATIONS:
+            if len(combinations) == MAX_COMBINATIONS:
                 raise ValueError(
-                    f"more than {MOST_COMBINATIONS:,} combinations of up to {size} values are in "
+                    f"more than {MAX_COMBINATIONS:,} combinations of up to {size} values are in "
                     f"{least} rows or more; raise minimum, or lower size"
                 )
             beyond = others & elsewhere[i]

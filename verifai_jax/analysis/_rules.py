@@ -29,7 +29,7 @@ from verifai_jax.falsification.no_rate import why_no_rate
 from verifai_jax.falsification.run import Run
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
 
-FEWEST = 10
+MIN_FAILURES = 10
 """Failing rows, and safe rows, from which on rules are made and measured."""
 FEW = 100
 """Failing rows below which their number may be why there is no rule."""
@@ -249,9 +249,9 @@ def _too_few(failing: Bool[np.ndarray, " n"]) -> str:
     """Say that there are too few failing or safe rows for rules; empty where there are enough."""
     counts = {"fail": int(failing.sum()), "are safe": int((~failing).sum())}
     for verb, count in counts.items():
-        if count < FEWEST:
+        if count < MIN_FAILURES:
             return (
-                f"only {count} of {len(failing):,} rows {verb}, and rules need {FEWEST} to be made "
+                f"only {count} of {len(failing):,} rows {verb}, and rules need {MIN_FAILURES} to be made "
                 "from some and measured on others; simulate more"
             )
     return ""

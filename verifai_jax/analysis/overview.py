@@ -34,10 +34,10 @@ from verifai_jax.falsification.no_rate import why_no_rate
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.table import ErrorTable
 
-FEWEST = 4
-MOST_TO_CLUSTER = 2000
-MOST_NAMED = 6
-MOST_REPRESENTATIVES = 6
+MIN_FAILURES = 4
+MAX_TO_CLUSTER = 2000
+MAX_NAMED = 6
+MAX_REPRESENTATIVES = 6
 TITLES = {
     "failures": "Failures",
     "rules": "Where it fails",
@@ -216,8 +216,8 @@ def _describe_failures(source: object, samples: Samples) -> str:
     if np.isfinite(samples.rho).any():
         place = samples.worst
         row = samples.frame.iloc[place]
-        where = format_features({name: row[name] for name in samples.names[:MOST_NAMED]})
-        more = ", ..." if len(samples.names) > MOST_NAMED else ""
+        where = format_features({name: row[name] for name in samples.names[:MAX_NAMED]})
+        more = ", ..." if len(samples.names) > MAX_NAMED else ""
         lines.append(
             f"{'worst' if failures else 'nearest'}: row {samples.rows[place]}, "
             f"robustness {samples.rho[place]:z.4g} at {where}{more}"
@@ -233,17 +233,17 @@ def _thinned(samples: Samples, seed: int) -> Samples:
     from dataclasses import replace
 
     failing = _failing(samples)
-    if len(failing) <= MOST_TO_CLUSTER:
+    if len(failing) <= MAX_TO_CLUSTER:
         return failing
     generator = np.random.default_rng(seed)
-    kept = np.sort(generator.choice(len(failing), MOST_TO_CLUSTER, replace=False))
+    kept = np.sort(generator.choice(len(failing), MAX_TO_CLUSTER, replace=False))
     return replace(failing, frame=failing.frame.iloc[kept])
 
 
 def _too_few(failures: int) -> str:
     if not failures:
         return "no row fails"
-    if failures >= FEWEST:
+    if failures >= MIN_FAILURES:
         return ""
     return f"only {failures} rows fail" if failures > 1 else "only one row fails"
 

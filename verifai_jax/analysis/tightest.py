@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-_MOST_DIMENSIONS = 20
+_MAX_DIMENSIONS = 20
 """Dimensions beyond which a k-d tree looks at nearly every point."""
 _ENTRIES = 20_000_000
 """Entries of the arrays of a block at most."""
@@ -67,7 +67,7 @@ def _within(
     other groups at a distance of 1.
     """
     n = len(weights)
-    tree = _tree(coordinates) if n > 1 and coordinates.shape[1] <= _MOST_DIMENSIONS else None
+    tree = _tree(coordinates) if n > 1 and coordinates.shape[1] <= _MAX_DIMENSIONS else None
     most = min(k, n)
     size = max(1, min(1024, _ENTRIES // (most if tree is not None else n)))
     bounds, exact = np.empty(n), np.empty(n, bool)

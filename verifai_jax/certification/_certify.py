@@ -33,7 +33,7 @@ LANES = 64
 """Samples of a policy in one block."""
 SETTLED = 3.0
 """Over `tie`: about as many samples as name a leader that never fails."""
-MOST_KEPT = 1000
+MAX_KEPT = 1000
 """Counterexamples of a policy that are kept, the worst ones."""
 ROWS = 256
 """Rows whose features are computed at a time, so that one shape compiles."""
@@ -241,7 +241,7 @@ def _worst_rows(
     rho = np.concatenate([each.least for each in verdicts])
     failing = np.concatenate([each.violated for each in verdicts])
     order = np.argsort(rho, kind="stable")  # NaN come last.
-    kept = order[failing[order]][:MOST_KEPT]
+    kept = order[failing[order]][:MAX_KEPT]
     shown = np.concatenate([order[:1], kept])
     columns = _columns(space, u[shown])
     found = {name: values[1:] for name, values in columns.items()} | {"rho": rho[kept]}

@@ -42,7 +42,7 @@ STREAM = 0x5AFE
 """Sets the random numbers of a certificate apart from those of a training with the same seed."""
 DRAWN = 4096
 """Samples drawn from the prior at a time."""
-MOST_BARREN = 1000
+MAX_BARREN = 1000
 """Such draws in a row without one that the constraint accepts, after which it is given up."""
 
 
@@ -336,9 +336,9 @@ class _Samples:
             if self._space.where is not None:
                 u = u[self.accepted(u)]
             barren = 0 if len(u) else barren + 1
-            if barren >= MOST_BARREN:
+            if barren >= MAX_BARREN:
                 raise ValueError(
-                    f"where accepted none of {MOST_BARREN * DRAWN:,} samples of the space in a row"
+                    f"where accepted none of {MAX_BARREN * DRAWN:,} samples of the space in a row"
                 )
             self._points = np.concatenate([self._points, u])
         return self._points[first : first + count]

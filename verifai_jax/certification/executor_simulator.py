@@ -38,9 +38,9 @@ from verifai_jax.problem.problem import Problem
 
 AT_FIRST = 4
 """Blocks that a worker gets at a time, before it is known how long one takes."""
-MOST = 64
+MAX_BLOCKS_PER_SECOND = 64
 """Blocks that a worker gets at a time at most, for a second of work."""
-MOST_KEPT = 64
+MAX_KEPT = 64
 """Groups of policies by themselves whose problems a worker keeps."""
 
 
@@ -112,7 +112,7 @@ class ExecutorSimulator:
                 self.messages.setdefault(number, message)
             each = result["seconds"] / max(len(found[place]), 1)
             wanted = seconds_per_block(self._executor)
-            most = MOST * max(1, int(wanted / SECONDS))
+            most = MAX_BLOCKS_PER_SECOND * max(1, int(wanted / SECONDS))
             self._each = max(1, min(most, int(wanted / max(each, 1e-9))))
 
         gather(futures, ended)
@@ -168,7 +168,7 @@ def _separate(
     if name not in shipment.made:
         problems: dict[int, Problem] = {}
         shipment.made[name] = problems, SeparateSimulators(problems, lanes)
-        for other in list(shipment.made)[:-MOST_KEPT]:
+        for other in list(shipment.made)[:-MAX_KEPT]:
             del shipment.made[other]
     problems, simulators = shipment.made[name]
     for number, policy in policies:

@@ -28,7 +28,7 @@ from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.verdicts import Verdicts, violations
 from verifai_jax.problem.problem import Problem
 
-MOST_BLOCKS = 64
+MAX_BLOCKS = 64
 """Blocks of a device in one call at most."""
 SLICE_SECONDS = 1.0
 """Seconds that a call lasts at most, about: between calls one can stop."""
@@ -158,7 +158,7 @@ class _Program:
         devices: tuple[Device, ...],
     ) -> None:
         self.problem_of, self.lanes, self.dim, self.devices = problem_of, lanes, dim, devices
-        self.capacity = MOST_BLOCKS
+        self.capacity = MAX_BLOCKS
         self._seconds: float | None = None  # Of a block, on one device.
         self._executables: dict[Mode, jax.stages.Compiled] = {}
 

@@ -36,7 +36,7 @@ Exit codes:
 """
 """What `--help` says of them."""
 
-_MOST_OF_AN_ERROR = 4000
+_MAX_ERROR_LENGTH = 4000
 """Characters of an error that are printed: it may quote a file, or the message of a system."""
 
 USAGE_ERRORS = (
@@ -94,7 +94,7 @@ def command_error(error: BaseException, show_traceback: bool = False) -> Command
             f"{type(error).__name__}: {error}\nThis is a bug of verifai_jax; please report it "
             "with the lines above"
         )
-    return CommandError(printable(message, _MOST_OF_AN_ERROR), code)
+    return CommandError(printable(message, _MAX_ERROR_LENGTH), code)
 
 
 def _told(error: BaseException) -> tuple[str, int]:

@@ -35,7 +35,7 @@ _RESUMES = (
 """Options that go with `--resume`; the cache of the sweep has fixed the others."""
 _NOTED = ("target", "configurations", "given", "options", "nominal")
 """Entries of the command in the cache."""
-_MOST_ROWS = 12
+_MAX_ROWS = 12
 """Rows of the table that are printed."""
 
 
@@ -236,7 +236,7 @@ def _format_table(result: "Sweep") -> str:
     names = [n for n in result.hyperparameters if n in table and n != "steps"]
     columns = ["steps", *names, "nominal_return", "failures", "simulations", "failure_high"]
     columns += ["worst_robustness", "verdict", "status"]
-    some: Any = table.iloc[order[:_MOST_ROWS]][columns]
+    some: Any = table.iloc[order[:_MAX_ROWS]][columns]
     if (some["status"] == "trained").all():
         some = some.drop(columns="status")
     text = some.to_string(float_format=lambda value: f"{value:z.4g}", max_colwidth=40)

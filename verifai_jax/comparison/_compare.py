@@ -35,7 +35,7 @@ from verifai_jax.statistics.paired_rates import PairedRates, paired_rates
 
 BLOCK = 1024
 """Points of the cube that are drawn at once."""
-FIRST, MOST = 64, 4096
+FIRST, MAX_SAMPLES = 64, 4096
 """Pairs between two looks, at first and at most; each time twice as many."""
 BATCH = 512
 """Simulations at once."""
@@ -161,7 +161,7 @@ def _compare(
                 if judge(tallies[name].rates(each), margin) != UNDECIDED:
                     open_ones.discard(name)
             first += size
-            size = min(2 * size, MOST)
+            size = min(2 * size, MAX_SAMPLES)
         else:
             stopped = "decided"
     except KeyboardInterrupt:

@@ -28,7 +28,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from verifai_jax.core.devices import cache_folder
 from verifai_jax.core.fingerprint import identity
 
-MOST_BYTES = 64 * 2**20
+MAX_BYTES = 64 * 2**20
 """Size of a program that is kept at most."""
 
 SEAL = 32
@@ -106,7 +106,7 @@ def lower_or_recall(
         except (ValueError, NotImplementedError, ImportError):
             # Such as calls of libraries that JAX does not promise to keep.
             return jax.jit(function).trace(*arguments).lower()
-        if len(data) <= MOST_BYTES:
+        if len(data) <= MAX_BYTES:
             _write(path, data)
 
     def recalled(*arguments: Any) -> Any:

@@ -74,7 +74,7 @@ def format_seconds(seconds: float, digits: int = 6) -> str:
     return f"{'-' * (seconds < 0)}{' '.join(parts)}"
 
 
-MOST_ENTRIES = 4
+MAX_ENTRIES = 4
 """Numbers of one feature that are written one by one; of more, their range."""
 
 
@@ -99,7 +99,7 @@ def format_features(features: Mapping[str, object], labels: Mapping[str, str] | 
     parts = []
     for stem, columns in entries.items():
         there = [value for _, value in columns if value == value]
-        if len(columns) <= MOST_ENTRIES or not there:
+        if len(columns) <= MAX_ENTRIES or not there:
             parts += [f"{labels.get(n, n)}={_format_value(value)}" for n, value in columns]
             continue
         values = np.array([value for _, value in columns], float)
@@ -120,7 +120,7 @@ def _format_value(value: object) -> str:
 
 def format_error(error: BaseException) -> str:
     """Write an exception in one line: its type and the first line of its message, shortened."""
-    first = shorten((storable(error).splitlines() or [""])[0], MOST_OF_A_MESSAGE)
+    first = shorten((storable(error).splitlines() or [""])[0], MAX_MESSAGE_LENGTH)
     return f"{type(error).__name__}: {first}" if first else type(error).__name__
 
 
@@ -132,7 +132,7 @@ def shorten(text: str, most: int = 60) -> str:
     return text if len(text) <= most else f"{text[: most // 3]}...{text[len(text) - most // 2 :]}"
 
 
-MOST_OF_A_MESSAGE = 500
+MAX_MESSAGE_LENGTH = 500
 """Characters of a message of somebody's system that are printed; the table has all of it."""
 
 
@@ -183,7 +183,7 @@ def _escaped(character: str) -> str:
     return character.encode("unicode_escape").decode("ascii")
 
 
-def one_line(text: str, most: int = MOST_OF_A_MESSAGE) -> str:
+def one_line(text: str, most: int = MAX_MESSAGE_LENGTH) -> str:
     """Write a text in one line of at most so many characters, safe for a terminal."""
     return printable(" ".join(shorten(text, most).split()))
 

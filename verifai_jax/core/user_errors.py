@@ -28,15 +28,15 @@ from verifai_jax.core.text import storable
 from verifai_jax.core.user_files import is_notebook_cell, is_user_file
 from verifai_jax.core.waveform import IS_CALLED
 
-MOST_CODE = 80
+MAX_CODE = 80
 """Characters of a line of code that a message quotes."""
-MOST_MESSAGE = 300
+MAX_MESSAGE = 300
 """Characters of what a library or a simulator says."""
-MOST_READ = 4 * MOST_MESSAGE
+MAX_READ = 4 * MAX_MESSAGE
 """Characters of a message that are read at all: one of megabytes costs no time."""
-MOST_TRACEBACK = 100_000
+MAX_TRACEBACK = 100_000
 """The same of a message that ends with what was raised, behind its traceback."""
-MOST_NAMES = 12
+MAX_NAMES = 12
 """Names that a message lists."""
 
 ONCE_FOR_ALL = "JAX traces the code once for all simulations, so its values are not known yet"
@@ -199,7 +199,7 @@ def explain_user_error(
     if step is None:
         return _said(error)
     line = _line(step.tb_frame.f_code, step.tb_lineno)
-    code = f" (`{storable(line.code, MOST_CODE)}`)" if line.code else ""
+    code = f" (`{storable(line.code, MAX_CODE)}`)" if line.code else ""
     kept = isinstance(error, jax.errors.UnexpectedTracerError)
     more = (
         (AS_NATIVE if native else AS_PYTHON)
@@ -265,8 +265,8 @@ def _missing_key(key: object, step: TracebackType, features: object) -> str:
 
 
 def _known(begin: str, name: object, names: list[str]) -> str:
-    more = f", ... ({len(names)} in all)" if len(names) > MOST_NAMES else ""
-    listing = f"{begin} {', '.join(names[:MOST_NAMES])}{more}" if names else "It has none"
+    more = f", ... ({len(names)} in all)" if len(names) > MAX_NAMES else ""
+    listing = f"{begin} {', '.join(names[:MAX_NAMES])}{more}" if names else "It has none"
     return f"{nearest_names(name, names) or '.'} {listing}"
 
 
@@ -326,14 +326,14 @@ def raised_in_callback(error: BaseException) -> str | None:
     """
     if type(error).__name__ not in ("JaxRuntimeError", "XlaRuntimeError"):
         return None
-    text = storable(error, MOST_TRACEBACK)
+    text = storable(error, MAX_TRACEBACK)
     head, _, traceback = text.partition("Traceback (most recent call last):")
     lines = traceback.strip().splitlines()
     if "allback" not in head or not lines:
         return None
     places = re.findall(r'File "([^"]+)", line (\d+)', traceback)
     where = f" ({_shown_file(places[-1][0])}, line {places[-1][1]})" if places else ""
-    return f"{storable(lines[-1].strip(), MOST_MESSAGE)}{where}"
+    return f"{storable(lines[-1].strip(), MAX_MESSAGE)}{where}"
 
 
 def _said(error: BaseException) -> str:
@@ -341,11 +341,11 @@ def _said(error: BaseException) -> str:
     if (raised := raised_in_callback(error)) is not None:
         return raised
     # JAX appends advice about its own tracebacks.
-    said = storable(error, MOST_READ)
+    said = storable(error, MAX_READ)
     words = " ".join(said.partition("\n------")[0].split())
-    if len(words) > MOST_MESSAGE:
-        words = f"{words[: MOST_MESSAGE - 3]}..."
-    kind = storable(type(error).__name__, MOST_CODE)
+    if len(words) > MAX_MESSAGE:
+        words = f"{words[: MAX_MESSAGE - 3]}..."
+    kind = storable(type(error).__name__, MAX_CODE)
     return f"{kind}: {words}" if words else kind
 
 

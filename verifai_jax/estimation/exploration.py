@@ -61,11 +61,11 @@ A_PART = 4
 """Simulations for each doubling of the coordinates, about, to find those that decide."""
 IMPROBABLE = 20.0
 """Logarithm of the prior's density beside the greatest, below which a region is left out."""
-FEWEST_CHAINS, MOST_CHAINS = 8, 256
+MIN_CHAINS, MAX_CHAINS = 8, 256
 """Chains, at least, where there are as many ends, and at most."""
 MERGES, NEIGHBOURS = 3, 4
 """Times that groups of ends are compared, and others with which each is, the nearest first."""
-COMPARED, MOST_COMPARED = 0.4, 512
+COMPARED, MAX_COMPARED = 0.4, 512
 """Ends that are compared with one another, in parts of the simulations for that, and at most."""
 
 
@@ -111,7 +111,7 @@ def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int)
     cost += (HALVINGS + 3 * (FIRST_STEPS + NEAREST_STEPS) + corners) * differentiates
     telling = round(TELLING_APART * simulations)
     left = simulations - telling - (limit_state.simulations - begin)
-    chains = min(max(FEWEST_CHAINS, left // cost), MOST_CHAINS, len(ends.points))
+    chains = min(max(MIN_CHAINS, left // cost), MAX_CHAINS, len(ends.points))
     rows, groups = _choose_ends(limit_state, ends, chains, telling)
     z = ends.points[rows]
     if differentiates:
@@ -151,7 +151,7 @@ def _choose_ends(
     **Returns:** rows of ends, and the region of each.
     """
     most = max(chains, round(COMPARED * simulations))
-    rows = _spread_out(ends, min(most, MOST_COMPARED))
+    rows = _spread_out(ends, min(most, MAX_COMPARED))
     gaps = _gaps(ends, rows, rows)
     gaps[np.triu_indices(len(rows))] = np.inf
     group = _joined(limit_state, ends.points[rows], np.argsort(gaps, axis=1)[:, :LINKS])

@@ -32,7 +32,7 @@ Differentiate: TypeAlias = Callable[
 ]
 """The same, and the gradient `[n, d]` of the robustness by the coordinates of the unit cube."""
 
-MOST_DRAWN = 4_000_000
+MAX_DRAWN = 4_000_000
 """Points drawn from the prior in search of accepted ones, at most, for each one wanted."""
 _CONSTRAINT_BATCH = 4096
 """Points of one call of the constraint, so that one shape compiles."""
@@ -161,7 +161,7 @@ class LimitState:
             z = z[self.accepts(z)][: n - count]
             accepted.append(z)
             count, drawn = count + len(z), drawn + _CONSTRAINT_BATCH
-            if drawn > MOST_DRAWN and count < n * drawn / (100 * MOST_DRAWN):
+            if drawn > MAX_DRAWN and count < n * drawn / (100 * MAX_DRAWN):
                 raise ValueError("where accepts too little of the space to sample it")
         return np.concatenate(accepted) if accepted else np.zeros((0, self.dim))
 

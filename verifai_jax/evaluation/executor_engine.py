@@ -50,10 +50,10 @@ WORTH_KEEPING = 0.01
 is quicker is simulated again instead."""
 IN_FLIGHT = 3
 """Blocks on their way for each worker, so that none waits for the next one."""
-MOST_DROPPED = 100
+MAX_DROPPED = 100
 """Answers to other calls after which an executor is given up: a bound, so that no run waits for
 ever for one that mixes up its answers."""
-MOST_AHEAD = 1 << 22
+MAX_AHEAD = 1 << 22
 """Rows at most that are on their way at a time: a bound on the memory that they take."""
 
 SHIPMENTS: Slot[tuple[str, str | None], Any] = Slot("shipments")
@@ -129,13 +129,13 @@ class ExecutorEngine:
         if self._seconds is None:
             return self.unit * (1 if self.problem.black_box else AT_FIRST)
         wanted = seconds_per_block(self.executor)
-        rows = int(min(wanted / max(self._seconds, 1e-9), MOST_AHEAD // 8))
+        rows = int(min(wanted / max(self._seconds, 1e-9), MAX_AHEAD // 8))
         return max(self.unit, rows - rows % self.unit)
 
     @property
     def ahead(self) -> int:
         """Rows on their way that keep all workers busy."""
-        return min(MOST_AHEAD, IN_FLIGHT * count_workers(self.executor) * self.block)
+        return min(MAX_AHEAD, IN_FLIGHT * count_workers(self.executor) * self.block)
 
     def begin_compiling(self) -> None:
         """Do nothing: the workers compile, with their first block."""
@@ -189,7 +189,7 @@ class ExecutorEngine:
         if result.get("question", question) == question:
             return True
         self._dropped += 1
-        if self._dropped > MOST_DROPPED:
+        if self._dropped > MAX_DROPPED:
             raise WorkerError(
                 f"{self._dropped} answers of the executor belonged to other calls than the one "
                 "whose future they came by; what was finished before is kept: resume with another "

@@ -57,7 +57,7 @@ from verifai_jax.problem.dependence import depends_on_key, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.binomial import clopper_pearson
 
-DIVIDING, MOST_DIVIDING = 0.25, 6500
+DIVIDING, MAX_DIVIDING = 0.25, 6500
 """Share of the budget that divides the failures, and most of these simulations; the rest is for the
 probability."""
 MORE_DIVIDING = 2
@@ -66,7 +66,7 @@ SHOWN = 200
 """Failures of a mode that its result keeps, and samples of the prior that its name is told from."""
 OUTWARD = (1.0, 1.005, 1.02, 1.05)
 """Factors on a likeliest failure, of which the first that fails again in a run is its row."""
-MOST_OF_RUN = 200
+MAX_RUN_FAILURES = 200
 """Failures of a given run that the search for modes begins from."""
 
 
@@ -117,7 +117,7 @@ def modes(
     check_fraction("least_share", least_share)
     in_precision(precision)
     problem.space.check_where()
-    least = int(budget) - min(round(DIVIDING * budget), MOST_DIVIDING)
+    least = int(budget) - min(round(DIVIDING * budget), MAX_DIVIDING)
     chains = chains_for(least, SHARE_OF_LEVEL)
     batch = min(chains if batch is None else batch, budget)
     chosen = resolved(problem, batch=batch, budget=budget, precision=precision, wanted=backend)
@@ -227,7 +227,7 @@ def _failures_of(source: Problem | Run) -> Float[np.ndarray, "n d"] | None:
     rows = source.table.counterexamples
     if not len(rows):
         return None
-    rows = rows.sort_values("rho").head(MOST_OF_RUN)
+    rows = rows.sort_values("rho").head(MAX_RUN_FAILURES)
     points = np.asarray(source.problem.space.points(rows), np.float64)
     return ndtri(np.clip(points, 1e-8, 1 - 1e-8))
 

@@ -25,7 +25,7 @@ from verifai_jax.search import Search
 
 ENOUGH = 32
 """Simulations with a verdict from which on what all of them have in common is worth a note."""
-MOST_SAMPLES = 5_000_000
+MAX_SAMPLES = 5_000_000
 """Samples of a whole batch up to which it is simulated for the nominal features alone."""
 HARDLY_MOVES = 0.05
 """Share of its least value within which a robustness hardly moves."""
@@ -80,7 +80,7 @@ def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
         engine = HostEngine(problem, engine.precision, monitor=monitor)
     else:
         assert not isinstance(engine, HostEngine)
-        if not is_quick(problem) or _samples(problem, engine.padded) > MOST_SAMPLES:
+        if not is_quick(problem) or _samples(problem, engine.padded) > MAX_SAMPLES:
             return ()
     space = problem.space
     nominal = problem.nominal or {}

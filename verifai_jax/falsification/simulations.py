@@ -28,7 +28,7 @@ from verifai_jax.mtl.clauses import goals_of
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 
-MOST_DIFFERENTIATED = 16
+MAX_DIFFERENTIATED = 16
 """Rows whose clauses are differentiated in one call of the engine."""
 MEASURED = 2
 """First rows of a black box that are timed; in the first one a simulator may prepare itself. More
@@ -86,7 +86,7 @@ class Simulations:
         )
         self._differentiate: Evaluator | None = None
         if search.wants.clauses:
-            most = min(batch, MOST_DIFFERENTIATED)
+            most = min(batch, MAX_DIFFERENTIATED)
             self._differentiate = evaluator(most, gradient=True, clauses=True)
         self._measured: Verdicts | None = None
         self.hopeless: str | None = None

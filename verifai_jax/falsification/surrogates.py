@@ -38,7 +38,7 @@ PARENTS = 8
 """Best rows around which half of them are."""
 NEIGHBOUR = 0.1
 """Distance, greatest over the coordinates, up to which one row is the neighbour of another."""
-LEAST_ROWS = 64
+MIN_ROWS = 64
 """Least number of rows that programs are compiled for; fewer are padded, more to four times it."""
 RATE = (0.1, 0.01)
 """First and last step of a descent, in cubes."""
@@ -52,7 +52,7 @@ PATIENCE = 8
 less."""
 PROGRESS = 0.9
 """Share of the least robustness below which a new one is progress."""
-MOST_SPREAD = 5.0
+MAX_SPREAD = 5.0
 """Greatest factor on the standard deviations of a model that is believed less."""
 SPREADS = 4
 """Factors from one to the greatest, in turn."""
@@ -347,7 +347,7 @@ def _spread(rho: Float[np.ndarray, " n"], number: int, dim: int) -> float:
         if rho[i] < PROGRESS * best:
             best, last = rho[i], i
     idle = len(rho) - 1 - last
-    most = min(max(1.0, idle / (PATIENCE * dim)), MOST_SPREAD)
+    most = min(max(1.0, idle / (PATIENCE * dim)), MAX_SPREAD)
     return most ** (number % SPREADS / (SPREADS - 1))
 
 
@@ -377,7 +377,7 @@ def _embed(u: Float[Any, "n d"], cube: Cube) -> Float[Array, "n x"]:
 
 def _padded(rows: int, capacity: int) -> int:
     """Return the number of rows of the program for so many; each is compiled once."""
-    size = LEAST_ROWS
+    size = MIN_ROWS
     while size < rows:
         size *= 4
     return min(size, capacity)

@@ -40,7 +40,7 @@ def writing(place: Path | None) -> Iterator[None]:
         ) from error
 
 
-MOST_AT_ONCE = 32_768
+MAX_AT_ONCE = 32_768
 """Simulations of a round at most, by default; more are no faster."""
 
 
@@ -69,7 +69,7 @@ def usual_batch(
         )
     if not search.learns:
         eighth = 1 << max(0, (int(budget) // 8).bit_length() - 1)
-        return max(search.wants.max_batch, min(MOST_AT_ONCE, eighth) if whole else 0)
+        return max(search.wants.max_batch, min(MAX_AT_ONCE, eighth) if whole else 0)
     most = (
         search.wants.max_batch
         if stop_after is None

@@ -15,7 +15,7 @@ from verifai_jax.core.trace import Status
 from verifai_jax.features import Automaton, Domain
 from verifai_jax.problem.problem import Problem
 
-MOST_NAMED = 4
+MAX_NAMED = 4
 """Names of what is not covered that are written out."""
 
 
@@ -56,8 +56,8 @@ class Covered:
             return share
         if self.what == "cells":
             return share
-        shown = ", ".join(self.missing[:MOST_NAMED])
-        more = len(self.missing) - MOST_NAMED
+        shown = ", ".join(self.missing[:MAX_NAMED])
+        more = len(self.missing) - MAX_NAMED
         return f"{share}; missing {shown}{f' and {more} more' if more > 0 else ''}"
 
 

@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 
 from verifai_jax.core.whole_files import replacing
 from verifai_jax.evaluation.replay import Replay
-from verifai_jax.plotting.film import LAST, MOST_FRAMES, MOST_WANTED, check_film
+from verifai_jax.plotting.film import LAST, MAX_FRAMES, MAX_WANTED, check_film
 from verifai_jax.plotting.gymnasium_film import episode_of, film_episode
 from verifai_jax.plotting.mujoco_motion import can_draw, record
 from verifai_jax.plotting.mujoco_scene import film
@@ -114,7 +114,7 @@ def _drawn(
 
     clock = np.asarray(replay.trace.clock())
     seconds = float(clock[-1] - clock[0])
-    rate, most = (FRAMES_PER_SECOND, MOST_FRAMES) if fps is None else (fps, MOST_WANTED)
+    rate, most = (FRAMES_PER_SECOND, MAX_FRAMES) if fps is None else (fps, MAX_WANTED)
     count = max(2, min(most, round(seconds * rate)))
     samples = np.searchsorted(clock, np.linspace(clock[0], clock[-1], count)).clip(
         max=len(clock) - 1

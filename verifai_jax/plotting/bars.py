@@ -21,8 +21,8 @@ from verifai_jax.plotting.style import (
 
 SECOND = "#8d99ae"
 """Colour of what is shown next to failures and to total influence."""
-MOST_IMPORTANCES = 15
-MOST_SENSITIVITIES = 20
+MAX_IMPORTANCES = 15
+MAX_SENSITIVITIES = 20
 
 
 def plot_importance(importance: Importance, path: str | Path | None = None) -> Figure:
@@ -44,7 +44,7 @@ def plot_importance(importance: Importance, path: str | Path | None = None) -> F
     if weak:
         what = " and of ".join(NAMES[target] for target in weak)
         title += f"\nmeaningless for {what}: the model does not predict"
-    shown = importance.table.head(MOST_IMPORTANCES)
+    shown = importance.table.head(MAX_IMPORTANCES)
     return plot_bars(shown, columns, title, "loss of score when shuffled", path)
 
 
@@ -58,7 +58,7 @@ def plot_sensitivity(sensitivity: Sensitivity, path: str | Path | None = None) -
 
     **Returns:** the figure.
     """
-    shown = sensitivity.table.head(MOST_SENSITIVITIES)
+    shown = sensitivity.table.head(MAX_SENSITIVITIES)
     title = (
         f"{sensitivity.method} of {sensitivity.problem}, {sensitivity.simulations:,} simulations"
     )

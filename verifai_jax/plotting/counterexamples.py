@@ -31,9 +31,9 @@ from verifai_jax.plotting.style import (
 )
 
 QUIET = "#8d99ae"
-MOST_BARS = 12
+MAX_BARS = 12
 """Features drawn as bars."""
-MOST_SIGNALS = 3
+MAX_SIGNALS = 3
 """Input signals drawn."""
 
 
@@ -48,7 +48,7 @@ def plot_explanation(explained: Explained, path: str | Path | None = None) -> Fi
     **Returns:** the figure.
     """
     features = explained.replay.features
-    inputs = [i for i in explained.influences if is_waveform(features.get(i.name))][:MOST_SIGNALS]
+    inputs = [i for i in explained.influences if is_waveform(features.get(i.name))][:MAX_SIGNALS]
     figure = new_figure(figsize=(10.5, 3.4 + 1.3 * len(inputs)))
     halves: Any = figure.subfigures(1, 2, width_ratios=(1.6, 1))
     left, right = halves
@@ -167,7 +167,7 @@ def _course(
 
 def _draw_bars(axes: Axes, explained: Explained) -> None:
     """Draw the robustness with each feature back at nominal; or gradients, if not known."""
-    shown = explained.influences[:MOST_BARS]
+    shown = explained.influences[:MAX_BARS]
     names = [i.name for i in shown]
     where = np.arange(len(shown))
     if any(np.isfinite(i.reverted) for i in shown):

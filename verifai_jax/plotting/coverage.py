@@ -17,7 +17,7 @@ from verifai_jax.plotting.style import (
     wrap_name,
 )
 
-MOST_SHOWN = 12
+MAX_SHOWN = 12
 """Features drawn, the least covered first."""
 
 
@@ -35,7 +35,7 @@ def plot_coverage(coverage: Coverage, path: str | Path | None = None) -> Figure:
     worst = coverage.table.sort_values("occupied", kind="stable")
     figure = new_figure(figsize=(9.6, 4.2))
     left, right = figure.subplots(1, 2)
-    shown = worst.head(MOST_SHOWN)
+    shown = worst.head(MAX_SHOWN)
     place = np.arange(len(shown))
     several = len(coverage.table) > 1
     for k, (column, label, color) in enumerate(

@@ -15,7 +15,7 @@ DOTS = 3000
 """Rows drawn of each verdict."""
 JITTER = 0.25
 """Spread of unordered values around their place."""
-MOST_LABELS = 12
+MAX_LABELS = 12
 """Choices that an axis names."""
 
 
@@ -69,7 +69,7 @@ def draw_samples(axes: Axes, samples: Samples, across: str, up: str, size: float
     for name, axis in drawn:
         column = columns[name]
         if not column.ordered:
-            step = -(-len(column.choices) // MOST_LABELS)
+            step = -(-len(column.choices) // MAX_LABELS)
             ticks = np.arange(0, len(column.choices), max(step, 1))
             axis.set_ticks(ticks, [str(column.choices[i])[:16] for i in ticks])
         elif column.integer:

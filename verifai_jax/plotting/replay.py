@@ -30,11 +30,11 @@ from verifai_jax.plotting.style import (
     wrap_name,
 )
 
-MOST_PANELS = 6
+MAX_PANELS = 6
 """Signals drawn at most, unless more are monitored."""
-MOST_INPUTS = 3
+MAX_INPUTS = 3
 """Features that are functions of time drawn at least, however many signals are monitored."""
-MOST_BOUNDS = 4
+MAX_BOUNDS = 4
 """Predicates named above a panel at most."""
 WIDEST_NAME = 18
 """Characters of a signal's name in one line."""
@@ -78,8 +78,8 @@ def plot_replay(
         check_names("signal", signals, ordered)
         if not signals:
             raise ValueError("signals names what is drawn; got none")
-    needed = len(monitored) + min(len(inputs), MOST_INPUTS)
-    shown = list(signals or ordered[: max(MOST_PANELS, needed)])
+    needed = len(monitored) + min(len(inputs), MAX_INPUTS)
+    shown = list(signals or ordered[: max(MAX_PANELS, needed)])
     name = replay.worst
     clock = np.asarray(trace.clock())
     decisive = decisive_instant(formulas[name], trace, replay.problem.end)
@@ -282,7 +282,7 @@ def _name_bounds(axes: Axes, predicates: dict[str, tuple[str, float]], decided: 
     ranks = [FAILING, BOUND, SAFE]
     place = {text: (ranks.index(color), least) for text, (color, least) in predicates.items()}
     ranked = sorted(predicates, key=place.__getitem__)
-    named, others = ranked[:MOST_BOUNDS], ranked[MOST_BOUNDS:]
+    named, others = ranked[:MAX_BOUNDS], ranked[MAX_BOUNDS:]
     lines = [(text, predicates[text][0]) for text in named]
     if others:
         lines.append((f"and {len(others)} more", predicates[others[0]][0]))

@@ -40,7 +40,7 @@ RETURN = "#31688e"
 """Colour of the return."""
 BARS = {"failure_rate": (FAILING, "failing", ""), "nominal_return": (RETURN, "return", "//")}
 """Colour, name and hatching of the targets of an importance."""
-MOST_BARS = 8
+MAX_BARS = 8
 """Hyper-parameters in a panel, at most."""
 
 
@@ -280,7 +280,7 @@ def _draw_shares(axes: Axes, importance: HyperparameterImportance) -> None:
     """Draw the share of the variance that each hyper-parameter explains."""
     targets = [target for target in importance.scores if importance.is_reliable(target)]
     targets = targets or list(importance.scores)
-    shown = importance.table.head(MOST_BARS)
+    shown = importance.table.head(MAX_BARS)
     height, place = 0.76 / len(targets), np.arange(len(shown))
     for k, target in enumerate(targets):
         colour, what, hatch = BARS[target]
@@ -320,7 +320,7 @@ def _draw_trends(axes: Axes, importance: HyperparameterImportance) -> None:
     names = [f"{target}_trend" for target in importance.scores]
     shown = importance.table.loc[importance.table[names].notna().any(axis=1)]
     order = shown[names].abs().max(axis=1).sort_values(ascending=False, kind="stable").index
-    shown = shown.loc[order[:MOST_BARS]]
+    shown = shown.loc[order[:MAX_BARS]]
     height, place = 0.76 / len(names), np.arange(len(shown))
     chance = max(importance.chance.values())
     axes.axvspan(-chance, chance, color=WITHOUT_VERDICT, alpha=0.18, linewidth=0, label="by chance")

@@ -19,7 +19,7 @@ from verifai_jax.mtl.clauses import Goals, goals_of
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.semantics import hard
 
-MOST_CELLS = 512
+MAX_CELLS = 512
 """Cells of all signals together at most."""
 
 
@@ -72,10 +72,10 @@ class Behaviour:
             check_count(f"the number of cells of signal {name!r}", count)
             axes.append(Axis(name, float(low), float(high), int(count)))
         total = math.prod(axis.cells for axis in axes)
-        if total > MOST_CELLS:
+        if total > MAX_CELLS:
             raise ValueError(
                 f"the signals {', '.join(cells)} have {total} cells together, and at most "
-                f"{MOST_CELLS} can be told apart; give fewer cells or fewer signals"
+                f"{MAX_CELLS} can be told apart; give fewer cells or fewer signals"
             )
         object.__setattr__(self, "axes", tuple(axes))
         object.__setattr__(self, "formulas", tuple(formulas))

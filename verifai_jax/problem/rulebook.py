@@ -24,7 +24,7 @@ from verifai_jax.core.errors import check_names
 Violation: TypeAlias = Sequence[float] | Shaped[np.ndarray, " k"]
 """By how much a row breaks each rule: numbers, 0 where a rule is kept, or truth values."""
 
-MOST_RULES = 30
+MAX_RULES = 30
 """Rules at most: beyond, a lexicographic number would not be exact."""
 
 
@@ -36,7 +36,7 @@ class Rulebook:
     order of `names` where the edges leave it open.
 
     **Raises:** `ValueError` for a name that is no rule, edges that go round in a circle, or more
-    than `MOST_RULES` rules.
+    than `MAX_RULES` rules.
     """
 
     names: tuple[str, ...]
@@ -52,8 +52,8 @@ class Rulebook:
             check_names("rule", edge, self.names)
             pairs.append((edge[0], edge[1]))
         object.__setattr__(self, "edges", tuple(pairs))
-        if len(self.names) > MOST_RULES:
-            raise ValueError(f"a rulebook has at most {MOST_RULES} rules; got {len(self.names)}")
+        if len(self.names) > MAX_RULES:
+            raise ValueError(f"a rulebook has at most {MAX_RULES} rules; got {len(self.names)}")
         object.__setattr__(self, "order", self._sorted())
 
     def graver(self, one: Violation, other: Violation) -> bool:

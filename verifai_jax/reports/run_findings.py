@@ -30,7 +30,7 @@ from verifai_jax.reports.studies import Failure, Studies, png
 
 DRAWN = ("clusters", "importance", "coverage")
 """Analyses of the table that a report draws."""
-MOST_FEATURES = 40
+MAX_FEATURES = 40
 """Features of a failure that are listed one by one."""
 
 
@@ -117,7 +117,7 @@ def _failure(run: Run, failure: Failure, studies: Studies, about: About) -> Mark
             f"{number(row[name])} {about.units.get(name, '')}".strip(),
             *([format_percent(rare[name]) if name in rare else ""] if rare else []),
         )
-        for name in features[:MOST_FEATURES]
+        for name in features[:MAX_FEATURES]
     ]
     heads = ["feature", "value", *(["the prior has one as far out in"] if rare else [])]
     verdict = str(row.get("verdict", "") or "not looked at more closely")
@@ -128,8 +128,8 @@ def _failure(run: Run, failure: Failure, studies: Studies, about: About) -> Mark
         *(paragraph(text) for text in (failure.replay.warnings if failure.replay else ())),
         table(heads, values),
     ]
-    if len(features) > MOST_FEATURES:
-        content.append(paragraph(f"{len(features) - MOST_FEATURES} further features are left out."))
+    if len(features) > MAX_FEATURES:
+        content.append(paragraph(f"{len(features) - MAX_FEATURES} further features are left out."))
     if len(run.formulas) > 1:
         margins = [(name, number(row[f"rho.{name}"])) for name in run.formulas]
         content.append(table(["property", "robustness"], margins))

@@ -26,7 +26,7 @@ from verifai_jax.reports.view import rows_to_trace, trace_data
 
 Result = TypeVar("Result")
 
-MOST_FAILURES = 5
+MAX_FAILURES = 5
 """Failures that are shown one by one."""
 TRACES = 24
 """Rows that are simulated beforehand, unless that takes long."""
@@ -176,11 +176,11 @@ def _failures_to_show(run: Run, found: Analysis) -> list[tuple[int, str]]:
     for number, row in enumerate(found.representatives):
         if row in failing.index:
             chosen.setdefault(row, f"it stands for kind {number + 1} of the failures")
-    if len(chosen) < MOST_FAILURES:
+    if len(chosen) < MAX_FAILURES:
         chosen.setdefault(by_rho[-1], "the one nearest to the bound")
-    for row in by_rho[:MOST_FAILURES]:
+    for row in by_rho[:MAX_FAILURES]:
         chosen.setdefault(row, "among the worst")
-    return list(chosen.items())[:MOST_FAILURES]
+    return list(chosen.items())[:MAX_FAILURES]
 
 
 def _animated(replay: Replay, left_out: list[str]) -> bytes | None:

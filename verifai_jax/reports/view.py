@@ -29,21 +29,21 @@ GROUPS = (
     ("failing", FAILING, 2000),
 )
 """Verdicts from the least grave on: name, colour, and rows shown at most."""
-MOST_ROWS = 4000
+MAX_ROWS = 4000
 """Rows shown at most."""
-MOST_CELLS = 160_000
+MAX_CELLS = 160_000
 """Values shown at most; of a wide table there are fewer rows and columns."""
-MOST_COLUMNS = 40
+MAX_COLUMNS = 40
 """Features shown at most, those that distinguish failing from safe rows first."""
-MOST_PARALLEL = 12
+MAX_PARALLEL = 12
 """Axes of the parallel coordinates at most."""
-MOST_CHOICES = 60
+MAX_CHOICES = 60
 """Different texts of a feature up to which it is shown."""
-MOST_SAMPLES = 160
+MAX_SAMPLES = 160
 """Samples of a trace at most."""
-MOST_SIGNALS = 4
+MAX_SIGNALS = 4
 """Signals of a trace at most."""
-MOST_COMPONENTS = 6
+MAX_COMPONENTS = 6
 """Components of a signal that is a vector, at most."""
 
 
@@ -66,10 +66,10 @@ def view_data(
     group[columns["status"] != "ok"] = 1
     group[violating_rows(columns)] = 2
     group[claimed_rows(columns)] = 3
-    features = [*distinguishing_features(run)[:MOST_COLUMNS]]
+    features = [*distinguishing_features(run)[:MAX_COLUMNS]]
     features += [name for name in run.table.features if name not in features]
-    features = features[:MOST_COLUMNS]
-    most = max(200, min(MOST_ROWS, MOST_CELLS // (len(features) + 1)))
+    features = features[:MAX_COLUMNS]
+    most = max(200, min(MAX_ROWS, MAX_CELLS // (len(features) + 1)))
     numbers = table.index.to_numpy()
     places = _thinned(group, most, np.flatnonzero(np.isin(numbers, list(traces))))
     shown = table.iloc[places]
@@ -89,7 +89,7 @@ def view_data(
             for (name, color, _), count in zip(GROUPS, counts, strict=True)
         ],
         "axes": axes,
-        "parallel": [*wanted[: MOST_PARALLEL - 1], 0],
+        "parallel": [*wanted[: MAX_PARALLEL - 1], 0],
         "traces": {str(number): dict(trace) for number, trace in traces.items()},
         "replay": "This command simulates it again:" if command else "",
         "command": command,
@@ -105,7 +105,7 @@ def _thinned(
     chosen, left = [kept], most - len(kept)
     for verdict in reversed(range(len(GROUPS))):
         places = np.flatnonzero(group == verdict)
-        count = min(len(places), left, GROUPS[verdict][2] * most // MOST_ROWS)
+        count = min(len(places), left, GROUPS[verdict][2] * most // MAX_ROWS)
         if count:
             spread = np.linspace(0, len(places) - 1, count).astype(int)
             chosen.append(places[np.unique(spread)])
@@ -120,7 +120,7 @@ def _column(name: str, values: "pd.Series") -> dict[str, Any] | None:
         return {"name": name, "values": numbers_of(array)}
     texts = [None if pd.isna(value) else one_line(str(value), 80) for value in array]
     levels = sorted({text for text in texts if text is not None})
-    if not levels or len(levels) > MOST_CHOICES:
+    if not levels or len(levels) > MAX_CHOICES:
         return None
     place = {text: i for i, text in enumerate(levels)}
     return {
@@ -152,11 +152,11 @@ def trace_data(replay: Replay, label: str = "") -> dict[str, Any]:
     """
     trace, problem = replay.trace, replay.problem
     clock = np.asarray(trace.clock())
-    samples = np.unique(np.linspace(0, len(clock) - 1, MOST_SAMPLES).astype(int))
+    samples = np.unique(np.linspace(0, len(clock) - 1, MAX_SAMPLES).astype(int))
     monitored = [name for name in problem.monitored if name in trace.signals]
     others = [name for name in trace.signals if name not in monitored]
     signals = []
-    for name in [*monitored, *others][:MOST_SIGNALS]:
+    for name in [*monitored, *others][:MAX_SIGNALS]:
         values = np.asarray(trace.signals[name], float).reshape(len(clock), -1)
         bounds = [
             limit
@@ -168,7 +168,7 @@ def trace_data(replay: Replay, label: str = "") -> dict[str, Any]:
         signals.append(
             {
                 "name": one_line(name),
-                "values": [numbers_of(each) for each in values[samples].T[:MOST_COMPONENTS]],
+                "values": [numbers_of(each) for each in values[samples].T[:MAX_COMPONENTS]],
                 "bounds": numbers_of(list(dict.fromkeys(bounds))),
             }
         )

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-_MOST_PAIRS = 2**24
+_MAX_PAIRS = 2**24
 """Comparisons made in one go."""
 
 
@@ -45,7 +45,7 @@ def _fronts_of_distinct(points: Float[np.ndarray, "n objectives"]) -> Int[np.nda
     while len(left):
         some = points[left]
         dominated = np.zeros(len(left), bool)
-        together = max(1, _MOST_PAIRS // max(1, some.size))
+        together = max(1, _MAX_PAIRS // max(1, some.size))
         for begin in range(0, len(left), together):
             part = some[begin : begin + together]
             # Distinct points: nowhere worse means somewhere better, but for the point itself.

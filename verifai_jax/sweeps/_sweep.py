@@ -43,7 +43,7 @@ SCREENING = 64
 """Samples of a policy, and simulations of the attack on it, by which a search or halving chooses.
 
 Certificates take fresh samples."""
-_MOST_BARREN = 64
+_MAX_BARREN = 64
 """Rounds of a search without a new configuration before proposals end."""
 _FOR_TRAINING = 2 / 3
 """Share of `max_seconds` after which no training begins, so that there is time to certify."""
@@ -225,7 +225,7 @@ class _RunningSweep:
 
     def _train_all(self, proposer: Proposer) -> None:
         wanted, barren = self.options["configurations"], 0
-        while len(self.configurations) < wanted and barren < _MOST_BARREN:
+        while len(self.configurations) < wanted and barren < _MAX_BARREN:
             proposals = proposer.propose(wanted - len(self.configurations))
             if not proposals:
                 return

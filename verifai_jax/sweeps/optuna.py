@@ -32,7 +32,7 @@ _SAMPLERS = {
     "qmc": "QMCSampler",
 }
 """Classes of Optuna's samplers, by the names that are used here."""
-_MOST_REFUSED = 1000
+_MAX_REFUSED = 1000
 """Trials in a row that the constraint may refuse before proposals end."""
 
 
@@ -114,7 +114,7 @@ class OptunaProposer:
     def propose(self, most: int) -> list[Hyperparameters]:
         """Return the next configurations; see `Proposer`."""
         self._trials, proposals, refused = [], [], 0
-        while len(proposals) < min(most, self.batch) and refused < _MOST_REFUSED:
+        while len(proposals) < min(most, self.batch) and refused < _MAX_REFUSED:
             trial = self._study.ask(self._distributions)
             values, accepted = _values(self.space, trial.params)
             if accepted:

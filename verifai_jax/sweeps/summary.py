@@ -26,7 +26,7 @@ from verifai_jax.sweeps.record import SweepRecord, algorithm_uses, error_message
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST_ROWS = 8
+MAX_ROWS = 8
 """Rows that a notebook shows."""
 _VIEWS = ".table .safe .best .configurations .pareto() .importance() .plot() .problem(row)"
 """Views of the result that the summary points to."""
@@ -153,7 +153,7 @@ def format_hyperparameters(findings: Findings, row: Mapping[str, Any]) -> str:
 def format_html(findings: Findings) -> str:
     """Write the headline, the first rows to choose from, and the summary to unfold."""
     record, table = findings.record, findings.table
-    rows = table.iloc[preference_order(table)[:MOST_ROWS]]
+    rows = table.iloc[preference_order(table)[:MAX_ROWS]]
     names = [name for name in record.hyperparameters if name != "steps"]
     heads = ["row", "verdict", "P(fail)", "nominal return", "steps", *names]
     entries: Any = rows.to_dict("records")

@@ -38,7 +38,7 @@ from verifai_jax.synthesis._synthesize import (
 from verifai_jax.synthesis.adversary import attack
 from verifai_jax.synthesis.held_out import held_out
 from verifai_jax.synthesis.optimize import (
-    LEAST_BATCH,
+    MIN_BATCH,
     Archive,
     Choice,
     climb,
@@ -361,7 +361,7 @@ class _Repair:
         # What was near and what was robust in the old set may still be in this one.
         old = self.archive.best(4, self.merit) + self.archive.best(8, value_merit, apart=0.05)
         self.archive = archive = Archive()
-        if self.limits.left < LEAST_BATCH * len(self.environments):
+        if self.limits.left < MIN_BATCH * len(self.environments):
             self.archive, self.stopped = archive, self.limits.stopped_by
             return False
         starts = np.stack([self.start, self.now.theta, *(choice.theta for choice in old)])
@@ -390,7 +390,7 @@ class _Repair:
         self.robustness = best.value
         if best.value >= self.enough:
             return True
-        if self.limits.left < LEAST_BATCH * len(self.environments):
+        if self.limits.left < MIN_BATCH * len(self.environments):
             self.stopped = self.limits.stopped_by
             return False
         self.stopped = "no parameters"

@@ -18,11 +18,11 @@ from verifai_jax.search.proposals import Proposals
 from verifai_jax.synthesis.parametric import Pairs, Parametric
 from verifai_jax.synthesis.region import Region
 
-MOST_FOLLOWED = 4
+MAX_FOLLOWED = 4
 """Environments that are followed downhill."""
 DESCENT = 4
 """Steps of a descent at most."""
-MOST_DIFFERENCES = 12
+MAX_DIFFERENCES = 12
 """Coordinates up to which differences take the place of gradients."""
 GAP = 0.01
 """Length of a difference, in unit coordinates."""
@@ -91,9 +91,9 @@ def attack(
     """
     assert loop.environment is not None
     free = np.sum(np.array(loop.environment.levels) == 0)
-    follows = free > 0 and (loop.differentiable or free <= MOST_DIFFERENCES)
+    follows = free > 0 and (loop.differentiable or free <= MAX_DIFFERENCES)
     each = 1 if loop.differentiable else 1 + int(free)
-    reserved = DESCENT * MOST_FOLLOWED * (each + len(STEPS)) if follows else 0
+    reserved = DESCENT * MAX_FOLLOWED * (each + len(STEPS)) if follows else 0
     searching = limits.slice(limits.left - min(reserved, limits.left // 3))
     proposals = Proposals(
         search,
@@ -139,8 +139,8 @@ def _descend(
     assert loop.environment is not None
     free = np.array(loop.environment.levels) == 0
     order = np.argsort(np.where(np.isnan(first.rho), np.inf, first.rho), kind="stable")
-    points = first.environments[order[:MOST_FOLLOWED]]
-    best = first.rho[order[:MOST_FOLLOWED]]
+    points = first.environments[order[:MAX_FOLLOWED]]
+    best = first.rho[order[:MAX_FOLLOWED]]
     tried: list[tuple[np.ndarray, Pairs]] = []
     for _ in range(DESCENT):
         each = 1 if loop.differentiable else 1 + int(free.sum())

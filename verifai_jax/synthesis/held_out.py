@@ -14,7 +14,7 @@ from verifai_jax.core.budget import Budget
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
 from verifai_jax.synthesis.parametric import Parametric
 
-MOST_DRAWS = 1000
+MAX_DRAWS = 1000
 """Batches of draws at most where the constraint refuses nearly all."""
 ROUND = 256
 """Simulations between two readings of the clock."""
@@ -126,7 +126,7 @@ def draw(
     d = loop.environment.dim if loop.environment is not None else 0
     rng = np.random.default_rng(seed)
     parts, count_so_far = [np.zeros((0, d), np.float32)], 0
-    for _ in range(MOST_DRAWS):
+    for _ in range(MAX_DRAWS):
         if count_so_far >= count:
             break
         points = rng.random((max(count, 64), d), np.float32)

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 ROWS = 64
 """Rows of a table made at a time, so that one shape compiles."""
-MOST_DIFFERENTIATED = 64
+MAX_DIFFERENTIATED = 64
 """Simulations differentiated at a time by arrays of parameters."""
 
 
@@ -315,7 +315,7 @@ class ArrayParameters:
     @cached_property
     def _gradients(self) -> Engine:
         # The gradient of each row is kept, which is as long as the parameters.
-        return self._engine(min(self.batch, MOST_DIFFERENTIATED), gradient=True)
+        return self._engine(min(self.batch, MAX_DIFFERENTIATED), gradient=True)
 
     def _engine(self, batch: int, gradient: bool) -> Engine:
         inputs = WithParameters(

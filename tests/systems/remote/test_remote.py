@@ -878,7 +878,7 @@ def test_a_client_gives_up_where_there_is_no_run():
 
 
 def test_connections_that_say_nothing_shut_nobody_out(system, monkeypatch):
-    monkeypatch.setattr(server, "MOST_CLIENTS", 4)
+    monkeypatch.setattr(server, "MAX_CLIENTS", 4)
     silent = [socket.create_connection(system.address, timeout=10) for _ in range(20)]
     with answering(system):
         outcomes = Asked(system, 3).all()
@@ -889,7 +889,7 @@ def test_connections_that_say_nothing_shut_nobody_out(system, monkeypatch):
 
 
 def test_a_full_server_is_tried_again(system, monkeypatch, program):
-    monkeypatch.setattr(server, "MOST_CLIENTS", 2)
+    monkeypatch.setattr(server, "MAX_CLIENTS", 2)
     peers = [Peer(system.address) for _ in range(2)]
     until(lambda: len(system.clients) == 2)
     refused = Peer(system.address, greet=False)

@@ -39,7 +39,7 @@ from verifai_jax.problem.problem import Problem
 Method = Literal["auto", "kmeans", "kmodes", "kprototypes", "dbscan"]
 METHODS = ("auto", "kmeans", "kmodes", "kprototypes", "dbscan")
 # Kaufman and Rousseeuw, Finding Groups in Data, 1990: below, there is no substantial structure.
-LEAST_SILHOUETTE = 0.25
+MIN_SILHOUETTE = 0.25
 _SILHOUETTE_ROWS = 2000
 _TRIED = 5000
 _STARTS = 8
@@ -246,7 +246,7 @@ def _best_count(placed: tuple[np.ndarray, np.ndarray], most: int, rng: np.random
     """Return the number of clusters with the greatest silhouette, tried on at most 5000 rows."""
     rows = rng.permutation(len(placed[0]))[:_TRIED]
     part = placed[0][rows], placed[1][rows]
-    best, reached = 1, LEAST_SILHOUETTE
+    best, reached = 1, MIN_SILHOUETTE
     for count in range(2, min(most, len(rows) - 1) + 1):
         # The same rows for each count, so that chance does not decide between them.
         score = _silhouette(part, _partition(part, count, rng), np.random.default_rng(0))

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 RESAMPLES = 200
 """Bootstrap samples behind an interval."""
-MOST_SHOWN = 20
+MAX_SHOWN = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,10 +64,10 @@ class Sensitivity(InNotebook):
         if self.dropped:
             lines.append(f"{self.dropped:,} simulations had no verdict and were left out")
         width = max(len(str(name)) for name in self.table.index)
-        for name, row in self.table.head(MOST_SHOWN).iterrows():
+        for name, row in self.table.head(MAX_SHOWN).iterrows():
             lines.append(f"  {name!s:<{width}}  {_words(self.method, row)}")
-        if len(self.table) > MOST_SHOWN:
-            lines.append(f"  and {len(self.table) - MOST_SHOWN} more with less influence")
+        if len(self.table) > MAX_SHOWN:
+            lines.append(f"  and {len(self.table) - MAX_SHOWN} more with less influence")
         return "\n".join(lines)
 
 

@@ -26,7 +26,7 @@ from verifai_jax.systems.mujoco.model import MjModel, MjxData, MjxModel, Model, 
 
 # Values at which MJX looks once, to see whether there is any friction; features may change them.
 _SWITCHES = ("dof_frictionloss", "tendon_frictionloss")
-LEAST = 1e-9
+MIN_POSITIVE = 1e-9
 """Friction instead of zero: MJX takes a row of friction without friction for an equality."""
 
 
@@ -197,7 +197,7 @@ def prepare_model(bindings: Bindings, features: Features) -> tuple[Any, Any]:
     for name, value in leaves.items():
         old = _leaf(model, name)
         if name in _SWITCHES:
-            value = jnp.maximum(value, LEAST)
+            value = jnp.maximum(value, MIN_POSITIVE)
         changes[name] = value.reshape(old.shape).astype(old.dtype)
     model = model.tree_replace(changes)
     if bindings.moves_constants:
@@ -215,9 +215,9 @@ def _mjx_model(bindings: Bindings) -> tuple[Any, Any]:
             array, where = binding.place.array, binding.place.index
             if array in _SWITCHES:
                 flat = getattr(compiled, array).reshape(-1)
-                flat[where] = np.maximum(flat[where], LEAST)
+                flat[where] = np.maximum(flat[where], MIN_POSITIVE)
             if array in ("opt.density", "opt.viscosity", "opt.wind"):
-                compiled.opt.density = max(compiled.opt.density, LEAST)
+                compiled.opt.density = max(compiled.opt.density, MIN_POSITIVE)
         # Constants of every program that is traced, so never traced themselves.
         with jax.ensure_compile_time_eval():
             model = mjx.put_model(compiled, impl="jax")

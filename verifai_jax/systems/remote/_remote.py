@@ -36,9 +36,9 @@ from verifai_jax.systems.remote.tls import File, server_context
 
 log = logging.getLogger("verifai_jax.remote")
 
-MOST_BYTES = 16 << 20
+MAX_BYTES = 16 << 20
 """Bytes of one message of a client, unless `remote` is given another limit."""
-MOST_MEMORY = 256 << 20
+MAX_MEMORY = 256 << 20
 """Bytes of unfinished messages of all clients together, unless `remote` is given another limit."""
 LOOPBACKS = ("127.0.0.1", "::1")
 """Addresses of this machine, by IPv4 and IPv6."""
@@ -153,8 +153,8 @@ def remote(
     signals: SignalNames | None = None,
     dt: float | None = None,
     length: int | None = None,
-    most_bytes: int = MOST_BYTES,
-    most_memory: int = MOST_MEMORY,
+    most_bytes: int = MAX_BYTES,
+    most_memory: int = MAX_MEMORY,
 ) -> Remote:
     """Make a system that programs simulate which connect to this one.
 

@@ -27,13 +27,13 @@ log = logging.getLogger("verifai_jax.remote")
 
 TICK = 0.1
 """Seconds between two checks of timeouts."""
-MOST_LOGGED = 20
+MAX_LOGGED = 20
 """Faults of one client that are logged."""
-MOST_UNREAD = 1 << 20
+MAX_UNREAD = 1 << 20
 """Bytes that a client may leave unread while it gives cause for more."""
 UNCOUNTED = 1 << 16
 """Bytes that a client may hold without that those of all are counted."""
-MOST_CLIENTS = 256
+MAX_CLIENTS = 256
 """Clients that may be connected at a time."""
 REMEMBERED = 1 << 16
 """Simulations of which is remembered which client made them."""
@@ -167,14 +167,14 @@ class Server(threading.Thread):
         except OSError:  # It is gone already.
             sock.close()
             return
-        if len(self.clients) >= MOST_CLIENTS:
+        if len(self.clients) >= MAX_CLIENTS:
             self._make_room()
-        full = len(self.clients) >= MOST_CLIENTS
+        full = len(self.clients) >= MAX_CLIENTS
         client = Client(sock, address)
         self.clients.add(client)
         self._selector.register(sock, selectors.EVENT_READ, client)
         if full:
-            self._send_away(client, f"there are {MOST_CLIENTS} clients already", retry=True)
+            self._send_away(client, f"there are {MAX_CLIENTS} clients already", retry=True)
         else:
             client.hello(self.rules)
         self._flush(client)
@@ -197,7 +197,7 @@ class Server(threading.Thread):
             self.waiting.extendleft(reversed(client.has.values()))
             client.has.clear()
             why = f"messages of all clients hold more than {self.rules.most_memory} bytes"
-            if client.leaving or len(client.out) > MOST_UNREAD:
+            if client.leaving or len(client.out) > MAX_UNREAD:
                 self._drop(client, f"was dropped: {why}")
             else:
                 self._send_away(client, why, retry=True)
@@ -335,11 +335,11 @@ class Server(threading.Thread):
     def _blame(self, client: Client, what: str, number: int | None = None) -> None:
         """Tell a client of a fault that concerns one result only."""
         client.faults += 1
-        if client.faults <= MOST_LOGGED:
+        if client.faults <= MAX_LOGGED:
             about = "" if number is None else f" (point {number})"
-            last = "; no more of its faults are logged" if client.faults == MOST_LOGGED else ""
+            last = "; no more of its faults are logged" if client.faults == MAX_LOGGED else ""
             log.warning("simulator %s%s: %s%s", client.name, about, what, last)
-        if len(client.out) > MOST_UNREAD:
+        if len(client.out) > MAX_UNREAD:
             raise wire.WireError("it is sent errors and does not read them")
         client.tell(what, number)
 
