@@ -33,7 +33,7 @@ def sampled(seed: int) -> int:
 
 
 def first_failure(run: vj.Run) -> int:
-    """Return the number of the first failing simulation, from 1; `MAX_SIMULATIONS` where none fails."""
+    """Return the number of the first failing simulation, from 1, or `MAX_SIMULATIONS`."""
     violated = run.table.all["violated"].to_numpy()
     return int(violated.argmax()) + 1 if violated.any() else MAX_SIMULATIONS
 

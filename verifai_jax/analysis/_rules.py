@@ -251,8 +251,8 @@ def _too_few(failing: Bool[np.ndarray, " n"]) -> str:
     for verb, count in counts.items():
         if count < MIN_FAILURES:
             return (
-                f"only {count} of {len(failing):,} rows {verb}, and rules need {MIN_FAILURES} to be made "
-                "from some and measured on others; simulate more"
+                f"only {count} of {len(failing):,} rows {verb}, and rules need {MIN_FAILURES} to "
+                "be made from some and measured on others; simulate more"
             )
     return ""
 
