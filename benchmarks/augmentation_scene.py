@@ -247,7 +247,7 @@ DRIVES = {
 }
 
 
-def least_gaps(weights, key, drives=512, seen="network"):
+def smallest_gaps(weights, key, drives=512, seen="network"):
     """Return the least gaps of drives from the whole domain, and their features."""
     gaps, rows = [], []
     for number in range(drives // LANES):
@@ -263,7 +263,7 @@ def least_gaps(weights, key, drives=512, seen="network"):
 
 def failure_rate(weights, key):
     """Return the share of 512 drives that end less than 0.8 m before a cone."""
-    return float(np.mean(least_gaps(weights, key)[0] < 0.8))
+    return float(np.mean(smallest_gaps(weights, key)[0] < 0.8))
 
 
 def task(narrow):

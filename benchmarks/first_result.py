@@ -124,8 +124,8 @@ def run_quadrotor(problem, budget):
     import verifai_jax as vj
 
     run = vj.falsify(problem, budget=budget, progress=False)
-    least = run.table.all["rho"].min()
-    print(f"{len(run.table.counterexamples)} of {len(run.table)}, {least:.9g}")
+    lowest = run.table.all["rho"].min()
+    print(f"{len(run.table.counterexamples)} of {len(run.table)}, {lowest:.9g}")
 
 
 def hopper():

@@ -243,8 +243,8 @@ def main() -> None:
     for shape in options.shapes:
         for dim in options.dims:
             for count in options.counts:
-                least, most = DIMENSIONS[shape]
-                if count <= dim * (0.5 if shape in OBLIQUE else 2) and least <= dim <= most:
+                lowest, maximum = DIMENSIONS[shape]
+                if count <= dim * (0.5 if shape in OBLIQUE else 2) and lowest <= dim <= maximum:
                     print(measure(shape, dim, count, options.budget, options.seeds), flush=True)
 
 

@@ -226,7 +226,7 @@ class _Connection:
         self.welcome = False  # Whether the server has handed out a point.
         self.capacity = capacity
         self._received = bytearray()
-        self._most = GREETING_BYTES
+        self._max_bytes = GREETING_BYTES
         self._told = 0
         self._points: deque[dict[str, Any]] = deque()
         self._unsent: list[bytes] = []
@@ -241,7 +241,7 @@ class _Connection:
                 self.socket = _encrypted(self.socket, tls, host)
             self._greet(token, name)
             self.socket.settimeout(None)
-            self._most = MAX_BYTES
+            self._max_bytes = MAX_BYTES
         except BaseException:
             self.socket.close()
             raise
@@ -336,8 +336,8 @@ class _Connection:
         if len(self._received) < 4:
             return None
         length = struct.unpack_from(">I", self._received)[0]
-        if length > self._most:
-            raise _no_run(f"it announces {length} bytes, more than {self._most}")
+        if length > self._max_bytes:
+            raise _no_run(f"it announces {length} bytes, more than {self._max_bytes}")
         end = 4 + length
         if len(self._received) < end:
             return None

@@ -28,13 +28,13 @@ class Report:
     seconds: float
     rows: int
     begun: float
-    most: float
+    largest: float
     grown: float
 
     def __str__(self) -> str:
         return (
             f"{self.rows:,} rows in {self.seconds:.0f} s; {self.begun:.2f} GB resident after a "
-            f"fifth of the time, at most {self.most:.2f} GB in the second half, "
+            f"fifth of the time, at most {self.largest:.2f} GB in the second half, "
             f"{self.grown:.2f} GB of the growth beyond that of the rows themselves"
         )
 

@@ -105,12 +105,12 @@ def _corner_distances(a: Pose, body: Body, b: Pose, other: Body) -> tuple[Scalar
         out = jnp.maximum(jnp.abs(along[-1]) - half_length, 0.0)
         beside = jnp.maximum(jnp.abs(across[-1]) - half_width, 0.0)
         squares.append(out**2 + beside**2)
-    first = jnp.maximum(_least(along), -_greatest(along)) - half_length
-    second = jnp.maximum(_least(across), -_greatest(across)) - half_width
-    return _least(squares), jnp.maximum(first, second)
+    first = jnp.maximum(_lowest(along), -_greatest(along)) - half_length
+    second = jnp.maximum(_lowest(across), -_greatest(across)) - half_width
+    return _lowest(squares), jnp.maximum(first, second)
 
 
-def _least(values: list[Any]) -> Any:
+def _lowest(values: list[Any]) -> Any:
     return functools.reduce(jnp.minimum, values)
 
 
@@ -133,7 +133,7 @@ def disc_gap(a: Pose, body: Body, b: Pose, other: Body, temperature: float = 0.0
     squares = [(x - u) ** 2 + (y - v) ** 2 for x, y in body.middles(a) for u, v in other.middles(b)]
     radii = body.radius + other.radius
     if temperature <= 0:
-        return jnp.sqrt(_least(squares) + TINY) - radii
+        return jnp.sqrt(_lowest(squares) + TINY) - radii
     distances = jnp.sqrt(jnp.stack(squares) + TINY)
     return -temperature * jax.nn.logsumexp(-distances / temperature, axis=0) - radii
 

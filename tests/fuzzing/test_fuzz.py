@@ -22,7 +22,7 @@ TRAFFIC = vj.events.Automaton(
         ("busy", "leave"): {"to": "free", "wait": vj.Box(0.1, 1)},
         ("busy", "horn"): {"wait": vj.Box(0.1, 1)},
     },
-    most=3,
+    max_events=3,
 )
 
 

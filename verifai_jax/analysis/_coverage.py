@@ -218,11 +218,11 @@ def _discrepancy(
     from scipy.stats import qmc
 
     n, d = unit.shape
-    most = int(min(MAX_ROWS, np.sqrt(MAX_ENTRIES / d)))
+    maximum = int(min(MAX_ROWS, np.sqrt(MAX_ENTRIES / d)))
     if allowed is not None:
-        most = min(most, len(allowed))
-    if n > most:
-        unit, n = unit[generator.choice(n, most, replace=False)], most
+        maximum = min(maximum, len(allowed))
+    if n > maximum:
+        unit, n = unit[generator.choice(n, maximum, replace=False)], maximum
     expected = ((5 / 4) ** d - (13 / 12) ** d) / n
     if allowed is not None:
         expected = qmc.discrepancy(allowed[:n], method="CD")

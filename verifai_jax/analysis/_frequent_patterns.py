@@ -221,8 +221,8 @@ def frequent_patterns(
         _, elsewhere = _items(samples, bins, samples.others("all").frame)
     else:
         elsewhere = np.zeros((len(items), 0), bool)
-    least = max(1, int(np.ceil(minimum * len(samples) - 1e-9)))
-    combinations, counts, expected = _frequent(items, present, elsewhere, least, size)
+    min_count = max(1, int(np.ceil(minimum * len(samples) - 1e-9)))
+    combinations, counts, expected = _frequent(items, present, elsewhere, min_count, size)
     if against == "prior":
         expected = np.array([prod(items[i].prior or 0.0 for i in one) for one in combinations])
     order = sorted(range(len(counts)), key=lambda i: (len(combinations[i]), -counts[i], i))
@@ -249,9 +249,9 @@ def _has_both_verdicts(samples: Samples) -> bool:
 
 
 def _frequent(
-    items: tuple[Item, ...], present: np.ndarray, elsewhere: np.ndarray, least: int, size: int
+    items: tuple[Item, ...], present: np.ndarray, elsewhere: np.ndarray, min_count: int, size: int
 ) -> tuple[list[tuple[int, ...]], np.ndarray, np.ndarray]:
-    """Return all combinations of at most `size` items, of different columns, with `least` rows."""
+    """Return all combinations of at most `size` items, of different columns, with `min_count` rows."""
     combinations: list[tuple[int, ...]] = []
     counts: list[int] = []
     shares: list[float] = []
@@ -262,12 +262,12 @@ def _frequent(
                 continue
             covered = rows & present[i]
             count = int(np.count_nonzero(covered))
-            if count < least:
+            if count < min_count:
                 continue
             if len(combinations) == MAX_COMBINATIONS:
                 raise ValueError(
                     f"more than {MAX_COMBINATIONS:,} combinations of up to {size} values are in "
-                    f"{least} rows or more; raise minimum, or lower size"
+                    f"{min_count} rows or more; raise minimum, or lower size"
                 )
             beyond = others & elsewhere[i]
             combinations.append((*one, i))

@@ -171,18 +171,18 @@ def _split(
     values: np.ndarray, generator: np.random.Generator, predictions: int
 ) -> tuple[Int[np.ndarray, " train"], Int[np.ndarray, " test"]]:
     """Return rows to train on and rows to measure on; rare verdicts are kept before others."""
-    most = int(np.clip(MAX_PREDICTED // max(predictions, 1), 200, MAX_TESTED))
+    maximum = int(np.clip(MAX_PREDICTED // max(predictions, 1), 200, MAX_TESTED))
     if values.dtype != bool:
         order = generator.permutation(len(values))
         half = len(values) // 2
-        return order[:half][:MAX_TRAINED], order[half:][:most]
+        return order[:half][:MAX_TRAINED], order[half:][:maximum]
     train, test = [], []
     for part in (values, ~values):
         order = generator.permutation(np.flatnonzero(part))
         half = len(order) // 2
         # Neither score depends on how many rows of each verdict there are.
         train.append(order[:half][: MAX_TRAINED // 2])
-        test.append(order[half:][: most // 2])
+        test.append(order[half:][: maximum // 2])
     return np.concatenate(train), np.concatenate(test)
 
 

@@ -254,10 +254,10 @@ def pca(
     samples.need_ordered("principal component analysis")
     offset, width = samples.scaling(scale)
     scaled = samples.matrix(scale)
-    most = min(scaled.shape)
-    if components is not None and check_count("components", components) > most:
+    maximum = min(scaled.shape)
+    if components is not None and check_count("components", components) > maximum:
         raise ValueError(
-            f"components must be from 1 to {most}, the lesser of {scaled.shape[0]} rows and "
+            f"components must be from 1 to {maximum}, the lesser of {scaled.shape[0]} rows and "
             f"{scaled.shape[1]} ordered columns; got {components}"
         )
     mean = scaled.mean(axis=0)

@@ -172,7 +172,7 @@ def rules(
     depth: int = 3,
     *,
     cover: float = 0.95,
-    most: int = 6,
+    max_rules: int = 6,
     held_out: float = 0.4,
     seed: int = 0,
 ) -> Rules:
@@ -182,7 +182,7 @@ def rules(
 
     - `source`: a run, its table, a DataFrame, or `Samples` of `"all"` rows.
     - `depth`: features that a rule has conditions on at most.
-    - `cover`: share of the failures to cover; `most` rules at most.
+    - `cover`: share of the failures to cover; `max_rules` rules at most.
     - `held_out`: share of the rows that are kept aside to measure coverage and precision, drawn by
       `seed` among failing and safe rows alike.
     - `seed`: of the rows kept aside.
@@ -202,7 +202,7 @@ def rules(
 
     **Raises:** `ValueError` without failing or without safe rows, or for options out of range.
     """
-    depth, most = check_count("depth", depth), check_count("most", most)
+    depth, max_rules = check_count("depth", depth), check_count("max_rules", max_rules)
     check_fraction("cover", cover, one=True)
     check_fraction("held_out", held_out)
     samples = Samples.of(source, "all")
@@ -215,7 +215,7 @@ def rules(
     values, codes = samples.values(), samples.codes()
     made = ~aside
     regions = _select_regions(
-        values[made], codes[made], failing[made], samples.unordered, depth, cover, most
+        values[made], codes[made], failing[made], samples.unordered, depth, cover, max_rules
     )
     integer = [column.integer for column in samples.ordered]
     regions = [region.round(values[made], codes[made], integer) for region in regions]
@@ -307,7 +307,7 @@ def _select_regions(
     unordered: tuple[Column, ...],
     depth: int,
     cover: float,
-    most: int,
+    max_rules: int,
 ) -> list[Region]:
     """Select regions that together cover the failures, each from what those before left over."""
     base = failing.mean()
@@ -315,7 +315,7 @@ def _select_regions(
     dense = min(DENSER * base, (1 + base) / 2)
     remaining = np.ones(len(failing), bool)
     found: list[Region] = []
-    while len(found) < most and (failing & remaining).sum() > (1 - cover) * failing.sum():
+    while len(found) < max_rules and (failing & remaining).sum() > (1 - cover) * failing.sum():
 
         def score(region: Region, left: Bool[np.ndarray, " n"] = remaining) -> float:
             inside = region.covers(values, codes) & left

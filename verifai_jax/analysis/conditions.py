@@ -179,20 +179,20 @@ def everywhere(ordered: int, unordered: int) -> Region:
     return Region((-np.inf,) * ordered, (np.inf,) * ordered, (None,) * unordered)
 
 
-def short_number(least: float, below: float, near: float) -> float:
+def short_number(lowest: float, below: float, near: float) -> float:
     """Return the number with fewest decimals in `[least, below)`, of those the closest to `near`.
 
     >>> short_number(0.3071, 0.3164, 0.31175)
     0.31
     """
-    if not least < below:
-        return least
-    first = int(np.floor(np.log10(max(abs(least), abs(below))))) + 1
+    if not lowest < below:
+        return lowest
+    first = int(np.floor(np.log10(max(abs(lowest), abs(below))))) + 1
     for decimals in range(-first, 18 - first):
         number = round(near, decimals)
-        if least <= number < below:
+        if lowest <= number < below:
             return number + 0.0  # No negative zero.
-    return least
+    return lowest
 
 
 def _between_values(end: float, values: Float[np.ndarray, " n"], integer: bool) -> float:
@@ -201,8 +201,8 @@ def _between_values(end: float, values: Float[np.ndarray, " n"], integer: bool) 
     if place in (0, len(values)):
         # All values are on one side: no bound at all, as far as these rows can tell.
         return -np.inf if place == 0 else np.inf
-    least, below = float(values[place - 1]), float(values[place])
-    return float(np.floor(least)) if integer else short_number(least, below, (least + below) / 2)
+    lowest, below = float(values[place - 1]), float(values[place])
+    return float(np.floor(lowest)) if integer else short_number(lowest, below, (lowest + below) / 2)
 
 
 def _put(entries: tuple, j: int, entry: object) -> tuple:

@@ -264,8 +264,8 @@ def _features(found: Analysis) -> pd.DataFrame:
     if found.samples is not None and found.samples.failing.any():
         failing = found.samples.frame.loc[found.samples.failing]
         for column in found.samples.ordered:
-            table.loc[column.name, "least_failing"] = failing[column.name].min()
-            table.loc[column.name, "most_failing"] = failing[column.name].max()
+            table.loc[column.name, "min_failing"] = failing[column.name].min()
+            table.loc[column.name, "max_failing"] = failing[column.name].max()
     if names and (covered := found["coverage"]) is not None:
         table["occupied"] = covered.table["occupied"]
     return table

@@ -57,13 +57,13 @@ def propose_regions(
     return regions
 
 
-def _limit_rows(failing: Bool[np.ndarray, " n"], most: int) -> Int[np.ndarray, " k"]:
-    """Return rows to make trees from, `most` at most; rare verdicts are kept."""
-    if len(failing) <= most:
+def _limit_rows(failing: Bool[np.ndarray, " n"], maximum: int) -> Int[np.ndarray, " k"]:
+    """Return rows to make trees from, `maximum` at most; rare verdicts are kept."""
+    if len(failing) <= maximum:
         return np.arange(len(failing))
     parts = []
     for part in (np.flatnonzero(failing), np.flatnonzero(~failing)):
-        parts.append(part[:: max(1, -(-2 * len(part) // most))])
+        parts.append(part[:: max(1, -(-2 * len(part) // maximum))])
     return np.concatenate(parts)
 
 

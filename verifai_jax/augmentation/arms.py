@@ -229,10 +229,10 @@ def _rules_generator(base: Base) -> Generator | str:
 def _kept(base: Base, generate: Generator | str) -> Addition:
     if isinstance(generate, str):
         return _nothing(base, generate)
-    most = GENERATED * base.added
+    maximum = GENERATED * base.added
     parts, generated, found = [base.features(base.table.iloc[:0])], 0, 0
     key = base.key
-    while found < base.added and generated < most:
+    while found < base.added and generated < maximum:
         key, now = jax.random.split(key)
         rows = generate(now, base.added)
         if not len(rows):

@@ -118,9 +118,9 @@ class Allocation:
         - `margins`: what decides between equals who leads; see `find_leader`.
         """
         k, n = np.asarray(failures), np.asarray(simulations)
-        least = np.maximum(-(-(self.samples - n) // self.block), 0)
-        if least.any():
-            return least
+        lowest = np.maximum(-(-(self.samples - n) // self.block), 0)
+        if lowest.any():
+            return lowest
         left = (self.budget - int(n.sum())) // self.block
         if left <= 0:
             return np.zeros(len(n), np.int64)
@@ -196,8 +196,8 @@ class Allocation:
         from scipy.special import betaincinv
 
         limit = required_evidence(self.confidence, among)
-        most = max(self.budget, 2 * self.block)
-        steps = np.geomspace(self.block, most, 32)
+        maximum = max(self.budget, 2 * self.block)
+        steps = np.geomspace(self.block, maximum, 32)
         fewest = np.full(len(failures), np.inf)
         k, n = failures[:, None].astype(float), simulations[:, None] + steps
         for evidence, level in ((evidence_below, 0.25), (evidence_above, 0.75)):

@@ -213,9 +213,9 @@ class Blocks:
             with truncate_silently():
                 found = simulator(members, points[:, None], numbers.astype(np.int32), key)
             self.simulated += 1
-            least = [each.least[0] if each.proper[0] else np.nan for each in found]
+            lowest = [each.lowest[0] if each.proper[0] else np.nan for each in found]
             failing = np.array([bool(each.violated[0]) for each in found])
-            return {"again": np.array(least, np.float32), "failing": failing}
+            return {"again": np.array(lowest, np.float32), "failing": failing}
 
         kind, rows = "attack" if of_attack else "sample", "-".join(map(str, numbers.tolist()))
         kind = f"{kind}/{attempt}"
@@ -239,10 +239,10 @@ class Blocks:
                 if i not in ready:
                     owner = self._owner[blocks[i].policy]
                     simulator, _ = self._simulators[owner]
-                    most = simulator.blocks_per_call()
+                    maximum = simulator.blocks_per_call()
                     some = [
                         j
-                        for j in order[place : place + most]
+                        for j in order[place : place + maximum]
                         if self._owner[blocks[j].policy] == owner and j not in ready
                     ]
                     found = self._simulate(owner, [blocks[j] for j in some], key)
@@ -348,8 +348,8 @@ class _Samples:
 
 
 def _to_memo(verdicts: Verdicts) -> dict[str, np.ndarray]:
-    least = np.where(verdicts.proper, verdicts.least, np.nan).astype(np.float32)
-    return {"rho": least, "failing": verdicts.violated, "proper": verdicts.proper}
+    lowest = np.where(verdicts.proper, verdicts.lowest, np.nan).astype(np.float32)
+    return {"rho": lowest, "failing": verdicts.violated, "proper": verdicts.proper}
 
 
 def _from_memo(known: Arrays, count: int) -> Verdicts:

@@ -112,8 +112,8 @@ class ExecutorSimulator:
                 self.messages.setdefault(number, message)
             each = result["seconds"] / max(len(found[place]), 1)
             wanted = seconds_per_block(self._executor)
-            most = MAX_BLOCKS_PER_SECOND * max(1, int(wanted / SECONDS))
-            self._each = max(1, min(most, int(wanted / max(each, 1e-9))))
+            maximum = MAX_BLOCKS_PER_SECOND * max(1, int(wanted / SECONDS))
+            self._each = max(1, min(maximum, int(wanted / max(each, 1e-9))))
 
         gather(futures, ended)
         return [verdicts for place in range(len(parts)) for verdicts in found[place]]

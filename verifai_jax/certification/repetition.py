@@ -34,16 +34,19 @@ def repeat_failures(
     **Returns:** what that says of the system; empty where all came again.
     """
     rows = [
-        (float(verdicts.least[place]), record, block, place)
+        (float(verdicts.lowest[place]), record, block, place)
         for record in (sampled, attacked)
         for block, verdicts in enumerate(record.verdicts)
         for place in np.flatnonzero(verdicts.violated).tolist()
     ]
     rows.sort(key=lambda row: row[0])
     found = Repetitions()
-    begin, most = 0, max(REPEATED, (sampled.simulations + attacked.simulations) // SHARE_REPEATED)
-    while begin < min(len(rows), most):
-        part = rows[begin : min(begin + REPEATED, most)]
+    begin, maximum = (
+        0,
+        max(REPEATED, (sampled.simulations + attacked.simulations) // SHARE_REPEATED),
+    )
+    while begin < min(len(rows), maximum):
+        part = rows[begin : min(begin + REPEATED, maximum)]
         begin += len(part)
         rho = np.array([row[0] for row in part])
         again, failing = _again(blocks, policy, attacked, part, 0)
@@ -63,7 +66,7 @@ def repeat_failures(
             record.take_out(block, place)
             attacked.failures -= record is attacked
         if found.moved:
-            most = LIMIT
+            maximum = LIMIT
     return str(found)
 
 

@@ -92,9 +92,9 @@ class SharedSimulator:
         key: Key[Array, ""],
     ) -> list[Verdicts]:
         verdicts: list[Verdicts] = []
-        most = self._program.capacity * len(self._program.devices)
-        for start in range(0, len(members), most):
-            part = slice(start, start + most)
+        maximum = self._program.capacity * len(self._program.devices)
+        for start in range(0, len(members), maximum):
+            part = slice(start, start + maximum)
             verdicts += self._call(members[part], points[part], first[part], key)
         return verdicts
 

@@ -67,11 +67,11 @@ class Check:
         if self.max_failure_probability is None:
             return
         check_fraction("max_failure_probability", self.max_failure_probability)
-        least = least_budget(self.max_failure_probability, self.confidence)
-        if self.budget < least:
+        minimum = min_budget(self.max_failure_probability, self.confidence)
+        if self.budget < minimum:
             raise ValueError(
                 f"a budget of {self.budget:,} simulations cannot show a failure probability of at "
-                f"most {format_percent(self.max_failure_probability)}: if none fails, {least:,} do"
+                f"most {format_percent(self.max_failure_probability)}: if none fails, {minimum:,} do"
             )
 
     def run(
@@ -113,7 +113,7 @@ class Check:
         outcome = CheckOutcome(problem.name, self, target, replayed, run)
         if corpus is None or not outcome.refuted or not run.table.counts.claimed:
             return outcome
-        saved = save_counterexamples(run, corpus, most=1, budget=SHRINKING)
+        saved = save_counterexamples(run, corpus, max_count=1, budget=SHRINKING)
         return CheckOutcome(problem.name, self, target, replayed, run, tuple(saved))
 
 
@@ -181,7 +181,7 @@ class CheckOutcome:
             result["vj_counterexamples"] = counts.claimed
             result["vj_without_verdict"] = counts.without_verdict
             if counts.without_verdict < self.run.simulations:
-                result["vj_least_robustness"] = counts.least
+                result["vj_least_robustness"] = counts.lowest
         if self.rate is not None:
             result["vj_failure_rate_low"] = self.rate.low
             result["vj_failure_rate_high"] = self.rate.high
@@ -244,7 +244,7 @@ def _short(value: object) -> str:
     return f"{value:z.6g}" if isinstance(value, float) else str(value)
 
 
-def least_budget(probability: float, confidence: float) -> int:
+def min_budget(probability: float, confidence: float) -> int:
     """Return the simulations without a failure that show a failure probability."""
     low, high = 0, 1
     while anytime_interval(0, high, confidence).high > probability:

@@ -266,9 +266,9 @@ def _check(
     if not 0 <= margin < 1:
         raise ValueError(f"margin must be a probability, from 0 to below 1; got {margin}")
     check_fraction("confidence", confidence)
-    least = 1 + len(candidates)
-    if check_count("budget", budget) < least:
-        raise ValueError(f"budget must be {least} at least, one simulation of each; got {budget}")
+    minimum = 1 + len(candidates)
+    if check_count("budget", budget) < minimum:
+        raise ValueError(f"budget must be {minimum} at least, one simulation of each; got {budget}")
     baseline.check()
     for name, problem in candidates.items():
         problem.check()

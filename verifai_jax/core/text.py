@@ -124,19 +124,23 @@ def format_error(error: BaseException) -> str:
     return f"{type(error).__name__}: {first}" if first else type(error).__name__
 
 
-def shorten(text: str, most: int = 60) -> str:
+def shorten(text: str, maximum: int = 60) -> str:
     """Shorten a text to at most so many characters by leaving out some before its end.
 
     The end of a name says more than its middle.
     """
-    return text if len(text) <= most else f"{text[: most // 3]}...{text[len(text) - most // 2 :]}"
+    return (
+        text
+        if len(text) <= maximum
+        else f"{text[: maximum // 3]}...{text[len(text) - maximum // 2 :]}"
+    )
 
 
 MAX_MESSAGE_LENGTH = 500
 """Characters of a message of somebody's system that are printed; the table has all of it."""
 
 
-def printable(text: str, most: int | None = None) -> str:
+def printable(text: str, maximum: int | None = None) -> str:
     r"""Write characters that steer a terminal as escapes: `\x1b[2J`, `\u202e`.
 
     Texts of systems, tables and files could otherwise clear the screen, or reorder what is on it.
@@ -145,15 +149,15 @@ def printable(text: str, most: int | None = None) -> str:
     **Arguments:**
 
     - `text`: the text.
-    - `most`: characters that are kept, of its begin and its end; all when left out.
+    - `maximum`: characters that are kept, of its begin and its end; all when left out.
     """
-    text = text if most is None else shorten(text, most)
+    text = text if maximum is None else shorten(text, maximum)
     if text.isascii() and text.isprintable():
         return text
     return "".join(_escaped(each) if _steers(each) else each for each in text)
 
 
-def storable(text: object, most: int = 2000) -> str:
+def storable(text: object, maximum: int = 2000) -> str:
     r"""Return a text of somebody's code as files and sockets can hold it, of bounded length.
 
     A lone surrogate, which UTF-8 cannot hold, becomes its escape: `\ud800`.
@@ -161,7 +165,7 @@ def storable(text: object, most: int = 2000) -> str:
     **Arguments:**
 
     - `text`: the text; anything else is written by `str`.
-    - `most`: characters that are kept, of its beginning and its end.
+    - `maximum`: characters that are kept, of its beginning and its end.
     """
     try:
         written = text if isinstance(text, str) else str(text)
@@ -169,7 +173,7 @@ def storable(text: object, most: int = 2000) -> str:
         if isinstance(error, KeyboardInterrupt):
             raise
         written = f"({type(text).__name__} whose text cannot be written)"
-    return shorten(written, most).encode("utf-8", "backslashreplace").decode("utf-8")
+    return shorten(written, maximum).encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def _steers(character: str) -> bool:
@@ -183,9 +187,9 @@ def _escaped(character: str) -> str:
     return character.encode("unicode_escape").decode("ascii")
 
 
-def one_line(text: str, most: int = MAX_MESSAGE_LENGTH) -> str:
+def one_line(text: str, maximum: int = MAX_MESSAGE_LENGTH) -> str:
     """Write a text in one line of at most so many characters, safe for a terminal."""
-    return printable(" ".join(shorten(text, most).split()))
+    return printable(" ".join(shorten(text, maximum).split()))
 
 
 def folder_name(text: str) -> str:

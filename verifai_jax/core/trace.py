@@ -330,10 +330,10 @@ def check_period(dt: Any) -> float:
         dt = float(dt)
     if not dt > 0:
         raise ValueError(f"the sampling period dt must be positive; got {dt}")
-    least = float(np.finfo(np.float32).tiny)
-    if not least <= dt < math.inf:
+    minimum = float(np.finfo(np.float32).tiny)
+    if not minimum <= dt < math.inf:
         raise ValueError(
-            f"the sampling period dt must be a finite number of seconds, at least {least:z.3g}, "
+            f"the sampling period dt must be a finite number of seconds, at least {minimum:z.3g}, "
             f"the least in single precision; got {dt}"
         )
     return dt

@@ -66,9 +66,11 @@ class Explained(Drawn, InNotebook):
     @property
     def matter(self) -> tuple[Influence, ...]:
         """The features whose influence is 5 % or more of the greatest, the greatest first."""
-        most = max((abs(self.effect(i)) for i in self.influences), default=0.0)
+        maximum = max((abs(self.effect(i)) for i in self.influences), default=0.0)
         return tuple(
-            i for i in self.influences if i.gone or abs(self.effect(i)) > MATTERS * max(most, 1e-12)
+            i
+            for i in self.influences
+            if i.gone or abs(self.effect(i)) > MATTERS * max(maximum, 1e-12)
         )
 
     def __str__(self) -> str:

@@ -164,12 +164,12 @@ def replay_counterexamples(
     batches: dict[tuple[int, str, str | None], _Batch] = {}
     for path, entry in entries.items():
         if entry.problem != problem.name:
-            results[path] = ReplayedCounterexample(path, OTHER, np.nan, _least(entry))
+            results[path] = ReplayedCounterexample(path, OTHER, np.nan, _lowest(entry))
             continue
         columns = renamed(entry.features, rename or {})
         reason = _misfit(problem.space, columns)
         if reason:
-            results[path] = ReplayedCounterexample(path, INVALID, np.nan, _least(entry), reason)
+            results[path] = ReplayedCounterexample(path, INVALID, np.nan, _lowest(entry), reason)
             continue
         together = (entry.seed, entry.precision, entry.backend)
         batches.setdefault(together, []).append((path, entry, columns))
@@ -196,7 +196,7 @@ def _replay_each(
         if len(batch) == 1:
             ((path, entry, _),) = batch
             reason = one_line(format_error(error))
-            return {path: ReplayedCounterexample(path, INVALID, np.nan, _least(entry), reason)}
+            return {path: ReplayedCounterexample(path, INVALID, np.nan, _lowest(entry), reason)}
     results: _Replayed = {}
     for each in batch:
         results |= _replay_each(problem, replay, [each])
@@ -253,7 +253,7 @@ def _replay_batch(
             message = "" if verdicts.messages is None else verdicts.messages[i]
             notes.append(message or status.name.lower())
         results[path] = ReplayedCounterexample(
-            path, state, robustness, _least(entry), "; ".join(notes), bool(changes)
+            path, state, robustness, _lowest(entry), "; ".join(notes), bool(changes)
         )
     return results
 
@@ -271,7 +271,7 @@ def _not_again(
     entry: SavedCounterexample, changes: tuple[Change, ...] | None, robustness: float
 ) -> list[str]:
     """Say that the same model gives another number than when a counterexample was saved."""
-    before = _least(entry)
+    before = _lowest(entry)
     near = abs(robustness - before) <= CLOSE * max(1.0, abs(before))
     if changes is None or changes or near or np.isnan(before):
         return []
@@ -281,7 +281,7 @@ def _not_again(
     ]
 
 
-def _least(entry: SavedCounterexample) -> float:
+def _lowest(entry: SavedCounterexample) -> float:
     values = [value for value in entry.robustness.values() if isinstance(value, int | float)]
     return min(values, default=np.nan)
 

@@ -284,7 +284,7 @@ class _Search:
         start: Float[np.ndarray, "1 d"],
     ) -> None:
         self.candidates, self.by, self.rng = candidates, by, rng
-        self.most = int(candidates.nominal.count(start)[0])
+        self.max_changed = int(candidates.nominal.count(start)[0])
         self.history: list[Step] = []
 
     def order(self, points: Float[np.ndarray, "n d"]) -> np.ndarray:
@@ -302,7 +302,7 @@ class _Search:
         points = self.candidates.points[self.candidates.failing]
         if self.by == "count":
             # However few its items, what departs in more than the row does is no smaller.
-            points = points[self.candidates.nominal.count(points) <= self.most]
+            points = points[self.candidates.nominal.count(points) <= self.max_changed]
         return points[self.order(points)]
 
     def note(self) -> None:
@@ -358,12 +358,12 @@ class _Search:
     def with_fewest_items(self) -> Float[np.ndarray, "1 d"]:
         """Return the failure with the fewest items, such as events; from now on none has more."""
         candidates = self.candidates
-        least = remove_items(candidates, self.failures()[0])
-        if int(candidates.nominal.count(least[None])[0]) > self.most:
+        lowest = remove_items(candidates, self.failures()[0])
+        if int(candidates.nominal.count(lowest[None])[0]) > self.max_changed:
             return self.failures()[:1]
-        candidates.most_items = int(candidates.nominal.items(least[None])[0])
+        candidates.max_items = int(candidates.nominal.items(lowest[None])[0])
         self.note()
-        return least[None]
+        return lowest[None]
 
     def starts(
         self,
@@ -429,13 +429,13 @@ def search_elsewhere(
     """
     nominal = candidates.nominal
     free = np.flatnonzero(np.array(nominal.cube.levels) == 0)
-    most = min(int(nominal.count(u[None])[0]), len(free)) if keep_count else len(free)
+    maximum = min(int(nominal.count(u[None])[0]), len(free)) if keep_count else len(free)
     reach = 0.98 * float(nominal.distance(u[None])[0])
-    if not most or not reach:
+    if not maximum or not reach:
         return
     moved = np.zeros((40, nominal.space.dim))
     for row in moved:
-        row[rng.permutation(free)[:most]] = rng.standard_normal(most)
+        row[rng.permutation(free)[:maximum]] = rng.standard_normal(maximum)
     moved *= reach * rng.uniform(0.3, 1, (len(moved), 1)) / _length(moved)
     points = nominal.settle(nominal.u + moved)
     rho, failing = candidates(points)

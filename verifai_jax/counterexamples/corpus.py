@@ -127,9 +127,9 @@ def _is_real(value: Any) -> bool:
     return abs(value) <= sys.float_info.max  # Neither NaN nor an integer beyond all floats.
 
 
-def _is_up_to(most: int) -> Callable[[object], bool]:
+def _is_up_to(maximum: int) -> Callable[[object], bool]:
     def fits(value: object) -> bool:
-        return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most
+        return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= maximum
 
     return fits
 
@@ -166,7 +166,7 @@ def save_counterexamples(
     run: Run,
     folder: str | Path,
     *,
-    most: int = 5,
+    max_count: int = 5,
     shrink: bool = True,
     budget: int = 1000,
 ) -> list[Path]:
@@ -180,7 +180,7 @@ def save_counterexamples(
 
     - `run`: with its problem.
     - `folder`: it is made where there is none; files that are there already stay.
-    - `most`: counterexamples at most.
+    - `max_count`: counterexamples at most.
     - `shrink`: whether each is first shrunk towards the nominal features, where these are known.
     - `budget`: simulations to shrink one with, at most.
 
@@ -189,7 +189,7 @@ def save_counterexamples(
     **Raises:** `ValueError` for a run without its problem or without a counterexample.
     """
     problem = problem_of(run)
-    check_count("most", most)
+    check_count("max_count", max_count)
     check_count("budget", budget)
     claimed = run.table.counterexamples
     if not len(claimed):
@@ -201,7 +201,7 @@ def save_counterexamples(
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     paths: dict[Path, None] = {}
-    for place in _spread(points, most):
+    for place in _spread(points, max_count):
         row = int(ordered.index[place])
         features = {name: ordered.iloc[place][name] for name in problem.space.columns}
         changed = None
@@ -299,11 +299,11 @@ def renamed(features: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, 
     return result
 
 
-def _spread(points: Any, most: int) -> list[int]:
+def _spread(points: Any, maximum: int) -> list[int]:
     """Return places of points, the first and then each time the one farthest from those before."""
     chosen = [0]
     distance = np.linalg.norm(points - points[0], axis=1)
-    while len(chosen) < min(most, len(points)):
+    while len(chosen) < min(maximum, len(points)):
         farthest = int(np.argmax(distance))
         if distance[farthest] <= 0:
             break

@@ -144,10 +144,10 @@ def _control_points(i: Influence, rho: float) -> str:
     if alone:
         return f" Its part {format_spans(alone)} alone does it."
     gain = np.nan_to_num(i.each - rho)
-    most = gain.max(initial=0.0)
-    if most <= 0:
+    maximum = gain.max(initial=0.0)
+    if maximum <= 0:
         return " No part of it does it alone."
-    strong = [span for span, g in zip(i.spans, gain, strict=True) if g > 0.3 * most]
+    strong = [span for span, g in zip(i.spans, gain, strict=True) if g > 0.3 * maximum]
     return f" No part of it does it alone; what counts most is {format_spans(strong)}."
 
 

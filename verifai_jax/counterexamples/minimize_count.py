@@ -60,7 +60,7 @@ def revert_features(candidates: Candidates, u: Point) -> Point:
             others = revert(candidates, u, more)
             tried = np.concatenate([tried, others])
             failing = np.concatenate([failing, candidates(others)[1]])
-        u = least_departure(candidates, tried[failing])
+        u = smallest_departure(candidates, tried[failing])
     return u
 
 
@@ -72,7 +72,7 @@ def revert(candidates: Candidates, u: Point, sets: list[np.ndarray]) -> Points:
     return points
 
 
-def least_departure(candidates: Candidates, points: Points) -> Point:
+def smallest_departure(candidates: Candidates, points: Points) -> Point:
     """Return the point with the fewest departures, and of those the nearest."""
     order = np.lexsort((candidates.nominal.distance(points), candidates.nominal.count(points)))
     return points[order[0]]
@@ -92,8 +92,8 @@ def trial_values(candidates: Candidates, i: int) -> list[float]:
     return [float(v) for v in values if np.float32(v) != candidates.nominal.u[i]]
 
 
-def grow(candidates: Candidates, starts: Points, most: int) -> Results:
-    """Search failing points with `most` departures at most, from nominal on; perhaps none."""
+def grow(candidates: Candidates, starts: Points, maximum: int) -> Results:
+    """Search failing points with `maximum` departures at most, from nominal on; perhaps none."""
     nominal = candidates.nominal
     d = nominal.space.dim
     pairs = [(i, value) for i in range(d) for value in trial_values(candidates, i)]
@@ -105,7 +105,7 @@ def grow(candidates: Candidates, starts: Points, most: int) -> Results:
     for point, (i, value) in zip(points, pairs, strict=True):
         point[i] = value
     rho, failing = candidates(points)
-    if failing.any() or most < 2:
+    if failing.any() or maximum < 2:
         return points[failing]
     # Of each coordinate the two best values, the best coordinates first.
     ranked = np.argsort(rho)
@@ -115,7 +115,7 @@ def grow(candidates: Candidates, starts: Points, most: int) -> Results:
         if len(offered.setdefault(i, [])) < 2:
             offered[i].append(value)
     beam = distinct_sets(candidates, points[ranked])[:BEAM]
-    for _ in range(2, most + 1):
+    for _ in range(2, maximum + 1):
         if candidates.left <= 0:
             break
         longer = []
@@ -178,12 +178,12 @@ def exchange(candidates: Candidates, u: Point, rng: np.random.Generator) -> Poin
         points = nominal.settle(np.concatenate(tried))
         rho, failing = candidates(points)
         if failing.any():
-            return least_departure(candidates, points[failing])
+            return smallest_departure(candidates, points[failing])
         if candidates.left <= 0:
             return None
         # The half that came nearest, each from its best point on.
-        least = np.array([rho[owner == k].min() for k in range(len(smaller))])
-        kept = np.argsort(least)[: max(1, min(8, (len(smaller) + 1) // 2))]
+        lowest = np.array([rho[owner == k].min() for k in range(len(smaller))])
+        kept = np.argsort(lowest)[: max(1, min(8, (len(smaller) + 1) // 2))]
         centres = np.array([points[owner == k][np.argmin(rho[owner == k])] for k in kept])
         smaller = [smaller[k] for k in kept]
         width *= 0.4
@@ -245,7 +245,7 @@ def minimize_count(candidates: Candidates, starts: Points, rng: np.random.Genera
         if not pool or candidates.left > enough:
             pool.append(revert_features(candidates, u))
     while candidates.left > 0:
-        u = least_departure(candidates, np.array(pool))
+        u = smallest_departure(candidates, np.array(pool))
         count = int(nominal.count(u[None])[0])
         if count <= 1:
             break

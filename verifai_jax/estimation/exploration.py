@@ -150,8 +150,8 @@ def _choose_ends(
 
     **Returns:** rows of ends, and the region of each.
     """
-    most = max(chains, round(COMPARED * simulations))
-    rows = _spread_out(ends, min(most, MAX_COMPARED))
+    maximum = max(chains, round(COMPARED * simulations))
+    rows = _spread_out(ends, min(maximum, MAX_COMPARED))
     gaps = _gaps(ends, rows, rows)
     gaps[np.triu_indices(len(rows))] = np.inf
     group = _joined(limit_state, ends.points[rows], np.argsort(gaps, axis=1)[:, :LINKS])
@@ -232,7 +232,7 @@ def _joined(
     return np.unique(group, return_inverse=True)[1]
 
 
-def _spread_out(ends: Ends, most: int) -> Int[np.ndarray, " k"]:
+def _spread_out(ends: Ends, maximum: int) -> Int[np.ndarray, " k"]:
     """Return ends far from one another, the least distant first; no two that are one."""
     everything = np.arange(len(ends.points))
     nearest = int(np.linalg.norm(ends.points, axis=1).argmin())
@@ -240,7 +240,7 @@ def _spread_out(ends: Ends, most: int) -> Int[np.ndarray, " k"]:
     def gaps_from(row: int) -> Float[np.ndarray, " n"]:
         return _gaps(ends, everything, np.array([row]))[:, 0]
 
-    return farthest_first(nearest, gaps_from, most, SAME)
+    return farthest_first(nearest, gaps_from, maximum, SAME)
 
 
 def _squares(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n 1"]:

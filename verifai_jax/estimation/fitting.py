@@ -38,11 +38,11 @@ CELLS = 48
 
 def effective_size(weight: Float[np.ndarray, " n"]) -> float:
     """Return the number of equally weighted points that these weights are worth."""
-    most = weight.max(initial=0.0)
-    if not most > 0:
+    maximum = weight.max(initial=0.0)
+    if not maximum > 0:
         return 0.0
     # Of the largest, so that squares of small ones do not all vanish.
-    parts = weight / most
+    parts = weight / maximum
     return float(parts.sum() ** 2 / np.sum(parts * parts))
 
 

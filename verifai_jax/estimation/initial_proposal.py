@@ -95,9 +95,9 @@ def compare_explorations(
     count, reached = len(proposals), share @ near
     lonely = near.sum(axis=1) <= 1
     alone = float(share @ lonely)
-    most = limit_state.left // (count * TRIED * COST_OF_PATHS)
-    if count > 1 and alone > WORTH_PATHS and most:
-        rows = rng.choice(len(z), min(most, PATHS), p=np.where(lonely, share, 0.0) / alone)
+    maximum = limit_state.left // (count * TRIED * COST_OF_PATHS)
+    if count > 1 and alone > WORTH_PATHS and maximum:
+        rows = rng.choice(len(z), min(maximum, PATHS), p=np.where(lonely, share, 0.0) / alone)
         joined = near[rows]
         with suppress(Ended):  # Then the paths that were simulated count.
             for number, points in enumerate(found):

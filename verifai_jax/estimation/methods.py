@@ -204,9 +204,9 @@ def estimate_by_importance_sampling(
                 limit_state, rng, points, chain_ids, limit_state.left, mix(proposals), anchors
             )
         counted = _promised_by_counting(limit_state, fitted, counts)
-        least = max(counted, MIN_OF_MOVED if by_chance else 0)
+        needed = max(counted, MIN_OF_MOVED if by_chance else 0)
         few = not by_chance and fitted.effective * limit_state.left < MIN_EFFECTIVE
-        if few or fitted.promise(limit_state.left) < least:
+        if few or fitted.promise(limit_state.left) < needed:
             answer = _without_proposal(limit_state, rng, plan, run, counts, fitted, counted)
             return _with_chance(answer, again, limit_state.own_chance)
         # A little is left over to see whether the searches agree.
@@ -495,14 +495,14 @@ def _bound_only(
     level = run.levels[-1] if run.levels else np.inf
     why = {
         "stuck": "the search found no failure: the robustness gets no lower than "
-        f"{limit_state.least:z.4g}, or has no slope to follow",
+        f"{limit_state.lowest:z.4g}, or has no slope to follow",
         "budget": f"the budget ended at robustness {level:z.4g}, which is reached with probability "
         f"{reached:z.1e}; failing is rarer, or impossible",
     }.get(run.stopped or "", f"ended ({run.stopped}) at robustness {level:z.4g}")
     counts = counts + monte_carlo.sample_prior(limit_state, rng, limit_state.left)
     answer = _monte_carlo_answer(counts, plan)
     answer.diagnostics = {"levels": list(run.levels), "fractions": list(run.fractions)}
-    if not np.isfinite(limit_state.least):
+    if not np.isfinite(limit_state.lowest):
         pass  # No simulation had a verdict, of which there is a note.
     elif limit_state.failures == 0:
         answer.notes.insert(0, why)

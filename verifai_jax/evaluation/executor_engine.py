@@ -103,9 +103,11 @@ class ExecutorEngine:
         form = problem.space.feature_form
         self._features: Any = jax.tree.structure(form)
         _, lanes = chunks_and_lanes(problem, batch, len(jax.local_devices()))
-        least = power_of_two(batch)
+        smallest = power_of_two(batch)
         backend = problem.system.backend if problem.system.backends else None
-        self.mode = BlockMode(lanes, gradient, clauses, precision, least, backend, steering, given)
+        self.mode = BlockMode(
+            lanes, gradient, clauses, precision, smallest, backend, steering, given
+        )
         self._dtype = np.dtype(precision if given else "float32")
         self.unit = lanes
         if problem.black_box:
@@ -288,9 +290,9 @@ class Pending:
 
     def send(self) -> list[Future]:
         """Send blocks until each worker has a few, and return those that are new."""
-        most = self._ended + IN_FLIGHT * count_workers(self._engine.executor)
+        maximum = self._ended + IN_FLIGHT * count_workers(self._engine.executor)
         already = len(self._sent)
-        while self._unsent and len(self._sent) < most:
+        while self._unsent and len(self._sent) < maximum:
             begin, end = self._unsent.popleft()
             left = end - begin + sum(b - a for a, b in self._unsent)
             stop = min(begin + self._engine.step(left), end)

@@ -103,8 +103,8 @@ class RowFunction(NamedTuple):
                 robustness(formula, trace, semantics, end=self.problem.end)
                 for formula in self.problem.formulas.values()
             ]
-            least = self._guided(jnp.min(jnp.stack(smoothed)), trace, features)
-            return least, (*verdict, features, None, more)
+            lowest = self._guided(jnp.min(jnp.stack(smoothed)), trace, features)
+            return lowest, (*verdict, features, None, more)
         values = self.goals.values(trace, hard, self.problem.end)
         nearest = jnp.argmin(jnp.max(values, axis=1))
         # A goal that is broken is a failure, whatever the guide says.

@@ -2,7 +2,7 @@
 
     verdicts = engine.evaluate(u, key, first=0)
     verdicts.rho, verdicts.status                       # [n, formulas], [n]
-    verdicts.violated, verdicts.least                   # [n], [n]
+    verdicts.violated, verdicts.lowest                 # [n], [n]
 
 A simulation violates the property if it ended properly and breaks a formula: with a negative
 robustness, or with one of exactly zero where the Boolean semantics say so (`x >= 0` holds at zero,
@@ -59,7 +59,7 @@ class Verdicts(NamedTuple):
         return self.status == Status.OK
 
     @property
-    def least(self) -> Float[np.ndarray, " n"]:
+    def lowest(self) -> Float[np.ndarray, " n"]:
         """The least robustness over the formulas; NaN without a verdict."""
         return np.min(self.rho, axis=1)
 
@@ -137,9 +137,9 @@ def violations(
     """
     proper = status == Status.OK
     # A formula without a verdict leaves it to the others.
-    least = rho[:, 0] if rho.shape[1] == 1 else np.fmin.reduce(rho, axis=1)
-    broken = proper & (least < 0)
-    undecided = proper & (least == 0)
+    lowest = rho[:, 0] if rho.shape[1] == 1 else np.fmin.reduce(rho, axis=1)
+    broken = proper & (lowest < 0)
+    undecided = proper & (lowest == 0)
     if undecided.any():
         broken |= undecided & ~np.all(holds(), axis=1)
     return broken

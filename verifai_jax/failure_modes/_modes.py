@@ -79,7 +79,7 @@ def modes(
     batch: int | None = None,
     seed: int = 0,
     confidence: float = 0.95,
-    least_share: float = 0.001,
+    min_share: float = 0.001,
     precision: str = "float32",
     backend: str | None = None,
     max_seconds: float | None = None,
@@ -94,7 +94,7 @@ def modes(
     - `batch`: simulations at once.
     - `seed`: the same seed gives the same modes on the same machine.
     - `confidence`: of all intervals, between 0 and 1.
-    - `least_share`: part of the failure probability below which a region is not listed.
+    - `min_share`: part of the failure probability below which a region is not listed.
     - `precision`, `backend`: as in `falsify`.
     - `max_seconds`: wall-clock seconds after which what is finished is divided into modes.
     - `progress`: True draws a progress bar, False none; None draws one on a terminal.
@@ -114,17 +114,17 @@ def modes(
     changed = source.changed_since() if isinstance(source, Run) else ""
     check_options(budget, 1 if batch is None else batch, seed, max_seconds, None)
     check_fraction("confidence", confidence)
-    check_fraction("least_share", least_share)
+    check_fraction("min_share", min_share)
     in_precision(precision)
     problem.space.check_where()
-    least = int(budget) - min(round(DIVIDING * budget), MAX_DIVIDING)
-    chains = chains_for(least, SHARE_OF_LEVEL)
+    for_probability = int(budget) - min(round(DIVIDING * budget), MAX_DIVIDING)
+    chains = chains_for(for_probability, SHARE_OF_LEVEL)
     batch = min(chains if batch is None else batch, budget)
     chosen = resolved(problem, batch=batch, budget=budget, precision=precision, wanted=backend)
     chosen.problem.check()
     draws = depends_on_key(chosen.problem)
     # Under each of several keys the failures are divided.
-    estimated = int(budget) - (MORE_DIVIDING if draws else 1) * (int(budget) - least)
+    estimated = int(budget) - (MORE_DIVIDING if draws else 1) * (int(budget) - for_probability)
     simulated = DoublePrecisionEvaluator(chosen.problem, batch, precision, seed)
     simulated.compile()
     rng = np.random.default_rng(seed)
@@ -159,7 +159,7 @@ def modes(
     if limit_state.own_chance:
         notes.insert(0, f"{limit_state.own_chance}; what a mode hands out may not fail again")
     if divided is not None and answer.samples is not None:
-        numbers = _Numbers(chosen.problem, seed, precision, backend, confidence, least_share)
+        numbers = _Numbers(chosen.problem, seed, precision, backend, confidence, min_share)
         listed, rest, run = _list_modes(numbers, rng, answer, divided)
         missed = clopper_pearson(divided.tried - divided.joined, divided.tried, confidence)
         unexplained = (missed.low, missed.high)
@@ -201,7 +201,7 @@ class _Numbers:
     precision: str
     backend: str | None
     confidence: float
-    least_share: float
+    min_share: float
     notes: list[str] = field(default_factory=list)
     """On failures that did not come again."""
 
@@ -297,7 +297,7 @@ def _list_modes(
     of_sample[samples.failing] = regions.assign(samples.failures)
     parts = [_part_of(samples, of_sample == k) for k in range(regions.count)]
     masses = np.array([float(part.x.sum()) for part in parts]) / float(samples.x.sum())
-    order = [int(k) for k in np.argsort(-masses, kind="stable") if masses[k] >= numbers.least_share]
+    order = [int(k) for k in np.argsort(-masses, kind="stable") if masses[k] >= numbers.min_share]
     rest = whole * max(0.0, float(1 - masses[order].sum()))
     if not order:
         return (), rest, None

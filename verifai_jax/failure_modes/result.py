@@ -251,10 +251,10 @@ class Modes(Drawn, InNotebook):
     __repr__ = __str__
 
 
-def _listed(features: Mapping[str, Any], most: int = 6) -> str:
+def _listed(features: Mapping[str, Any], maximum: int = 6) -> str:
     """Write features in one line, the first few of many."""
     parts = [
         f"{name} = {value:z.4g}" if isinstance(value, float | np.floating) else f"{name} = {value}"
-        for name, value in list(features.items())[:most]
+        for name, value in list(features.items())[:maximum]
     ]
-    return ", ".join(parts) + (", ..." if len(features) > most else "")
+    return ", ".join(parts) + (", ..." if len(features) > maximum else "")

@@ -364,14 +364,14 @@ class _WholeRounds:
             temperature = search.temperature(state) if search.wants.gradient else 1.0
             simulate = jax.vmap(self.engine.row, in_axes=(0, 0, None))
             row = simulate(u, keys, jnp.float32(temperature))
-            least = jnp.min(row.rho, axis=-1)
+            lowest = jnp.min(row.rho, axis=-1)
             gradient = row.derivatives.get("gradient")
             gradient = None if gradient is None else gradient.astype(jnp.float32)
             valid = row.status == Status.OK
-            observations = Observations(u, least.astype(jnp.float32), valid, gradient)
+            observations = Observations(u, lowest.astype(jnp.float32), valid, gradient)
             if search.learns:
                 state = search.tell(state, cube, observations)
-            return state, (u, least, row.status)
+            return state, (u, lowest, row.status)
 
         state, results = jax.lax.scan(step, state, jnp.arange(self.rounds, dtype=jnp.int32))
         return state, jax.tree.map(lambda each: each.reshape(-1, *each.shape[2:]), results)

@@ -115,7 +115,7 @@ class Learning:
     def objective(self, verdicts: Verdicts) -> Float[np.ndarray, " n"]:
         """Return what the search minimises; with a priority it depends on the rows before."""
         if self._objective is None:
-            return verdicts.least
+            return verdicts.lowest
         return self._objective(verdicts.rho, verdicts.rho < 0)
 
     def learn(

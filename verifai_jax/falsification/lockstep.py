@@ -75,8 +75,8 @@ def lockstep(
     state = start(jnp.stack([key for key, _ in keys]))
     repetitions = [Repetition(cube, key) for key, _ in keys] if cube.dim else []
     engines = {
-        kind: _engine(problem, kind, min(n * batch, most), precision)
-        for kind, most in ((False, VALUES_AT_ONCE), (True, DERIVATIVES_AT_ONCE))
+        kind: _engine(problem, kind, min(n * batch, maximum), precision)
+        for kind, maximum in ((False, VALUES_AT_ONCE), (True, DERIVATIVES_AT_ONCE))
     }
     number_keys = jax.jit(jax.vmap(simulation_key))
     rho: list[list[float]] = [[] for _ in range(n)]
@@ -126,7 +126,7 @@ def lockstep(
             verdicts = Verdicts.concatenate(parts)
             raising.add(verdicts.status, verdicts.messages)
             raising.check(problem.name)
-            values[seed, row], valid[seed, row] = verdicts.least, verdicts.proper
+            values[seed, row], valid[seed, row] = verdicts.lowest, verdicts.proper
             broken[seed, row], clauses[seed, row] = verdicts.violated, verdicts.clauses
             if kind:
                 clause_gradients[seed, row] = verdicts.clause_gradients

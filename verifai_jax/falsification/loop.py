@@ -134,13 +134,13 @@ class Rounds:
         self.learning.begin(self.batch)
         self._keep()
 
-    def advance(self, most: int, limit: int | None = None) -> None:
-        """Propose, simulate, confirm, learn and store at most `most` simulations.
+    def advance(self, maximum: int, limit: int | None = None) -> None:
+        """Propose, simulate, confirm, learn and store at most `maximum` simulations.
 
         - `limit`: simulations of the whole run, up to which points may be sent ahead to workers.
         """
         with self.watch.on(SIMULATE):
-            batch = self._next_points(most, limit)
+            batch = self._next_points(maximum, limit)
             if not len(batch.points):
                 self.learning.proposals.tell_refused()
                 self._keep()
@@ -153,24 +153,24 @@ class Rounds:
                 # A larger budget goes on before a round that this one cut, with all of its points.
                 self._keep()
 
-    def _next_points(self, most: int, limit: int | None) -> Batch:
+    def _next_points(self, maximum: int, limit: int | None) -> Batch:
         """Return the points of the next round: given ones, then suggestions, then proposals."""
         # The number of rows alone says how many of them are still to come, so resuming goes on.
         done = len(self.table)
-        given = self.first[done : done + most]
+        given = self.first[done : done + maximum]
         if len(given):
-            return Batch(given, "first", most < self.batch and len(self.first) > done + most)
+            return Batch(given, "first", maximum < self.batch and len(self.first) > done + maximum)
         if self.suggestions is not None:
             with self._searching():
                 given = self._suggested(self.suggestions, done)
-            left = most if limit is None else max(limit - done, 0)
+            left = maximum if limit is None else max(limit - done, 0)
             if len(given[:left]):
                 return Batch(given[:left], "suggested", limit is not None and len(given) > left)
         if self._sends_ahead:
             if self._ahead is None:
                 from verifai_jax.falsification.ahead import Ahead
 
-                limit = done + most if limit is None else limit
+                limit = done + maximum if limit is None else limit
                 proposals = self.learning.proposals
                 self._ahead = Ahead(proposals, self.evaluate, self.batch, limit, done)
             points, verdicts = self._ahead.next()
@@ -180,7 +180,7 @@ class Rounds:
             return Batch(points, "search")
         self._begin_stage()
         with self._searching():
-            points = self.learning.proposals.next(most)
+            points = self.learning.proposals.next(maximum)
         return Batch(points, "search", self.learning.proposals.cut)
 
     def _simulate(self, batch: Batch, first: int) -> Verdicts:
@@ -296,21 +296,21 @@ class Rounds:
         self.save()
         return suggestions.waiting(rows)
 
-    def measure(self, most: int, timed: bool) -> float:
+    def measure(self, maximum: int, timed: bool) -> float:
         """Simulate the first rows, and return the least seconds that one took.
 
         They are rows of the run. One by one, a first one that is quick is the only one, unless it
         raises.
 
-        - `most`: of the first round.
+        - `maximum`: of the first round.
         - `timed`: whether the seconds are wanted, for which they are simulated one by one.
         """
         if not len(self.first):
             with self._searching():
-                self._pending = self.learning.proposals.next(most)
+                self._pending = self.learning.proposals.next(maximum)
         points = np.asarray(self.first if len(self.first) else self._pending)
         with self.watch.on(SIMULATE):
-            return self._simulations.measure(points[:most], timed)
+            return self._simulations.measure(points[:maximum], timed)
 
     def take_in_measured(self) -> None:
         """Store the rows that were simulated one by one, without the rest of their round.
@@ -391,7 +391,7 @@ class Rounds:
             "violating": self.tally.violating,
             "counterexamples": self.tally.claimed,
             "without_verdict": self.tally.without_verdict,
-            "least_robustness": self.tally.least,
+            "least_robustness": self.tally.lowest,
         }
 
     @property
@@ -432,7 +432,7 @@ class Rounds:
             part.restore(checkpoint)
         counts = self.table.counts
         self._raising.always = counts.without_verdict == len(self.table)
-        self.tally = Tally(counts.claimed, counts.violating, counts.without_verdict, counts.least)
+        self.tally = Tally(counts.claimed, counts.violating, counts.without_verdict, counts.lowest)
         self._keep()
 
     def _keep(self) -> None:

@@ -415,7 +415,7 @@ class Run(InNotebook):
         **Arguments:**
 
         - `folder`: it is made where there is none.
-        - `options`: of `counterexamples.save_counterexamples`: `most`, `shrink`, `budget`.
+        - `options`: of `counterexamples.save_counterexamples`: `max_count`, `shrink`, `budget`.
 
         **Raises:** `ValueError` for a run without its problem or without a counterexample.
         """

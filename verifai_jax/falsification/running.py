@@ -188,7 +188,7 @@ class Running:
         with rounds.watch.on(REST):
             while stopped is None:
                 rounds.advance(min(rounds.batch, budget - len(rounds.table)), budget)
-                bar.update(len(rounds.table), rounds.tally.claimed, rounds.tally.least)
+                bar.update(len(rounds.table), rounds.tally.claimed, rounds.tally.lowest)
                 notify(callbacks, len(rounds.table), rounds.numbers)
                 stopped = self.ends.reached(rounds)
                 if stopped is None and self._is_hopeless:

@@ -213,7 +213,7 @@ def _simulate(
                     verdicts = evaluate(u, first=begin)
                     _write(place, begin, u, verdicts)
                     found += int(verdicts.violated.sum())
-                    best = float(np.fmin(best, np.fmin.reduce(verdicts.least)))
+                    best = float(np.fmin(best, np.fmin.reduce(verdicts.lowest)))
                 simulated += stop - begin
                 bar.update(simulated, found, best)
             first += len(points)

@@ -94,7 +94,7 @@ def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
     if not verdict.violated[0]:
         return ()
     return (
-        f"the nominal features fail themselves, with robustness {verdict.least[0]:z.4g}: "
+        f"the nominal features fail themselves, with robustness {verdict.lowest[0]:z.4g}: "
         "are the formula and its units right?",
     )
 
@@ -128,7 +128,7 @@ def notes_after(
         )
     if len(formulas) == 1:
         # The least robustness is known: most tables need not be read for it.
-        ranges = {"the property": _range(table, "rho")} if table.counts.least > 0 else {}
+        ranges = {"the property": _range(table, "rho")} if table.counts.lowest > 0 else {}
     else:
         ranges = {f"formula {name!r}": _range(table, f"rho.{name}") for name in formulas}
     return tuple(note for which, ends in ranges.items() for note in _never_near(which, ends, count))

@@ -86,8 +86,8 @@ class Simulations:
         )
         self._differentiate: Evaluator | None = None
         if search.wants.clauses:
-            most = min(batch, MAX_DIFFERENTIATED)
-            self._differentiate = evaluator(most, gradient=True, clauses=True)
+            maximum = min(batch, MAX_DIFFERENTIATED)
+            self._differentiate = evaluator(maximum, gradient=True, clauses=True)
         self._measured: Verdicts | None = None
         self.hopeless: str | None = None
 

@@ -84,7 +84,7 @@ class Surrogate:
 
     def learn(self, u: Float[Any, "n d"], verdicts: Verdicts) -> None:
         """Keep the rows that have a verdict and a trace like that of the others."""
-        proper = verdicts.proper & np.isfinite(verdicts.least)
+        proper = verdicts.proper & np.isfinite(verdicts.lowest)
         given = [
             (i, trace)
             for i, trace in enumerate(verdicts.traces or [])
@@ -105,8 +105,8 @@ class Surrogate:
         # Without rows there is no width yet.
         before = self.traces if len(self.traces) else flat[:0]
         self.traces = np.concatenate([before, flat[finite]])
-        least = verdicts.least[rows][finite].astype(np.float32)
-        self.rho = np.concatenate([self.rho, least])
+        lowest = verdicts.lowest[rows][finite].astype(np.float32)
+        self.rho = np.concatenate([self.rho, lowest])
         self._forget()
 
     def improve(self, points: Float[Any, "batch d"]) -> Float[Any, "batch d"]:
@@ -290,11 +290,13 @@ class Descents:
             return jnp.where(jnp.isfinite(gradient), gradient, 0.0)
 
         def one(weights: Float[Array, "terms c"]) -> tuple[Array, Array]:
-            least, place = jax.lax.top_k(-_number(values(pool, weights, hard)), self.options.starts)
+            lowest, place = jax.lax.top_k(
+                -_number(values(pool, weights, hard)), self.options.starts
+            )
             start = pool[place]
 
             def step(carry: tuple, part: Array) -> tuple:
-                u, first, second, best, least = carry
+                u, first, second, best, lowest = carry
                 tau = TEMPERATURES[0] * (TEMPERATURES[1] / TEMPERATURES[0]) ** part
                 gradient = slope(u, weights, tau)
                 # A common size for all coordinates of a point keeps its direction.
@@ -304,14 +306,14 @@ class Descents:
                 moved = jnp.clip(u - size * first / (jnp.sqrt(second) + 1e-9), 0.0, 1.0)
                 u = moved.at[:, cube.discrete].set(u[:, cube.discrete])
                 value = _number(values(u, weights, hard))
-                better = value < least
+                better = value < lowest
                 best = jnp.where(better[:, None], u, best)
-                return (u, first, second, best, jnp.where(better, value, least)), None
+                return (u, first, second, best, jnp.where(better, value, lowest)), None
 
             zero = jnp.zeros_like(start)
             parts = jnp.linspace(0.0, 1.0, self.options.steps)
             (_, _, _, best, value), _ = jax.lax.scan(
-                step, (start, zero, zero, start, -least), parts
+                step, (start, zero, zero, start, -lowest), parts
             )
             return best, value
 
@@ -339,16 +341,16 @@ def _spread(rho: Float[np.ndarray, " n"], number: int, dim: int) -> float:
     - `number`: of the round.
     - `dim`: of the cube.
     """
-    least = np.minimum.accumulate(rho)
-    if least[-1] <= 0:
+    lowest = np.minimum.accumulate(rho)
+    if lowest[-1] <= 0:
         return 1.0
     best, last = rho[0], 0
-    for i in np.flatnonzero(np.diff(least)) + 1:
+    for i in np.flatnonzero(np.diff(lowest)) + 1:
         if rho[i] < PROGRESS * best:
             best, last = rho[i], i
     idle = len(rho) - 1 - last
-    most = min(max(1.0, idle / (PATIENCE * dim)), MAX_SPREAD)
-    return most ** (number % SPREADS / (SPREADS - 1))
+    maximum = min(max(1.0, idle / (PATIENCE * dim)), MAX_SPREAD)
+    return maximum ** (number % SPREADS / (SPREADS - 1))
 
 
 def _number(value: Float[Array, " m"]) -> Float[Array, " m"]:

@@ -446,17 +446,17 @@ class ErrorTable(InNotebook):
 
     def _memory(self) -> Iterator[tuple[Int[np.ndarray, " n"], Columns]]:
         """Yield numbers and columns of the rows in memory, in blocks."""
-        most = segments.SEGMENT_ROWS
+        maximum = segments.SEGMENT_ROWS
         group: list[Batch] = []
         for first, batch in self._batches:
-            if group and sum(length(each) for _, each in group) + length(batch) > most:
+            if group and sum(length(each) for _, each in group) + length(batch) > maximum:
                 yield row_numbers(group), merge(group)
                 group = []
-            if length(batch) <= most:
+            if length(batch) <= maximum:
                 group.append((first, batch))
                 continue
-            for begin in range(0, length(batch), most):
-                part = cut((first, batch), first + begin, first + begin + most)
+            for begin in range(0, length(batch), maximum):
+                part = cut((first, batch), first + begin, first + begin + maximum)
                 yield row_numbers([part]), part[1]
         if group:
             yield row_numbers(group), merge(group)

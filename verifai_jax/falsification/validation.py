@@ -70,12 +70,12 @@ def usual_batch(
     if not search.learns:
         eighth = 1 << max(0, (int(budget) // 8).bit_length() - 1)
         return max(search.wants.max_batch, min(MAX_AT_ONCE, eighth) if whole else 0)
-    most = (
+    maximum = (
         search.wants.max_batch
         if stop_after is None
         else min(search.wants.max_batch, 16 * stop_after)
     )
-    return min(1 << (most.bit_length() - 1), 1 << max(3, (int(budget) // 20).bit_length() - 1))
+    return min(1 << (maximum.bit_length() - 1), 1 << max(3, (int(budget) // 20).bit_length() - 1))
 
 
 def batch_size(

@@ -114,8 +114,8 @@ def _drawn(
 
     clock = np.asarray(replay.trace.clock())
     seconds = float(clock[-1] - clock[0])
-    rate, most = (FRAMES_PER_SECOND, MAX_FRAMES) if fps is None else (fps, MAX_WANTED)
-    count = max(2, min(most, round(seconds * rate)))
+    rate, maximum = (FRAMES_PER_SECOND, MAX_FRAMES) if fps is None else (fps, MAX_WANTED)
+    count = max(2, min(maximum, round(seconds * rate)))
     samples = np.searchsorted(clock, np.linspace(clock[0], clock[-1], count)).clip(
         max=len(clock) - 1
     )

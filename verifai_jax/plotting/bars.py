@@ -144,8 +144,8 @@ def plot_effects(table: pd.DataFrame, title: str, path: str | Path | None = None
     figure = new_figure(figsize=(5.6, 4.4))
     axes = figure.subplots()
     across, up = table["mu_star"].to_numpy(float), table["sigma"].to_numpy(float)
-    most = 1.12 * max(np.max(across, initial=0), np.max(up, initial=0)) or 1.0
-    axes.plot([0, most], [0, most], color=BOUND, linewidth=0.8, linestyle=":")
+    maximum = 1.12 * max(np.max(across, initial=0), np.max(up, initial=0)) or 1.0
+    axes.plot([0, maximum], [0, maximum], color=BOUND, linewidth=0.8, linestyle=":")
     axes.errorbar(
         across,
         up,
@@ -155,8 +155,8 @@ def plot_effects(table: pd.DataFrame, title: str, path: str | Path | None = None
         ecolor=BOUND,
         elinewidth=0.8,
     )
-    axes.set_xlim(0, most)
-    axes.set_ylim(-0.03 * most, most)
+    axes.set_xlim(0, maximum)
+    axes.set_ylim(-0.03 * maximum, maximum)
     axes.set_xlabel("mean size of the effect on the robustness")
     axes.set_ylabel("standard deviation of the effect\n(interaction or curvature)")
     tidy(axes)

@@ -134,10 +134,10 @@ def _draw_input(axes: Axes, influence: Influence, explained: Explained) -> None:
         axes.legend(fontsize=7, frameon=False, loc="upper right")
     gain = np.nan_to_num(influence.each - explained.rho)
     every = [np.nan_to_num(i.each - explained.rho) for i in explained.influences]
-    most = max((float(g.max(initial=0.0)) for g in every), default=0.0)
+    maximum = max((float(g.max(initial=0.0)) for g in every), default=0.0)
     for span, one in zip(influence.spans or (), gain, strict=False):
-        if most > 0 and one > 0.02 * most:
-            axes.axvspan(*span, color=FAILING, alpha=0.25 * one / most, linewidth=0)
+        if maximum > 0 and one > 0.02 * maximum:
+            axes.axvspan(*span, color=FAILING, alpha=0.25 * one / maximum, linewidth=0)
     axes.set_ylabel(wrap_name(influence.name, 14))
     tidy(axes)
 
@@ -240,5 +240,5 @@ def plot_shrunk(shrunk: Shrunk, path: str | Path | None = None) -> Figure:
     return show_or_save(figure, path)
 
 
-def _short(text: str, most: int = 110) -> str:
-    return text if len(text) <= most else f"{text[: most - 3]}..."
+def _short(text: str, maximum: int = 110) -> str:
+    return text if len(text) <= maximum else f"{text[: maximum - 3]}..."

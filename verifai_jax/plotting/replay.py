@@ -280,7 +280,7 @@ def _name_bounds(axes: Axes, predicates: dict[str, tuple[str, float]], decided: 
     - `decided`: what decided there, for a line above them; empty for nothing.
     """
     ranks = [FAILING, BOUND, SAFE]
-    place = {text: (ranks.index(color), least) for text, (color, least) in predicates.items()}
+    place = {text: (ranks.index(color), lowest) for text, (color, lowest) in predicates.items()}
     ranked = sorted(predicates, key=place.__getitem__)
     named, others = ranked[:MAX_BOUNDS], ranked[MAX_BOUNDS:]
     lines = [(text, predicates[text][0]) for text in named]

@@ -101,8 +101,8 @@ def _draw_safety(axes: Axes, sweep: Sweep) -> None:
         axes.set_axis_off()
         return
     crowded = len(table) > 60
-    least = _least_shown(table, sweep.p)
-    shown = _spread(table, least)
+    lowest = _lowest_shown(table, sweep.p)
+    shown = _spread(table, lowest)
     final = shown.index.isin(last_checkpoints(sweep.table).index)
     for verdict, (colour, marker) in LOOKS.items():
         of_kind = is_safe(table) if verdict == "safe" else (table["verdict"] == verdict).to_numpy()
@@ -136,9 +136,9 @@ def _draw_safety(axes: Axes, sweep: Sweep) -> None:
         zorder=4,
     )
     # Linear up to the least rate, so that none at all has a place; logarithmic from there on.
-    axes.set_yscale("symlog", linthresh=least, linscale=0.6)
-    axes.set_ylim(-0.25 * least, 1.6)
-    ticks = [0.0, *(10.0**k for k in range(-6, 1) if 10.0**k >= least * 0.999)]
+    axes.set_yscale("symlog", linthresh=lowest, linscale=0.6)
+    axes.set_ylim(-0.25 * lowest, 1.6)
+    ticks = [0.0, *(10.0**k for k in range(-6, 1) if 10.0**k >= lowest * 0.999)]
     axes.set_yticks(ticks, [format_percent(tick) for tick in ticks])
     axes.set_yticks([], minor=True)
     if sweep.p is not None:
@@ -178,21 +178,21 @@ def _legend_below(axes: Axes, columns: int) -> None:
     )
 
 
-def _least_shown(table: "pd.DataFrame", wanted: float | None) -> float:
+def _lowest_shown(table: "pd.DataFrame", wanted: float | None) -> float:
     """Return the power of ten below which the axis is linear, less than every positive rate."""
     rates = table["failure_rate"].to_numpy(np.float64)
-    least = min([*rates[rates > 0], 0.01 if wanted is None else wanted])
-    return float(10.0 ** np.floor(np.log10(least)))
+    lowest = min([*rates[rates > 0], 0.01 if wanted is None else wanted])
+    return float(10.0 ** np.floor(np.log10(lowest)))
 
 
-def _spread(table: "pd.DataFrame", least: float) -> "pd.DataFrame":
+def _spread(table: "pd.DataFrame", lowest: float) -> "pd.DataFrame":
     """Shift points that would hide each other a little to the side."""
     shown = table.copy()
     shown["nominal_return"] = shown["nominal_return"].astype(float)
     span = float(np.ptp(shown["nominal_return"])) or 1.0
     cell = list(zip(
         np.round(shown["nominal_return"] / span * 60),
-        np.round(np.log10(np.maximum(shown["failure_rate"].to_numpy(float), least / 3)) * 8),
+        np.round(np.log10(np.maximum(shown["failure_rate"].to_numpy(float), lowest / 3)) * 8),
         strict=True,
     ))  # fmt: skip
     counts: dict[tuple[float, float], int] = {}

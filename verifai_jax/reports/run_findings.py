@@ -223,15 +223,15 @@ def explore(run: Run, view: dict, studies: Studies) -> Section:
     return Section("table", "The table, to look at", tuple(content))
 
 
-def not_claimed_rows(run: Run, most: int = 20) -> Iterable[Child]:
+def not_claimed_rows(run: Run, maximum: int = 20) -> Iterable[Child]:
     """Write rows that violate as simulated, and that closer replays did not let be claimed."""
     rows = run.table.unconfirmed.sort_values("rho")
-    for row_number, row in list(rows.to_dict("index").items())[:most]:
+    for row_number, row in list(rows.to_dict("index").items())[:maximum]:
         again = float(row.get("rho_again", math.nan))
         then = "" if math.isnan(again) else f", {again:z.4g} when simulated again"
         yield f"row {row_number}: {row.get('verdict', '')}, robustness {row['rho']:z.4g}{then}"
-    if len(rows) > most:
-        yield f"and {len(rows) - most:,} more"
+    if len(rows) > maximum:
+        yield f"and {len(rows) - maximum:,} more"
 
 
 def limits(run: Run, studies: Studies, assumptions: list[str]) -> Section:

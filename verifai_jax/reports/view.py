@@ -69,9 +69,9 @@ def view_data(
     features = [*distinguishing_features(run)[:MAX_COLUMNS]]
     features += [name for name in run.table.features if name not in features]
     features = features[:MAX_COLUMNS]
-    most = max(200, min(MAX_ROWS, MAX_CELLS // (len(features) + 1)))
+    maximum = max(200, min(MAX_ROWS, MAX_CELLS // (len(features) + 1)))
     numbers = table.index.to_numpy()
-    places = _thinned(group, most, np.flatnonzero(np.isin(numbers, list(traces))))
+    places = _thinned(group, maximum, np.flatnonzero(np.isin(numbers, list(traces))))
     shown = table.iloc[places]
     described = [_column("robustness", shown["rho"])]
     described += [_column(name, shown[name]) for name in features]
@@ -99,13 +99,13 @@ def view_data(
 
 
 def _thinned(
-    group: Int[np.ndarray, " n"], most: int, kept: Int[np.ndarray, " k"]
+    group: Int[np.ndarray, " n"], maximum: int, kept: Int[np.ndarray, " k"]
 ) -> Int[np.ndarray, " shown"]:
     """Return places of rows, evenly spread over each verdict, the graver ones first."""
-    chosen, left = [kept], most - len(kept)
+    chosen, left = [kept], maximum - len(kept)
     for verdict in reversed(range(len(GROUPS))):
         places = np.flatnonzero(group == verdict)
-        count = min(len(places), left, GROUPS[verdict][2] * most // MAX_ROWS)
+        count = min(len(places), left, GROUPS[verdict][2] * maximum // MAX_ROWS)
         if count:
             spread = np.linspace(0, len(places) - 1, count).astype(int)
             chosen.append(places[np.unique(spread)])
@@ -186,7 +186,7 @@ def trace_data(replay: Replay, label: str = "") -> dict[str, Any]:
     }
 
 
-def rows_to_trace(run: Run, most: int, first: Sequence[int] = ()) -> dict[int, str]:
+def rows_to_trace(run: Run, maximum: int, first: Sequence[int] = ()) -> dict[int, str]:
     """Choose the rows that matter most, with a word on each.
 
     The worst ones that are claimed, those nearest to the bound on either side, those not claimed.
@@ -194,12 +194,12 @@ def rows_to_trace(run: Run, most: int, first: Sequence[int] = ()) -> dict[int, s
     **Arguments:**
 
     - `run`: a run.
-    - `most`: rows at most.
+    - `maximum`: rows at most.
     - `first`: rows that come first, such as the failures that a report shows.
     """
-    chosen = {int(number): f"row {number}: shown above" for number in first[:most]}
+    chosen = {int(number): f"row {number}: shown above" for number in first[:maximum]}
     table = run.table
-    share = max(most // 4, 1)
+    share = max(maximum // 4, 1)
     for words, rows in (
         ("failing, among the worst", table.counterexamples.sort_values("rho")),
         ("failing, near the bound", table.counterexamples.sort_values("rho", ascending=False)),
@@ -208,6 +208,6 @@ def rows_to_trace(run: Run, most: int, first: Sequence[int] = ()) -> dict[int, s
         ("safe, far from the bound", table.safe.sort_values("rho", ascending=False)),
     ):
         new = [int(number) for number in rows.index if int(number) not in chosen][:share]
-        for number in new[: max(most - len(chosen), 0)]:
+        for number in new[: max(maximum - len(chosen), 0)]:
             chosen[number] = f"row {number}: {words}"
     return chosen

@@ -159,10 +159,10 @@ class BatchedTraining:
             lane = self._lanes.get(number)
             place = (self._structures[number], lane.done if lane else 0, until)
             groups.setdefault(place, []).append(number)
-        most = len(self.devices) * self.per_device
+        maximum = len(self.devices) * self.per_device
         for (structure, done, until), numbers in groups.items():
-            for start in range(0, len(numbers), most):
-                part = numbers[start : start + most]
+            for start in range(0, len(numbers), maximum):
+                part = numbers[start : start + maximum]
                 self._advance(structure, part, done, until)
                 yield from part
 

@@ -161,7 +161,7 @@ def sees_all_around(x: Any, y: Any, radius: Any, box: Rectangle) -> Bool[Array, 
     for normal in (below * step, (below + 1) * step):
         local = normal - box.heading
         cos, sin = jnp.cos(local), jnp.sin(local)
-        least = right * cos + forward * sin
-        least = least - box.half_width * jnp.abs(cos) - box.half_length * jnp.abs(sin)
-        apart = apart | (least > radius * math.cos(step / 2))
+        lowest = right * cos + forward * sin
+        lowest = lowest - box.half_width * jnp.abs(cos) - box.half_length * jnp.abs(sin)
+        apart = apart | (lowest > radius * math.cos(step / 2))
     return ~apart

@@ -41,7 +41,7 @@ def shortest(
 
 def shortest_in_box(
     rows: Float[np.ndarray, "m k"],
-    most: Float[np.ndarray, " m"],
+    maximum: Float[np.ndarray, " m"],
     low: Float[np.ndarray, " k"],
     high: Float[np.ndarray, " k"],
 ) -> Float[np.ndarray, " k"] | None:
@@ -49,22 +49,22 @@ def shortest_in_box(
 
     **Arguments:**
 
-    - `rows`, `most`: linear inequalities; rows of zeros are left out.
+    - `rows`, `maximum`: linear inequalities; rows of zeros are left out.
     - `low`, `high`: the box.
 
     **Returns:** the vector; None where there is none.
     """
     sizes = np.linalg.norm(rows, axis=1)
-    rows, most, sizes = rows[sizes > 0], most[sizes > 0], sizes[sizes > 0]
+    rows, maximum, sizes = rows[sizes > 0], maximum[sizes > 0], sizes[sizes > 0]
     identity = np.eye(rows.shape[1])
     z = shortest(
         np.concatenate([-rows / sizes[:, None], identity, -identity]),
-        np.concatenate([-most / sizes, low, -high]),
+        np.concatenate([-maximum / sizes, low, -high]),
     )
     return None if z is None else np.clip(z, low, high)
 
 
-def least_change(
+def smallest_change(
     theta: Float[np.ndarray, " p"],
     nominal: Float[np.ndarray, " p"],
     rho: Float[np.ndarray, " n"],

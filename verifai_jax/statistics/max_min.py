@@ -46,11 +46,11 @@ def max_min_step(
 
     # In units of the radius and of the largest derivative, which a solver's tolerances suit.
     scale = np.abs(linear).max() * radius
-    least = rho[rows].min()
+    lowest = rho[rows].min()
     solution = linprog(
         np.append(np.zeros(len(places)), -1.0),
         A_ub=np.hstack([-linear * radius / scale, np.ones((len(rows), 1))]),
-        b_ub=(rho[rows] - least) / scale,
+        b_ub=(rho[rows] - lowest) / scale,
         bounds=[*zip(low / radius, high / radius, strict=True), (None, None)],
     )
     if solution.status == 0:

@@ -49,8 +49,8 @@ def _fronts_of_distinct(points: Float[np.ndarray, "n objectives"]) -> Int[np.nda
         for begin in range(0, len(left), together):
             part = some[begin : begin + together]
             # Distinct points: nowhere worse means somewhere better, but for the point itself.
-            least = (some[None] <= part[:, None]).all(axis=2).sum(axis=1)
-            dominated[begin : begin + together] = least > 1
+            lowest = (some[None] <= part[:, None]).all(axis=2).sum(axis=1)
+            dominated[begin : begin + together] = lowest > 1
         numbers[left[~dominated]] = front
         left, front = left[dominated], front + 1
     return numbers

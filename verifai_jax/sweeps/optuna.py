@@ -111,10 +111,10 @@ class OptunaProposer:
             optuna.logging.set_verbosity(before)
         self._trials: list[Trial] = []
 
-    def propose(self, most: int) -> list[Hyperparameters]:
+    def propose(self, maximum: int) -> list[Hyperparameters]:
         """Return the next configurations; see `Proposer`."""
         self._trials, proposals, refused = [], [], 0
-        while len(proposals) < min(most, self.batch) and refused < _MAX_REFUSED:
+        while len(proposals) < min(maximum, self.batch) and refused < _MAX_REFUSED:
             trial = self._study.ask(self._distributions)
             values, accepted = _values(self.space, trial.params)
             if accepted:

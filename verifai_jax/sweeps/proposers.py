@@ -41,8 +41,8 @@ class Proposer(Protocol):
     learns: bool
     batch: int
 
-    def propose(self, most: int) -> list[Hyperparameters]:
-        """Return the next configurations, at most `most` and `batch`; none at the end."""
+    def propose(self, maximum: int) -> list[Hyperparameters]:
+        """Return the next configurations, at most `maximum` and `batch`; none at the end."""
         ...
 
     def observe(self, objectives: Sequence[float | None]) -> None:
@@ -111,15 +111,15 @@ class SearchProposer:
         self._proposals = Proposals(search, space.cube, batch, run_keys(seed)[0], space.constraint)
         self._count = 0
 
-    def propose(self, most: int) -> list[Hyperparameters]:
+    def propose(self, maximum: int) -> list[Hyperparameters]:
         """Return the next configurations; see `Proposer`."""
         if self._proposals.exhausted:
             self._count = 0
             return []
-        points = np.asarray(self._proposals.next(min(most, self.batch)))
+        points = np.asarray(self._proposals.next(min(maximum, self.batch)))
         # A search that learns gives whole rounds, also where fewer are wanted at the end.
         self._count = len(points)
-        return values_at(self.space, points)[:most]
+        return values_at(self.space, points)[:maximum]
 
     def observe(self, objectives: Sequence[float | None]) -> None:
         """Record the objectives of the last proposals; see `Proposer`."""

@@ -27,7 +27,7 @@ from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.validation import check_options, usual_batch
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
-from verifai_jax.statistics.least_distance import least_change
+from verifai_jax.statistics.least_distance import smallest_change
 from verifai_jax.statistics.max_min import max_min_step
 from verifai_jax.synthesis._synthesize import (
     ATTACK,
@@ -144,8 +144,8 @@ def repair(
     if stopped != "interrupted" and held_out:
         before, after = _check(loop, start, work.now.theta, held_out, margin, seed, checking)
     robustness = work.robustness
-    if after is not None and after.least is not None:
-        robustness = min(robustness, after.least)
+    if after is not None and after.lowest is not None:
+        robustness = min(robustness, after.lowest)
     theta = work.now.theta
     return Repair(
         name=whole.name,
@@ -267,7 +267,7 @@ class _Repair:
         self.margin, self.seed = margin, seed
         self.rng = np.random.default_rng((seed, 2))
         # An attack that finds nothing costs a tenth of the budget; one that does costs less.
-        self.share = min(ATTACK, max(64, limits.most // 10))
+        self.share = min(ATTACK, max(64, limits.maximum // 10))
         self.batch = min(128, usual_batch(search, self.share))
         self.environments = np.zeros((0, loop.environment.dim), np.float32)
         self.now = Choice(start, np.inf, 0)
@@ -412,7 +412,7 @@ class _Repair:
         self, theta: np.ndarray, rho: np.ndarray, gradients: np.ndarray, radius: float
     ) -> list[np.ndarray]:
         loop = self.loop
-        step = least_change(
+        step = smallest_change(
             theta, self.start, rho, gradients, self.aim, free=loop.free, bounded=loop.bounded
         )
         steps = [] if step is None else [step * share for share in (1.0, 0.5, 0.2, 0.05)]
@@ -433,7 +433,7 @@ class _Repair:
 
     def without_gradients(self, archive: Archive) -> Choice:
         """Search by cross-entropy, over the whole space where nothing is known, then nearer."""
-        limits = self.limits.slice(max(self.limits.most // 8, self.limits.left // 8))
+        limits = self.limits.slice(max(self.limits.maximum // 8, self.limits.left // 8))
         if archive.best(1, self.merit)[0].value < self.enough:
             explore(
                 self.loop, self.environments, archive, limits.slice(limits.left // 2),

@@ -46,16 +46,16 @@ class Attack(NamedTuple):
         """Least robustness with a verdict; infinite if there is none."""
         return float(np.nanmin(self.rho, initial=np.inf))
 
-    def select(self, most: int) -> Float[np.ndarray, "k d"]:
+    def select(self, maximum: int) -> Float[np.ndarray, "k d"]:
         """Select the worst violating environment, and those of the worst half farthest apart."""
         places = np.flatnonzero(self.violating)
         places = places[np.argsort(self.rho[places], kind="stable")]
-        places = places[: max(most, (len(places) + 1) // 2)]
+        places = places[: max(maximum, (len(places) + 1) // 2)]
         points = self.environments[places]
-        if len(points) <= most:
+        if len(points) <= maximum:
             return points
         taken, far = [0], np.linalg.norm(points - points[0], axis=1)
-        while len(taken) < most and far.max() > 0:
+        while len(taken) < maximum and far.max() > 0:
             taken.append(int(np.argmax(far)))
             far = np.minimum(far, np.linalg.norm(points - points[taken[-1]], axis=1))
         return points[taken]
@@ -155,12 +155,12 @@ def _descend(
         pairs = loop.evaluate(theta[None], rows)
         tried.append((rows, pairs))
         rho = np.where(pairs.proper[0], pairs.rho[0], np.inf).reshape(len(points), len(STEPS))
-        least, which = rho.min(axis=1), rho.argmin(axis=1)
-        better = least < best
+        lowest, which = rho.min(axis=1), rho.argmin(axis=1)
+        better = lowest < best
         if not better.any():
             break
         points = np.where(better[:, None], moved[np.arange(len(points)), which], points)
-        best = np.where(better, least, best)
+        best = np.where(better, lowest, best)
     return _join(first, _collect(tried, level, loop))
 
 

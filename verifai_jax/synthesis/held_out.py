@@ -31,7 +31,7 @@ class HeldOut:
     - `short`: simulations that kept it, but by less than the wanted margin.
     - `without_verdict`: simulations that did not end properly; the upper end of the rate's interval
       takes them for failures.
-    - `least` robustness, None without a verdict.
+    - `lowest` robustness, None without a verdict.
     - `rate`: of failures, with its 95 % interval; None without any verdict.
     """
 
@@ -39,7 +39,7 @@ class HeldOut:
     failures: int
     short: int
     without_verdict: int
-    least: float | None
+    lowest: float | None
     rate: Rate | None
 
     @property
@@ -112,7 +112,7 @@ def held_out(
         failures=failures,
         short=int(short.sum()),
         without_verdict=len(rho) - verdicts,
-        least=float(np.min(rho[proper])) if verdicts else None,
+        lowest=float(np.min(rho[proper])) if verdicts else None,
         rate=clopper_pearson(failures, len(rho), undecided=len(rho) - verdicts)
         if verdicts
         else None,

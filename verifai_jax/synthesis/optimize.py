@@ -262,19 +262,19 @@ def cross_entropy(
     best = max(range(len(points)), key=lambda j: merit(points[j], values[j]))
     rho = np.where(pairs.proper[best], pairs.rho[best], np.inf)
     environments = environments[np.argsort(rho, kind="stable")]
-    most, std = max(4, batch // 5), np.full(loop.dim, 0.1)
+    maximum, std = max(4, batch // 5), np.full(loop.dim, 0.1)
     for _ in range(rounds):
         affordable = limits.left // size
         if affordable < MIN_BATCH:
             return
         order = sorted(range(len(points)), key=lambda j: merit(points[j], values[j]), reverse=True)
-        points, values = points[order[:most]], values[order[:most]]
-        if len(points) == most:
+        points, values = points[order[:maximum]], values[order[:maximum]]
+        if len(points) == maximum:
             std = np.clip(1.5 * points.std(axis=0), 1e-4, 0.2)
             if np.all(std[loop.free] == 1e-4) and loop.free.all():
                 return
         count = min(batch, max(MIN_BATCH, affordable // 3))
-        level = merit(points[-1], values[-1]) if len(points) == most else (-np.inf,)
+        level = merit(points[-1], values[-1]) if len(points) == maximum else (-np.inf,)
         parents = points[rng.integers(0, len(points), 4 * count)]
         drawn = parents + std * rng.normal(size=parents.shape)
         # A few anywhere: what was best in the old set need not be near what is in this one.

@@ -143,7 +143,7 @@ class FeatureParameters:
         verdicts = evaluate(rows[happens], 1.0 if temperature is None else temperature)
         self.without_verdict += int(np.sum(~verdicts.proper))
         rho = np.full(k * n, np.inf)
-        rho[happens] = np.where(verdicts.proper, verdicts.least, np.nan)
+        rho[happens] = np.where(verdicts.proper, verdicts.lowest, np.nan)
         failing, proper = np.zeros(k * n, bool), np.ones(k * n, bool)
         failing[happens], proper[happens] = verdicts.violated, verdicts.proper
         slopes: Any = (None, None)
@@ -291,7 +291,7 @@ class ArrayParameters:
             verdicts = engine.evaluate(
                 rows[these], self._key, self.simulations, temperature or 1.0, shared=theta
             )
-            rho[these] = np.where(verdicts.proper, verdicts.least, np.nan)
+            rho[these] = np.where(verdicts.proper, verdicts.lowest, np.nan)
             failing[these], proper[these] = verdicts.violated, verdicts.proper
             if verdicts.gradient is not None:
                 usable = _finite(verdicts.gradient, verdicts.proper)

@@ -96,8 +96,10 @@ class Clusters(Drawn):
                 columns[column.name] = entries.mean().reindex(kinds).to_numpy(np.float64)
             else:
                 codes = column.codes(frame[column.name])
-                most = [np.argmax(np.bincount(codes[self.assigned == c] + 1)) - 1 for c in kinds]
-                choices = [column.choices[i] if i >= 0 else None for i in most]
+                commonest = [
+                    np.argmax(np.bincount(codes[self.assigned == c] + 1)) - 1 for c in kinds
+                ]
+                choices = [column.choices[i] if i >= 0 else None for i in commonest]
                 columns[column.name] = pd.Series(choices, dtype=object).to_numpy()
         return pd.DataFrame(columns, index=pd.Index(kinds, name="cluster"))
 
@@ -164,7 +166,7 @@ def clusters(
     columns: Sequence[str] | None = None,
     which: Which = "counterexamples",
     scale: Scale = "range",
-    most: int = 8,
+    max_clusters: int = 8,
     radius: float | None = None,
     space: Problem | FeatureSpace | None = None,
 ) -> Clusters:
@@ -177,14 +179,14 @@ def clusters(
     - `method`: `"kmeans"` looks at ordered columns only, `"kmodes"` at unordered ones only,
       `"kprototypes"` at both; `"auto"` takes the one that fits the columns. `"dbscan"` looks at
       both, and finds the number of clusters and the noise itself.
-    - `count`: number of clusters; by default that from 2 to `most` with the greatest silhouette
+    - `count`: number of clusters; by default that from 2 to `max_clusters` with the greatest silhouette
       (Rousseeuw, Journal of Computational and Applied Mathematics 20, 1987), or 1 if none is above
       0.25, or there are less than three rows. It is chosen on at most 5000 rows.
     - `radius`: of DBSCAN, by default the knee of the distances to the k-th neighbour, where k is
       twice the number of columns, and 4 at least.
     - `seed`: an integer, a NumPy generator or a `jax.random` key.
     - `scale`: as in `Samples.scaling`.
-    - `most`: clusters at most, where `count` is left out.
+    - `max_clusters`: clusters at most, where `count` is left out.
 
     **Returns:** `Clusters`; the same seed gives the same ones.
 
@@ -213,7 +215,7 @@ def clusters(
     placed = _place(samples, scale, weight)
     different = len(np.unique(np.concatenate(placed, axis=1), axis=0))
     if count is None:
-        count = _best_count(placed, min(check_count("most", most), different), rng)
+        count = _best_count(placed, min(check_count("max_clusters", max_clusters), different), rng)
     elif check_count("count", count) > different:
         raise ValueError(
             f"count must be from 1 to {different}, the number of different rows among "
@@ -242,12 +244,14 @@ def _place(
     return coordinates / np.sqrt(weight), codes
 
 
-def _best_count(placed: tuple[np.ndarray, np.ndarray], most: int, rng: np.random.Generator) -> int:
+def _best_count(
+    placed: tuple[np.ndarray, np.ndarray], max_clusters: int, rng: np.random.Generator
+) -> int:
     """Return the number of clusters with the greatest silhouette, tried on at most 5000 rows."""
     rows = rng.permutation(len(placed[0]))[:_TRIED]
     part = placed[0][rows], placed[1][rows]
     best, reached = 1, MIN_SILHOUETTE
-    for count in range(2, min(most, len(rows) - 1) + 1):
+    for count in range(2, min(max_clusters, len(rows) - 1) + 1):
         # The same rows for each count, so that chance does not decide between them.
         score = _silhouette(part, _partition(part, count, rng), np.random.default_rng(0))
         if score > reached:

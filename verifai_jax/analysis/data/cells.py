@@ -67,11 +67,13 @@ def count_occupied(
     **Returns:** a table with a row for each feature, a table of the values and pairs of values that
     were never tried (1000 at most), and their number.
     """
-    most = min(len(rows), MAX_FEATURES)
+    maximum = min(len(rows), MAX_FEATURES)
     counts = np.array([len(cells.prior) for cells in rows])
-    edges = np.concatenate([[0], np.cumsum(counts[:most])])
-    together = pair_counts(_ids(rows[:most]), counts[:most])
-    possible = together if allowed is None else pair_counts(_ids(allowed[:most]), counts[:most])
+    edges = np.concatenate([[0], np.cumsum(counts[:maximum])])
+    together = pair_counts(_ids(rows[:maximum]), counts[:maximum])
+    possible = (
+        together if allowed is None else pair_counts(_ids(allowed[:maximum]), counts[:maximum])
+    )
     table = np.full((len(rows), len(_COLUMNS)), np.nan)
     untried: list[tuple[Any, ...]] = []
     missing = 0
@@ -85,8 +87,8 @@ def count_occupied(
             missing += len(never)
             untried += [(one.name, one.marginal.shown(int(cell)), "", "") for cell in never]
         shares = []
-        for j, other in enumerate(rows[:most]):
-            if i == j or i >= most:
+        for j, other in enumerate(rows[:maximum]):
+            if i == j or i >= maximum:
                 continue
             block = np.s_[edges[i] : edges[i + 1], edges[j] : edges[j + 1]]
             both = together[block] > 0

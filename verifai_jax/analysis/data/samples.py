@@ -381,6 +381,8 @@ def _has_absent(entries: pd.Series | pd.DataFrame) -> bool:
     return bool(entries.isna().any())
 
 
-def _listed(names: Sequence[str], most: int = 8) -> str:
-    shown = ", ".join(names[:most]) + (f", and {len(names) - most} more" if names[most:] else "")
+def _listed(names: Sequence[str], maximum: int = 8) -> str:
+    shown = ", ".join(names[:maximum]) + (
+        f", and {len(names) - maximum} more" if names[maximum:] else ""
+    )
     return shown or "none"

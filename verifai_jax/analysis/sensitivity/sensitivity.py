@@ -91,7 +91,7 @@ class Simulator:
         """Robustness `[n]`, NaN without a verdict; row `i` has the random key `first + i`."""
         verdicts = self._evaluate(u, temperature, first)
         self.gradients.append(verdicts.gradient)
-        rho = verdicts.least if self.column is None else verdicts.rho[:, self.column]
+        rho = verdicts.lowest if self.column is None else verdicts.rho[:, self.column]
         rho = rho.astype(np.float64)
         rho[~np.isfinite(rho)] = np.nan
         self.done += len(rho)

@@ -202,8 +202,8 @@ def _first_moment(
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), action)
     delays = episode.delays
     lines = (
-        Line.of(first.observation, delays.most_observation),
-        Line.of(nothing, delays.most_action),
+        Line.of(first.observation, delays.max_observation),
+        Line.of(nothing, delays.max_action),
     )
     return first, memory, lines
 

@@ -187,7 +187,7 @@ class Loop:
             in_working_precision(self.controller_memory),
             jnp.int32(0),
             jnp.array(True),
-            Line.of(self.rest(), self.delay.most),
+            Line.of(self.rest(), self.delay.max_steps),
         )
 
     def rest(self) -> Float[Array, " nu"]:

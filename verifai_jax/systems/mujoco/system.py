@@ -97,7 +97,9 @@ class MuJoCo(System):
 
     def why_error(self, features: Features) -> str | None:
         """Return what is wrong with the delay of a simulation that ended with `ERROR`, if it is."""
-        return self.loop.delay.refusal(features, "this system") if self.loop.delay.most else None
+        return (
+            self.loop.delay.refusal(features, "this system") if self.loop.delay.max_steps else None
+        )
 
     @property
     def likely(self) -> str:
@@ -292,7 +294,7 @@ def mujoco(
             if isinstance(path, str) and path.startswith("contact/")
         )
     delay = as_delay(action_delay, "action_delay")
-    if delay.most and controller is None:
+    if delay.max_steps and controller is None:
         raise ValueError("action_delay needs a controller; got none")
     loaded = load(
         model,

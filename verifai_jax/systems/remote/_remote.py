@@ -153,8 +153,8 @@ def remote(
     signals: SignalNames | None = None,
     dt: float | None = None,
     length: int | None = None,
-    most_bytes: int = MAX_BYTES,
-    most_memory: int = MAX_MEMORY,
+    max_bytes: int = MAX_BYTES,
+    max_memory: int = MAX_MEMORY,
 ) -> Remote:
     """Make a system that programs simulate which connect to this one.
 
@@ -175,8 +175,8 @@ def remote(
       status `error`; waits, and says so in the log, when left out.
     - `signals`, `dt`, `length`: the form of every trace; see `blackbox.TraceForm`. A client that
       sends another gets an error, and the row has status `error`.
-    - `most_bytes`: of one message from a client.
-    - `most_memory`: bytes of unfinished messages of all clients together, at least `most_bytes`;
+    - `max_bytes`: of one message from a client.
+    - `max_memory`: bytes of unfinished messages of all clients together, at least `max_bytes`;
       beyond it the client whose message began first is sent away, and may come back.
 
     **Returns:** a `Remote`, which listens once it is needed, or in a `with` statement.
@@ -195,11 +195,11 @@ def remote(
         if value is not None and not (isinstance(value, int | float) and value > 0):
             raise ValueError(f"{name} must be a positive number of seconds; got {value!r}")
     check_count("retries", retries, 0)
-    if not isinstance(most_bytes, int) or not 1024 <= most_bytes < 2**31:
-        raise ValueError(f"most_bytes must be an integer from 1024 to 2**31 - 1; got {most_bytes}")
-    if not isinstance(most_memory, int) or most_memory < most_bytes:
+    if not isinstance(max_bytes, int) or not 1024 <= max_bytes < 2**31:
+        raise ValueError(f"max_bytes must be an integer from 1024 to 2**31 - 1; got {max_bytes}")
+    if not isinstance(max_memory, int) or max_memory < max_bytes:
         raise ValueError(
-            f"most_memory must be an integer of at least most_bytes={most_bytes}; got {most_memory}"
+            f"max_memory must be an integer of at least max_bytes={max_bytes}; got {max_memory}"
         )
     if token is None and not all(_is_loopback(place[4][0]) for place in _places(host, port)):
         raise ValueError(
@@ -210,7 +210,7 @@ def remote(
         raise ValueError("private_key belongs to a certificate: give certificate='...', too")
     tls = None if certificate is None else server_context(certificate, private_key)
     declared = TraceForm(signals, dt, length)
-    rules = Rules(token, timeout, retries, patience, most_bytes, declared, most_memory, tls)
+    rules = Rules(token, timeout, retries, patience, max_bytes, declared, max_memory, tls)
     return Remote(host, port, rules)
 
 

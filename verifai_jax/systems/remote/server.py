@@ -191,12 +191,12 @@ class Server(threading.Thread):
 
     def _bound_memory(self) -> None:
         """Send away whoever keeps a message unfinished longest while all hold too much."""
-        while sum(client.held for client in self.clients) > self.rules.most_memory:
+        while sum(client.held for client in self.clients) > self.rules.max_memory:
             client = min(self.clients, key=lambda client: (client.began, -client.held))
             # It may be as honest as the others, so its points have lost nothing but time.
             self.waiting.extendleft(reversed(client.has.values()))
             client.has.clear()
-            why = f"messages of all clients hold more than {self.rules.most_memory} bytes"
+            why = f"messages of all clients hold more than {self.rules.max_memory} bytes"
             if client.leaving or len(client.out) > MAX_UNREAD:
                 self._drop(client, f"was dropped: {why}")
             else:
@@ -381,7 +381,7 @@ class Server(threading.Thread):
     def _free(self) -> list[Client]:
         return [client for client in self.clients if client.here and client.room > 0]
 
-    def _hand(self, client: Client, points: deque[Point], most: int) -> bool:
+    def _hand(self, client: Client, points: deque[Point], maximum: int) -> bool:
         """Hand points to a client; return whether any left the queue.
 
         What it has simulated before is left to another one, where there is one: a simulation that
@@ -391,7 +391,7 @@ class Server(threading.Thread):
             other.here and other is not client for other in self.clients
         )
         handed, left, before = [], [], len(points)
-        while points and len(handed) < most:
+        while points and len(handed) < maximum:
             point = points.popleft()
             if point.batch.cancelled:
                 continue
