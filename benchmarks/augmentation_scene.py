@@ -64,8 +64,8 @@ def scene(features, distance):
     """Return the scene with the nearest cone at a distance from the camera."""
     there = features["present"]
     at = features["hue"] * (len(HUES) - 1)
-    place = jnp.clip(jnp.floor(at), 0, len(HUES) - 2).astype(int)
-    colour = HUES[place] + (HUES[place + 1] - HUES[place]) * (at - place)
+    index = jnp.clip(jnp.floor(at), 0, len(HUES) - 2).astype(int)
+    colour = HUES[index] + (HUES[index + 1] - HUES[index]) * (at - index)
     cones = tuple(
         Cone(
             (

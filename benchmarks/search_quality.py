@@ -92,8 +92,8 @@ def first_failures(search, landscape, batch, seeds):
         number = done[:, None] + np.cumsum(costs > 0, axis=1)
         price = spent[:, None] + np.cumsum(costs, axis=1)
         found = failing.any(axis=1) & np.isinf(first)
-        place = failing.argmax(axis=1)[found]
-        first[found], doubled[found] = number[found, place], price[found, place]
+        index = failing.argmax(axis=1)[found]
+        first[found], doubled[found] = number[found, index], price[found, index]
         done, spent = number[:, -1], price[:, -1]
     return first, doubled
 

@@ -22,7 +22,7 @@ from envs.cones import (
     LENGTH,
     NOTHING,
     Pose,
-    cone_places,
+    cone_positions,
     feature,
     render,
 )
@@ -113,13 +113,13 @@ def _draw_plan(
     for edge in (low, high):
         axes.plot([-BEHIND, AHEAD], [edge, edge], color=PAINT, linewidth=1)
     axes.plot([-BEHIND, AHEAD], [LANE / 2] * 2, color=PAINT, linewidth=1, dashes=(4, 4))
-    places = np.asarray(cone_places(features))
+    positions = np.asarray(cone_positions(features))
     hue, value = (float(feature(features, name)) for name in ("car_hue", "car_value"))
-    x = float(places[-1, 0]) + float(feature(features, "car_gap")) + LENGTH / 2
+    x = float(positions[-1, 0]) + float(feature(features, "car_gap")) + LENGTH / 2
     parked = x, float(feature(features, "car_offset")), float(feature(features, "car_yaw"))
     axes.add_patch(Polygon(_outline(*parked), color=hsv_to_rgb((hue, 0.85, value))))
-    for place in places:
-        axes.add_patch(Circle(tuple(place), 1.6 * CONE_RADIUS, color=PLASTIC, zorder=4))
+    for position in positions:
+        axes.add_patch(Circle(tuple(position), 1.6 * CONE_RADIUS, color=PLASTIC, zorder=4))
     past = slice(0, sample + 1)
     axes.plot(np.asarray(trace["x"])[past], np.asarray(trace["offset"])[past], color="#f2c14e")
     color = BROKEN if now["cone_gap"] < 0.1 else FINE

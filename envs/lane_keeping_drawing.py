@@ -32,7 +32,7 @@ def draw(axes: Any, trace: Trace, sample: int, features: Mapping[str, Any]) -> N
     past = slice(0, sample + 1)
     distance, offset = (np.asarray(trace[name])[past] for name in ("distance", "offset"))
     near = distance >= road.first
-    axes.plot(*road.place(distance[near], offset[near]), color=TRAIL, linewidth=1.6)
+    axes.plot(*road.position(distance[near], offset[near]), color=TRAIL, linewidth=1.6)
 
     over = min(now["left"], now["right"]) < 0
     color = BROKEN if over else FINE
@@ -72,7 +72,7 @@ class _Road:
         self.x = x - np.interp(here, self.distance, x)
         self.y = y - np.interp(here, self.distance, y)
 
-    def place(self, distance: Any, offset: Any) -> tuple[np.ndarray, np.ndarray]:
+    def position(self, distance: Any, offset: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return points of the plane at distances along the road and offsets to its left."""
         x, y, direction = (
             np.interp(distance, self.distance, values)
@@ -86,7 +86,7 @@ class _Road:
         """Draw a line beside the road's middle."""
         first = self.first if begin is None else begin
         last = self.last if end is None else end
-        return self.place(np.linspace(first, last, 60), offset)
+        return self.position(np.linspace(first, last, 60), offset)
 
     def band(self, right: float, left: float, color: str) -> Any:
         """Fill the surface between two offsets."""

@@ -473,7 +473,7 @@ def encoded(number: int, result: object) -> bytes:
     raw: list[bytes] = []
     at = 0
 
-    def place(name: str, value: object) -> dict[str, Any]:
+    def packed(name: str, value: object) -> dict[str, Any]:
         nonlocal at
         array = _with_gaps(value)
         if array.dtype.kind not in "biuf":
@@ -488,11 +488,11 @@ def encoded(number: int, result: object) -> bytes:
         return {"$array": kind, "shape": array.shape, "at": at - len(raw[-1])}
 
     header: dict[str, Any] = {"type": "result", "id": number}
-    header["signals"] = {str(name): place(f"signal {name!r}", v) for name, v in signals.items()}
+    header["signals"] = {str(name): packed(f"signal {name!r}", v) for name, v in signals.items()}
     if about["dt"] is not None:
         header["dt"] = float(about["dt"])
     if about["times"] is not None:
-        header["times"] = place("times", about["times"])
+        header["times"] = packed("times", about["times"])
     if about["valid"] is not None:
         header["valid"] = int(about["valid"])
     return b"".join((_framed({**header, "bytes": at}), *raw))
@@ -519,20 +519,20 @@ def function_of(text: str) -> Callable[..., Any]:
 
     **Raises:** `ValueError` where there is none.
     """
-    place, _, name = text.rpartition(":")
-    if place.endswith(".py"):
-        spec = importlib.util.spec_from_file_location(Path(place).stem, place)
-        if spec is None or spec.loader is None or not Path(place).exists():
-            raise ValueError(f"no file {place}")
+    path, _, name = text.rpartition(":")
+    if path.endswith(".py"):
+        spec = importlib.util.spec_from_file_location(Path(path).stem, path)
+        if spec is None or spec.loader is None or not Path(path).exists():
+            raise ValueError(f"no file {path}")
         module = importlib.util.module_from_spec(spec)
         sys.modules[spec.name] = module
         spec.loader.exec_module(module)
-    elif place:
-        module = importlib.import_module(place)
+    elif path:
+        module = importlib.import_module(path)
     else:
         raise ValueError(f"a simulator is MODULE:FUNCTION or FILE.py:FUNCTION; got {text!r}")
     if not callable(getattr(module, name, None)):
-        raise ValueError(f"{place} has no function {name!r}")
+        raise ValueError(f"{path} has no function {name!r}")
     return getattr(module, name)
 
 
@@ -554,7 +554,7 @@ def main(arguments: list[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     # Run by its path, the folder of this file would hide modules of other names: `trace`, `search`.
     here = str(Path(__file__).parent)
-    sys.path[:] = [os.getcwd(), *(place for place in sys.path if place not in ("", here))]
+    sys.path[:] = [os.getcwd(), *(path for path in sys.path if path not in ("", here))]
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     try:
         host, port = address_of(given.address)

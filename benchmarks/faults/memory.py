@@ -64,14 +64,14 @@ def soak(seconds: float) -> Report:
     watcher = threading.Thread(target=watch, daemon=True)
     begun = time.monotonic()
     watcher.start()
-    with tempfile.TemporaryDirectory() as place:
+    with tempfile.TemporaryDirectory() as root:
         run = vj.falsify(
             problem,
             "cross_entropy",
             1_000_000_000,
             batch=256,
             max_seconds=seconds,
-            folder=Path(place) / "run",
+            folder=Path(root) / "run",
             progress=False,
         )
         ended.set()

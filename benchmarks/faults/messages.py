@@ -125,9 +125,9 @@ def _messages(random_: random.Random) -> Iterator[bytes]:
     for _ in range(random_.randrange(1, 5)):
         data = _message(random_)
         if random_.random() < 0.3:
-            place = random_.randrange(len(data) + 1)
+            index = random_.randrange(len(data) + 1)
             junk = random_.randbytes(random_.randrange(1, 9))
-            data = random_.choice((data[:place], data[:place] + junk + data[place:]))
+            data = random_.choice((data[:index], data[:index] + junk + data[index:]))
         yield data
 
 

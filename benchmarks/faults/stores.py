@@ -47,8 +47,8 @@ def case(number: int) -> str:
     """Damage a sweep's folder, and use it. **Returns:** what came of it."""
     random_ = chance(number, "stores")
     expected = _table()
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(place) / "sweep"
+    with tempfile.TemporaryDirectory() as root:
+        folder = Path(root) / "sweep"
         shutil.copytree(_base(), folder)
         for _ in range(random_.choice((1, 1, 1, 2, 3))):
             damage(folder, random_)

@@ -105,8 +105,8 @@ def _flown(start: Plane, mode: Int[Array, ""], dt: Any) -> Plane:
     # stages that are written out.
     def stage(carry: Any, weights: Any) -> Any:
         rate, total = carry
-        place, share = weights
-        rate = _moved(start, rate, place)
+        position, share = weights
+        rate = _moved(start, rate, position)
         rate = slope(rate, reference(rate, mode))
         return (rate, _moved(total, rate, share)), None
 

@@ -60,15 +60,20 @@ class Body:
         """Return the middles of the discs."""
         sin, cos = sin_cos(pose.heading)
         cell = self.length / self.discs
-        places = [self.ahead - self.length / 2 + (i + 0.5) * cell for i in range(self.discs)]
-        return [(pose.x + place * cos, pose.y + place * sin) for place in places]
+        positions = [self.ahead - self.length / 2 + (i + 0.5) * cell for i in range(self.discs)]
+        return [(pose.x + position * cos, pose.y + position * sin) for position in positions]
 
     def corners(self, pose: Pose) -> list[tuple[Scalar, Scalar]]:
         """Return the corners, anticlockwise from the front on the right."""
         sin, cos = sin_cos(pose.heading)
         half = self.width / 2
-        places = [(self.front, -half), (self.front, half), (-self.rear, half), (-self.rear, -half)]
-        return [(pose.x + a * cos - b * sin, pose.y + a * sin + b * cos) for a, b in places]
+        positions = [
+            (self.front, -half),
+            (self.front, half),
+            (-self.rear, half),
+            (-self.rear, -half),
+        ]
+        return [(pose.x + a * cos - b * sin, pose.y + a * sin + b * cos) for a, b in positions]
 
 
 CAR = Body(4.7, 1.85)

@@ -26,8 +26,8 @@ class Car(NamedTuple):
 
     def pose(self, path: Path) -> Pose:
         """Return where it is in the plane."""
-        place = path.pose(self.distance, self.offset)
-        return Pose(place.x, place.y, place.heading + self.heading)
+        position = path.pose(self.distance, self.offset)
+        return Pose(position.x, position.y, position.heading + self.heading)
 
 
 def bicycle(

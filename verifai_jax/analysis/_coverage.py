@@ -155,10 +155,10 @@ def coverage(source: Source, *, cells: int = 10, seed: int = 0) -> Coverage:
         else:
             among, other = np.array_split(_units(allowed, ordered), 2)
             others = [other[: len(points)]]
-        dispersion, place = largest_hole(points, ordered, seed, among)
+        dispersion, centre = largest_hole(points, ordered, seed, among)
         uniform = float(np.mean([largest_hole(p, ordered, seed, among)[0] for p in others]))
         hole = {
-            part.column.name: part.value(float(u)) for part, u in zip(ordered, place, strict=True)
+            part.column.name: part.value(float(u)) for part, u in zip(ordered, centre, strict=True)
         }
     return Coverage(
         table=table,

@@ -103,8 +103,8 @@ class FrequentPatterns(Drawn):
                 "share": counts / len(self.samples),
             }
         )
-        places = {item.column: i for i, item in reversed(list(enumerate(self.items)))}
-        order = np.lexsort((-counts, [places[item.column] for item in self.items]))
+        order_of = {item.column: i for i, item in reversed(list(enumerate(self.items)))}
+        order = np.lexsort((-counts, [order_of[item.column] for item in self.items]))
         return table.iloc[order].reset_index(drop=True)
 
     @cached_property
@@ -113,16 +113,16 @@ class FrequentPatterns(Drawn):
         first = self.values.drop_duplicates("column")
         return dict(zip(first["column"], first["value"], strict=True))
 
-    def rows(self, place: int) -> Int[np.ndarray, " count"]:
-        """Return the row numbers that the combination in row `place` of `table` covers.
+    def rows(self, index: int) -> Int[np.ndarray, " count"]:
+        """Return the row numbers that the combination in row `index` of `table` covers.
 
         **Raises:** `IndexError` for a place that is not in the table.
         """
-        if not 0 <= place < len(self.combinations):
+        if not 0 <= index < len(self.combinations):
             raise IndexError(
-                f"combination {place} is not among the {len(self.combinations)} in the table"
+                f"combination {index} is not among the {len(self.combinations)} in the table"
             )
-        return self.samples.rows[self._present[list(self.combinations[place])].all(axis=0)]
+        return self.samples.rows[self._present[list(self.combinations[index])].all(axis=0)]
 
     def __str__(self) -> str:
         sizes = [len(one) for one in self.combinations]
@@ -294,12 +294,12 @@ def _items(
             labels, codes, prior = _cells(column, entries.to_numpy(np.float64), bins or 1)
         else:
             labels, codes, prior = column.choices, column.codes(entries), column.prior
-        for place, label in enumerate(labels):
+        for index, label in enumerate(labels):
             text = f"{column.name}={label}"
             if column.ordered and isinstance(label, str):
                 text = f"{column.name} in {label}"
-            items.append(Item(column.name, label, text, prior[place] if prior else None))
-            present.append(codes == place)
+            items.append(Item(column.name, label, text, prior[index] if prior else None))
+            present.append(codes == index)
     return tuple(items), np.array(present).reshape(len(items), len(frame))
 
 

@@ -86,9 +86,9 @@ class Components(Drawn, InNotebook):
     @cached_property
     def table(self) -> pd.DataFrame:
         """A row for each component: its loadings, its deviation and its share of the variance."""
-        place = pd.RangeIndex(1, len(self.directions) + 1, name="component")
-        table = pd.DataFrame(self.directions, index=place, columns=list(self.names))
-        own = pd.DataFrame({"deviation": self.deviations, "share": self.shares}, index=place)
+        index = pd.RangeIndex(1, len(self.directions) + 1, name="component")
+        table = pd.DataFrame(self.directions, index=index, columns=list(self.names))
+        own = pd.DataFrame({"deviation": self.deviations, "share": self.shares}, index=index)
         return beside(table, own)
 
     def project(self, rows: pd.DataFrame | Sequence[int] | None = None) -> pd.DataFrame:

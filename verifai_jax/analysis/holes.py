@@ -71,8 +71,8 @@ def largest_hole(
             squares = own[:, None] + np.sum(block**2, axis=1) - 2 * single @ block.T
             nearest = np.minimum(nearest, squares.min(axis=1))
         distance = np.sqrt(np.maximum(nearest, 0))
-    place = int(np.argmax(distance))
-    return float(distance[place]), probes[place]
+    index = int(np.argmax(distance))
+    return float(distance[index]), probes[index]
 
 
 def uniform_points(

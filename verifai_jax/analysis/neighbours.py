@@ -96,7 +96,7 @@ def k_closest(
     samples = Samples.of(source, which, columns, space)
     n = len(samples)
     k = n if k is None else min(check_count("k", k), n)
-    rows = samples.place(scale)
+    rows = samples.embed(scale)
     centre = tightest(*rows, k) if k < n else _middle(rows)
     far = distances(rows, (rows[0][centre], rows[1][centre]))
     # The centre comes first, also among rows that equal it.
@@ -147,8 +147,8 @@ def nearest(
         check_names("feature", samples.names, map(str, values))
         frame = pd.DataFrame([{name: values[name] for name in samples.names}])
         what = "the point"
-    coordinates, codes = samples.place(scale, frame)
-    far = distances(samples.place(scale), (coordinates[0], codes[0]))
+    coordinates, codes = samples.embed(scale, frame)
+    far = distances(samples.embed(scale), (coordinates[0], codes[0]))
     group = np.argsort(far, kind="stable")[:k]
     centre = int(point) if isinstance(point, int | np.integer) else None
     return Neighbours(

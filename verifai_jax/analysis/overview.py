@@ -108,11 +108,11 @@ class Analysis(Drawn):
 
         **Raises:** `FileExistsError` where the folder's name is that of a file.
         """
-        place = Path(folder)
-        place.mkdir(parents=True, exist_ok=True)
+        path = Path(folder)
+        path.mkdir(parents=True, exist_ok=True)
         lines = [f"# {html.escape(one_line(self.name))}", ""]
         if self.samples is not None:
-            self.plot(place / "overview.png")
+            self.plot(path / "overview.png")
             lines += ["![overview](overview.png)", ""]
         for part in self.parts:
             # Names of features and values are text of others: nothing in it ends the block.
@@ -120,9 +120,9 @@ class Analysis(Drawn):
             fence = "`" * max(3, 1 + max(map(len, re.findall("`+", words)), default=0))
             lines += [f"## {part.title}", "", f"{fence}text", words, fence, ""]
             if hasattr(part.result, "plot"):
-                part.result.plot(place / f"{part.name}.png")
+                part.result.plot(path / f"{part.name}.png")
                 lines += [f"![{part.title.lower()}]({part.name}.png)", ""]
-        report = place / "report.md"
+        report = path / "report.md"
         with replacing(report) as partial:
             partial.write_text("\n".join(lines))
         return report
@@ -214,13 +214,13 @@ def _describe_failures(source: object, samples: Samples) -> str:
             else f"failure rate not given: {why_no_rate(source)}"
         )
     if np.isfinite(samples.rho).any():
-        place = samples.worst
-        row = samples.frame.iloc[place]
+        index = samples.worst
+        row = samples.frame.iloc[index]
         where = format_features({name: row[name] for name in samples.names[:MAX_NAMED]})
         more = ", ..." if len(samples.names) > MAX_NAMED else ""
         lines.append(
-            f"{'worst' if failures else 'nearest'}: row {samples.rows[place]}, "
-            f"robustness {samples.rho[place]:z.4g} at {where}{more}"
+            f"{'worst' if failures else 'nearest'}: row {samples.rows[index]}, "
+            f"robustness {samples.rho[index]:z.4g} at {where}{more}"
         )
     return "\n".join(lines)
 

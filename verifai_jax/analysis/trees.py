@@ -89,9 +89,9 @@ def _encoded(
         columns.append(np.where(present, ranks[np.maximum(codes[:, j], 0)], -1).astype(float))
         meanings.append((j, ranks))
         if count <= MAX_ONE_HOT:
-            for place in range(count):
-                columns.append((codes[:, j] == place).astype(float))
-                meanings.append((j, (np.arange(count) == place).astype(int)))
+            for index in range(count):
+                columns.append((codes[:, j] == index).astype(float))
+                meanings.append((j, (np.arange(count) == index).astype(int)))
     return np.stack(columns, axis=1) if columns else values, meanings
 
 

@@ -42,10 +42,10 @@ class Examples:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def take(self, places: Any) -> "Examples":
+    def take(self, indices: Any) -> "Examples":
         """Return the examples at these places, in this order."""
-        inputs, labels = jax.tree.map(lambda leaf: leaf[places], (self.inputs, self.labels))
-        return Examples(self.rows.iloc[places].reset_index(drop=True), inputs, labels)
+        inputs, labels = jax.tree.map(lambda leaf: leaf[indices], (self.inputs, self.labels))
+        return Examples(self.rows.iloc[indices].reset_index(drop=True), inputs, labels)
 
     def join(self, other: "Examples") -> "Examples":
         """Return these examples followed by others."""

@@ -188,17 +188,17 @@ class Augmentation(InNotebook):
 
         **Raises:** `FolderInUse` where another process writes it.
         """
-        place = Path(folder)
-        place.mkdir(parents=True, exist_ok=True)
-        with write_lock(place):
-            with replacing(place / TABLE) as partial:
+        path = Path(folder)
+        path.mkdir(parents=True, exist_ok=True)
+        with write_lock(path):
+            with replacing(path / TABLE) as partial:
                 self.table.to_parquet(partial)
             mixed = [n for n in self.added.columns if self.added[n].dtype == object]
-            with replacing(place / ADDED) as partial:
+            with replacing(path / ADDED) as partial:
                 self.added.astype(dict.fromkeys(mixed, str)).to_parquet(partial)
-            with replacing(place / SUMMARY) as partial:
+            with replacing(path / SUMMARY) as partial:
                 partial.write_text(f"{self.summary()}\n")
-        return place
+        return path
 
     def __str__(self) -> str:
         return self.summary()

@@ -176,8 +176,8 @@ class Allocation:
         if not len(where):
             return blocks
         more = self._missing(k[where], n[where], len(n))
-        for place in np.argsort(more, kind="stable"):
-            i, missing = where[place], more[place]
+        for index in np.argsort(more, kind="stable"):
+            i, missing = where[index], more[index]
             if not math.isfinite(missing) or missing > left * self.block:
                 break
             # What it shows on the way may change what is missing.

@@ -49,11 +49,11 @@ class PolicyRecord:
         self.failures += int(np.sum(verdicts.violated))
         self.not_finite += int(np.sum(~verdicts.proper))
 
-    def take_out(self, block: int, place: int) -> None:
+    def take_out(self, block: int, index: int) -> None:
         """Leave a row out of the counterexamples and the least robustness, but in the counts."""
         verdicts = self.verdicts[block]
         rho, violated = verdicts.rho.copy(), verdicts.violated.copy()
-        rho[place], violated[place] = np.nan, False
+        rho[index], violated[index] = np.nan, False
         self.verdicts[block] = verdicts._replace(rho=rho, violated=violated)
 
     @property
@@ -112,8 +112,8 @@ def attack_policies(
                 chosen.append((number, points))
             else:
                 attacker.tell_refused()
-        for place, verdicts in blocks.attack(chosen, round_, repr(search)):
-            number, points = chosen[place]
+        for index, verdicts in blocks.attack(chosen, round_, repr(search)):
+            number, points = chosen[index]
             records[number].add(points, verdicts, round_ * blocks.lanes)
             attackers[number].tell(verdicts.lowest, verdicts.proper, None)
             report(len(points))

@@ -134,8 +134,8 @@ class Blocks:
                 simulator = shared_simulator(problem_of, group, lanes, self.space.dim, devices)
             for number in numbers:
                 self._owner[number] = len(self._simulators)
-            places = {number: place for place, number in enumerate(numbers)}
-            self._simulators.append((simulator, places))
+            indices = {number: index for index, number in enumerate(numbers)}
+            self._simulators.append((simulator, indices))
         root = jax.random.fold_in(jax.random.key(seed, impl="threefry2x32"), STREAM)
         self.attack_key, points_key, self._simulation_key, self._attacked_key = jax.random.split(
             root, 4
@@ -149,13 +149,13 @@ class Blocks:
     def notes(self) -> tuple[str, ...]:
         """Decisions and errors that a user should know of."""
         notes = list(self._notes)
-        for simulator, places in self._simulators:
+        for simulator, indices in self._simulators:
             if isinstance(simulator, SeparateSimulators | ExecutorSimulator):
                 messages = simulator.messages
                 notes += [
-                    f"a simulation of policy {number} raised {messages[place]}"
-                    for number, place in places.items()
-                    if place in messages
+                    f"a simulation of policy {number} raised {messages[index]}"
+                    for number, index in indices.items()
+                    if index in messages
                 ]
         return tuple(notes)
 
@@ -207,9 +207,9 @@ class Blocks:
         """
 
         def compute() -> dict[str, np.ndarray]:
-            simulator, places = self._simulators[self._owner[policy]]
+            simulator, indices = self._simulators[self._owner[policy]]
             key = self._attacked_key if of_attack else self._simulation_key
-            members = [places[policy]] * len(points)
+            members = [indices[policy]] * len(points)
             with truncate_silently():
                 found = simulator(members, points[:, None], numbers.astype(np.int32), key)
             self.simulated += 1
@@ -232,17 +232,17 @@ class Blocks:
         # Those of one program after another.
         order = sorted(range(len(blocks)), key=lambda i: self._owner[blocks[i].policy])
         ready: dict[int, Verdicts] = {}
-        for place, i in enumerate(order):
+        for index, i in enumerate(order):
             block = blocks[i]
 
-            def compute(place: int = place, i: int = i) -> dict[str, np.ndarray]:
+            def compute(index: int = index, i: int = i) -> dict[str, np.ndarray]:
                 if i not in ready:
                     owner = self._owner[blocks[i].policy]
                     simulator, _ = self._simulators[owner]
                     maximum = simulator.blocks_per_call()
                     some = [
                         j
-                        for j in order[place : place + maximum]
+                        for j in order[index : index + maximum]
                         if self._owner[blocks[j].policy] == owner and j not in ready
                     ]
                     found = self._simulate(owner, [blocks[j] for j in some], key)
@@ -253,10 +253,10 @@ class Blocks:
 
     @truncate_silently()
     def _simulate(self, owner: int, blocks: list[Block], key: Any) -> list[Verdicts]:
-        simulator, places = self._simulators[owner]
+        simulator, indices = self._simulators[owner]
         self.simulated += len(blocks)
         u = np.stack([_fill_block(block.points, self.lanes) for block in blocks])
-        members = [places[block.policy] for block in blocks]
+        members = [indices[block.policy] for block in blocks]
         first = np.array([block.first for block in blocks], np.int32)
         found = simulator(members, u, first, key)
         for block, verdicts in zip(blocks, found, strict=True):
@@ -266,10 +266,10 @@ class Blocks:
         return found
 
     def _take_in(self, policy: int, verdicts: Verdicts) -> None:
-        simulator, places = self._simulators[self._owner[policy]]
+        simulator, indices = self._simulators[self._owner[policy]]
         messages = verdicts.messages
         if messages is None and isinstance(simulator, ExecutorSimulator):
-            messages = [simulator.messages.get(places[policy], "")]
+            messages = [simulator.messages.get(indices[policy], "")]
         self._raising.add(verdicts.status, messages)
         self._tried.add(policy)
 
@@ -277,9 +277,9 @@ class Blocks:
         """End the work where a simulation of each policy raises, too: one may be broken alone."""
         for policy, owner in self._owner.items():
             if policy not in self._tried and self._raising.always:
-                simulator, places = self._simulators[owner]
+                simulator, indices = self._simulators[owner]
                 first = np.array([block.first], np.int32)
-                (verdicts,) = simulator([places[policy]], block.points[None, :1], first, key)
+                (verdicts,) = simulator([indices[policy]], block.points[None, :1], first, key)
                 self._take_in(policy, verdicts)
         self._raising.check(self.problem.name)
 

@@ -250,10 +250,10 @@ def read_record(folder: Path) -> dict[str, Any]:
     try:
         return record.read_record(folder)
     except FileNotFoundError as missing:
-        raise FileNotFoundError(_describe_place(folder, record.RECORD, str(missing))) from None
+        raise FileNotFoundError(_describe_folder(folder, record.RECORD, str(missing))) from None
 
 
-def _describe_place(folder: Path, record: str, missing: str) -> str:
+def _describe_folder(folder: Path, record: str, missing: str) -> str:
     """Say what a folder without a run is; `missing` says that its record is."""
     if folder.is_file():
         what = "it is a file; give the folder that verifai-jax falsify has written"

@@ -157,18 +157,18 @@ def tracing(name: str = "") -> Iterator[None]:
 @contextmanager
 def _said(name: str) -> Iterator[None]:
     """Return a context in which this thread is said to compile the program."""
-    place = threading.get_ident()
+    index = threading.get_ident()
     with _lock:
-        before = _running.get(place)
-        _running[place] = (name, time.perf_counter())
+        before = _running.get(index)
+        _running[index] = (name, time.perf_counter())
     try:
         yield
     finally:
         with _lock:
             if before is None:
-                del _running[place]
+                del _running[index]
             else:
-                _running[place] = before
+                _running[index] = before
 
 
 def describe_compilation() -> str:

@@ -105,16 +105,16 @@ class _Reader:
         elif isinstance(value, (np.dtype, jax.core.ShapedArray)):
             add(_form(value) if isinstance(value, jax.core.ShapedArray) else str(value))
         elif isinstance(value, (enum.Enum, type)):
-            add(f"{_place(value if isinstance(value, type) else type(value))} {value}")
-        elif type(value).__name__ in _NAMED and _place(type(value)).startswith("jax"):
-            add(f"{_place(type(value))} {value}")
+            add(f"{_module_path(value if isinstance(value, type) else type(value))} {value}")
+        elif type(value).__name__ in _NAMED and _module_path(type(value)).startswith("jax"):
+            add(f"{_module_path(type(value))} {value}")
         elif hasattr(type(value), "__dataclass_fields__"):
-            add(_place(type(value)))
+            add(_module_path(type(value)))
             for name in type(value).__dataclass_fields__:
                 add(name)
                 self.read(getattr(value, name))
         else:
-            raise _Unknown(_place(type(value)))
+            raise _Unknown(_module_path(type(value)))
 
     def _array(self, value: Any) -> None:
         if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
@@ -178,21 +178,21 @@ class _Reader:
         if step.params.get("symbolic_zeros"):
             raise _Unknown("a derivative that depends on which tangents are zero")
         call, inputs = as_function(program, step)
-        places = [i for i, v in enumerate(inputs) if jnp.issubdtype(v.aval.dtype, jnp.inexact)]
-        if not places:
+        indices = [i for i, v in enumerate(inputs) if jnp.issubdtype(v.aval.dtype, jnp.inexact)]
+        if not indices:
             return
         forms = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in inputs]
 
         def derivative(arguments: Any, directions: Any) -> Any:
-            function = of_some(call, arguments, places)
-            values = [arguments[i] for i in places]
+            function = of_some(call, arguments, indices)
+            values = [arguments[i] for i in indices]
             if step.primitive.name == "custom_jvp_call":
                 return jax.jvp(function, values, directions)
             results, pull = jax.vjp(function, *values)
             return pull([jnp.ones_like(result) for result in results])
 
         # Only of these: the derivative of all else follows from what it computes.
-        traced = jax.make_jaxpr(derivative)(forms, [forms[i] for i in places])
+        traced = jax.make_jaxpr(derivative)(forms, [forms[i] for i in indices])
         self._program(traced.jaxpr, traced.consts, derived=True)
 
 
@@ -210,5 +210,5 @@ def _form(value: Any) -> str:
     return f"{value.dtype}{value.shape}{getattr(value, 'weak_type', False)}"
 
 
-def _place(kind: type) -> str:
+def _module_path(kind: type) -> str:
     return f"{kind.__module__}.{kind.__qualname__}"

@@ -300,9 +300,9 @@ def _value(node: ast.expr, frame: FrameType) -> object:
 
 def _source_of_instruction(code: CodeType, offset: int) -> str:
     """Return the text of the expression that an instruction belongs to; empty if unknown."""
-    places = [*code.co_positions()]
+    spans = [*code.co_positions()]
     # An instruction takes two bytes.
-    first, last, begin, end = places[offset // 2] if offset // 2 < len(places) else (None,) * 4
+    first, last, begin, end = spans[offset // 2] if offset // 2 < len(spans) else (None,) * 4
     if first is None or last is None or begin is None or end is None:
         return ""
     lines = [linecache.getline(code.co_filename, n, None) for n in range(first, last + 1)]
@@ -331,8 +331,8 @@ def raised_in_callback(error: BaseException) -> str | None:
     lines = traceback.strip().splitlines()
     if "allback" not in head or not lines:
         return None
-    places = re.findall(r'File "([^"]+)", line (\d+)', traceback)
-    where = f" ({_shown_file(places[-1][0])}, line {places[-1][1]})" if places else ""
+    frames = re.findall(r'File "([^"]+)", line (\d+)', traceback)
+    where = f" ({_shown_file(frames[-1][0])}, line {frames[-1][1]})" if frames else ""
     return f"{storable(lines[-1].strip(), MAX_MESSAGE)}{where}"
 
 
@@ -374,5 +374,5 @@ def _is_of_user(frame: FrameType) -> bool:
 def _shown_file(file: str) -> str:
     if is_notebook_cell(file):
         return "a notebook cell"
-    place, here = Path(file), Path(os.getcwd())
-    return str(place.relative_to(here)) if place.is_relative_to(here) else str(place)
+    path, here = Path(file), Path(os.getcwd())
+    return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)

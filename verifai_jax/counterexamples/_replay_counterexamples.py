@@ -67,12 +67,12 @@ class CorpusReplay(InNotebook):
     """The files of a corpus, replayed against a problem, as `replay_counterexamples` returns them.
 
     - `problem`: its name.
-    - `place`: the folder or file.
+    - `folder`: the folder or file.
     - `replayed`: a `ReplayedCounterexample` for each file.
     """
 
     problem: str
-    place: Path
+    folder: Path
     replayed: tuple[ReplayedCounterexample, ...]
 
     def of(self, state: str) -> tuple[ReplayedCounterexample, ...]:
@@ -112,7 +112,7 @@ class CorpusReplay(InNotebook):
         states = (FAILING, FIXED, WITHOUT_VERDICT, INVALID)
         counts = ", ".join(f"{len(self.of(state))} {state}" for state in states if self.of(state))
         plural = "s" * (count != 1)
-        lines = [f"{self.problem}: {count} counterexample{plural} in {self.place}"]
+        lines = [f"{self.problem}: {count} counterexample{plural} in {self.folder}"]
         lines[0] += f": {counts}" if count else ""
         if changed := sum(one.changed for one in self.replayed):
             lines.append(f"  the model has changed since {changed} of them were saved")

@@ -201,9 +201,9 @@ def save_counterexamples(
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     paths: dict[Path, None] = {}
-    for place in _spread(points, max_count):
-        row = int(ordered.index[place])
-        features = {name: ordered.iloc[place][name] for name in problem.space.columns}
+    for index in _spread(points, max_count):
+        row = int(ordered.index[index])
+        features = {name: ordered.iloc[index][name] for name in problem.space.columns}
         changed = None
         if problem.black_box:
             # What was not repeated in the run may not come again: it is no regression test then.
@@ -224,11 +224,11 @@ def save_counterexamples(
         seen = replay(problem, features, run_keys(run.seed)[1], row, run.precision)
         if not seen.violated:
             # Shrinking in another precision, or rounding in the table, must not claim too much.
-            features, changed = {name: ordered.iloc[place][name] for name in features}, None
+            features, changed = {name: ordered.iloc[index][name] for name in features}, None
             seen = replay(problem, features, run_keys(run.seed)[1], row, run.precision)
         if not seen.violated:
             continue
-        verdict = str(ordered.iloc[place]["verdict"]) if "verdict" in ordered else ""
+        verdict = str(ordered.iloc[index]["verdict"]) if "verdict" in ordered else ""
         saved = SavedCounterexample(
             problem=run.name,
             target=run.target,
@@ -270,14 +270,14 @@ def read_corpus(folder: str | Path) -> tuple[dict[Path, SavedCounterexample], di
 
     **Raises:** `FileNotFoundError` where there is no such place.
     """
-    place = Path(folder)
-    if not place.exists():
-        raise FileNotFoundError(f"there is no corpus of counterexamples in {place}")
-    paths = [place]
-    if place.is_dir():
-        below = (path.relative_to(place) for path in sorted(place.rglob("*")))
+    location = Path(folder)
+    if not location.exists():
+        raise FileNotFoundError(f"there is no corpus of counterexamples in {location}")
+    paths = [location]
+    if location.is_dir():
+        below = (path.relative_to(location) for path in sorted(location.rglob("*")))
         seen = (path for path in below if not any(part.startswith(".") for part in path.parts))
-        paths = [place / path for path in seen if path.suffix.lower() == ".json"]
+        paths = [location / path for path in seen if path.suffix.lower() == ".json"]
     entries, damaged = {}, {}
     for path in paths:
         try:

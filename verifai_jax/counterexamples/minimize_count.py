@@ -37,8 +37,8 @@ def revert_features(candidates: Candidates, u: Point) -> Point:
         changed = np.flatnonzero(nominal.moved(u[None])[0])
         if not len(changed):
             return u
-        groups = [np.intersect1d(places, changed) for _, places in nominal.groups]
-        sets = [places for places in groups if 1 < len(places) < len(changed)]
+        groups = [np.intersect1d(coordinates, changed) for _, coordinates in nominal.groups]
+        sets = [coordinates for coordinates in groups if 1 < len(coordinates) < len(changed)]
         if len(changed) > 24:
             sets += [part for n in (2, 4, 8) for part in np.array_split(changed, n)]
         sets += [changed[i : i + 1] for i in range(len(changed))]
@@ -67,8 +67,8 @@ def revert_features(candidates: Candidates, u: Point) -> Point:
 def revert(candidates: Candidates, u: Point, sets: list[np.ndarray]) -> Points:
     """Return the point with each of these sets of coordinates back at nominal."""
     points = np.repeat(u[None], len(sets), axis=0)
-    for point, places in zip(points, sets, strict=True):
-        point[places] = candidates.nominal.u[places]
+    for point, coordinates in zip(points, sets, strict=True):
+        point[coordinates] = candidates.nominal.u[coordinates]
     return points
 
 
@@ -86,9 +86,9 @@ def trial_values(candidates: Candidates, i: int) -> list[float]:
     else:
         cells = np.unique(np.linspace(0, cube.levels[i] - 1, min(cube.levels[i], 8)).astype(int))
         every = np.zeros((len(cells), len(cube.discrete)), int)
-        place = int(np.flatnonzero(cube.discrete == i)[0])
-        every[:, place] = cells
-        values = candidates.nominal.centres(every)[:, place]
+        index = int(np.flatnonzero(cube.discrete == i)[0])
+        every[:, index] = cells
+        values = candidates.nominal.centres(every)[:, index]
     return [float(v) for v in values if np.float32(v) != candidates.nominal.u[i]]
 
 
@@ -170,10 +170,10 @@ def exchange(candidates: Candidates, u: Point, rng: np.random.Generator) -> Poin
     for turn in range(3):
         each = int(np.clip((96, 96, 96)[turn] // len(smaller), 4, 32))
         tried = []
-        for tangent, centre, places in zip(
+        for tangent, centre, coordinates in zip(
             candidates.tangents(centres), centres, smaller, strict=True
         ):
-            tried.append(push(candidates, centre, places, tangent, each, width, rng))
+            tried.append(push(candidates, centre, coordinates, tangent, each, width, rng))
         owner = np.repeat(np.arange(len(smaller)), [len(part) for part in tried])
         points = nominal.settle(np.concatenate(tried))
         rho, failing = candidates(points)
@@ -193,7 +193,7 @@ def exchange(candidates: Candidates, u: Point, rng: np.random.Generator) -> Poin
 def push(
     candidates: Candidates,
     centre: Point,
-    places: np.ndarray,
+    coordinates: np.ndarray,
     tangent: Tangent | None,
     count: int,
     width: float,
@@ -201,7 +201,7 @@ def push(
 ) -> Results:
     """Draw points that differ from `centre` in these coordinates only."""
     cube, u0 = candidates.nominal.cube, candidates.nominal.u
-    free = np.array([i for i in places if cube.levels[i] == 0], int)
+    free = np.array([i for i in coordinates if cube.levels[i] == 0], int)
     points = np.repeat(centre[None].astype(np.float64), count, axis=0)
     if len(free):
         away = np.sign(centre[free] - u0[free])
@@ -219,7 +219,7 @@ def push(
         corner = rng.random(noise.shape) < 0.3 * width
         noise = np.where(corner, (rng.random(noise.shape) < 0.5).astype(float), noise)
         rest[:, free] = noise
-    for i in places:
+    for i in coordinates:
         if cube.levels[i]:
             rows = rng.random(count) < 0.3
             points[rows, i] = rng.random(int(rows.sum()))

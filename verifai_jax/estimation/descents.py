@@ -115,7 +115,7 @@ def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulat
     starts = _begin(limit_state, draw_starts(limit_state, rng, drawn))
     hits = np.flatnonzero(starts.score == -np.inf)[: max(8, round(HITS * simulations))]
     others = np.flatnonzero(starts.score > -np.inf)
-    worse = _worse_neighbours(_places_ahead(limit_state, starts), starts.score)
+    worse = _worse_neighbours(_points_ahead(limit_state, starts), starts.score)
     others = others[np.argsort(-worse[others], kind="stable")]
     # Far out, where they lie, several regions overlap.
     failing = starts.of(hits)
@@ -178,7 +178,7 @@ def _planes(feet: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n coordinates"
     return np.concatenate([feet, FAR * feet / np.maximum(norms, 1e-9)], axis=1)
 
 
-def _places_ahead(limit_state: LimitState, descents: _Descents) -> Float[np.ndarray, "n d"]:
+def _points_ahead(limit_state: LimitState, descents: _Descents) -> Float[np.ndarray, "n d"]:
     """Return where the slope at each point says that the limit state is; the point without one.
 
     It is looked for no farther than one step leads.

@@ -222,10 +222,10 @@ def _joined(
     known: Int[np.ndarray, " k"] | None = None,
 ) -> Int[np.ndarray, " k"]:
     """Return numbers `[k]` of groups of failures: joined to others where the middle fails."""
-    places = np.arange(len(z))
-    group = places.copy() if known is None else known.copy()
+    indices = np.arange(len(z))
+    group = indices.copy() if known is None else known.copy()
     for other in others.T:
-        tried = np.flatnonzero((other < places) & (group[other] != group))
+        tried = np.flatnonzero((other < indices) & (group[other] != group))
         middle = (z[tried] + z[other[tried]]) / 2
         for row in tried[fails_at(limit_state, middle)]:
             group[group == group[row]] = group[other[row]]

@@ -316,8 +316,8 @@ class Pending:
                 u = self._u[begin:stop]
                 found[begin] = self._engine.recall(u, self._key, self._first + begin)
 
-            def ended(place: int, result: dict[str, Any]) -> None:
-                begin, stop, _ = self._sent[place]
+            def ended(index: int, result: dict[str, Any]) -> None:
+                begin, stop, _ = self._sent[index]
                 u, first = self._u[begin:stop], self._first + begin
                 self._ended += 1
                 if not self._engine.is_answer(result, self._words, first, u):

@@ -284,11 +284,11 @@ class HostEngine:
         waiting = _Waiting(partial(self._block_verdicts, features), keep, rows.show)
         started = time.perf_counter()
         try:
-            for place, outcome in self._outcomes(each, [int(seeds[i]) for i in todo]):
+            for index, outcome in self._outcomes(each, [int(seeds[i]) for i in todo]):
                 self.simulation_seconds = time.perf_counter() - started
                 said = outcome.trace.notes if isinstance(outcome.trace, Trace) else {}
                 self.remarks.add(said)
-                waiting.add(todo[place], outcome)
+                waiting.add(todo[index], outcome)
         finally:
             # Also when interrupted: what has been simulated goes into the journal.
             waiting.settle_all()
@@ -306,8 +306,8 @@ class HostEngine:
     ) -> list[RowVerdict]:
         filled = [*traces, *[traces[-1]] * (BLOCK - len(traces))]
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *filled)
-        place = np.array([*rows, *[rows[-1]] * (BLOCK - len(rows))])
-        own = jax.tree.map(lambda leaf: np.asarray(leaf)[place], features)
+        index = np.array([*rows, *[rows[-1]] * (BLOCK - len(rows))])
+        own = jax.tree.map(lambda leaf: np.asarray(leaf)[index], features)
         try:
             rho, status, holds, marks, told = self.monitor(stacked, BLOCK, own)
         except Exception as error:

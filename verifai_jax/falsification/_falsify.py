@@ -184,10 +184,10 @@ def falsify(
         by = "inputs" if diverse is True else diverse
         search = searches.Diverse(search, capacity=max(256, stop_after or 0), by=by)
     ends = Ending(started, budget, max_seconds, stop_after, stop_when)
-    with new_folder(folder) as place:
-        table = ErrorTable(tuple(problem.space.columns), place)
+    with new_folder(folder) as path:
+        table = ErrorTable(tuple(problem.space.columns), path)
         rounds = Rounds(
-            problem, search, size, seed, table, precision, place, confirm, executor, target, given,
+            problem, search, size, seed, table, precision, path, confirm, executor, target, given,
             suggests=asking is not None,
         )  # fmt: skip
         if asking is not None:

@@ -327,10 +327,10 @@ class _WholeRounds:
         def holds() -> Bool[np.ndarray, "rows 1"]:
             undecided = np.flatnonzero((rho.ravel() == 0) & (flat == Status.OK))
             every = np.ones((rho.size, 1), bool)
-            for place in undecided.tolist():
-                seed, row = divmod(place, rho.shape[1])
+            for index in undecided.tolist():
+                seed, row = divmod(index, rho.shape[1])
                 found = self.engine.holds(u[seed, row][None], keys[seed], first + row)
-                every[place] = found.all()
+                every[index] = found.all()
             return every
 
         return violations(rho.reshape(-1, 1), flat, holds).reshape(rho.shape)

@@ -79,8 +79,8 @@ def claimed_rows(columns: Columns) -> Bool[np.ndarray, " n"]:
     """Tell rows that violate the property and are claimed to."""
     claimed = violating_rows(columns)
     if "verdict" in columns:
-        places = np.flatnonzero(claimed)
-        claimed[places] = ~np.isin(columns["verdict"][places], NOT_CLAIMED)
+        indices = np.flatnonzero(claimed)
+        claimed[indices] = ~np.isin(columns["verdict"][indices], NOT_CLAIMED)
     return claimed
 
 
@@ -110,12 +110,12 @@ def count(parts: Iterable[tuple[Int[np.ndarray, " n"], Columns]]) -> Counts:
         counts.lowest = float(np.fmin(counts.lowest, minimum))
         rho = np.nan_to_num(np.asarray(columns["rho"], np.float64), nan=np.inf)
         for name, among in (("worst", claimed), ("nearest", proper)):
-            places = np.flatnonzero(among)
-            if len(places):
-                place = places[np.argmin(rho[places])]
-                if getattr(counts, name) is None or rho[place] < lowest[name]:
-                    setattr(counts, name, int(numbers[place]))
-                    lowest[name] = float(rho[place])
+            indices = np.flatnonzero(among)
+            if len(indices):
+                index = indices[np.argmin(rho[indices])]
+                if getattr(counts, name) is None or rho[index] < lowest[name]:
+                    setattr(counts, name, int(numbers[index]))
+                    lowest[name] = float(rho[index])
         if counts.first_message is None and "message" in columns:
             said = (i for i in np.flatnonzero(~proper) if columns["message"][i])
             if (first := next(said, None)) is not None:

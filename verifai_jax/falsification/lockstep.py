@@ -118,8 +118,8 @@ def lockstep(
             for first in range(0, len(seed), engine.batch):
                 block = slice(first, first + engine.batch)
                 # Always as many, so that one program makes the keys.
-                place = np.minimum(np.arange(first, first + engine.padded), len(seed) - 1)
-                own = number_keys(run_key[seed[place]], numbers[place].astype(np.int32))
+                index = np.minimum(np.arange(first, first + engine.padded), len(seed) - 1)
+                own = number_keys(run_key[seed[index]], numbers[index].astype(np.int32))
                 some = seed[block], row[block]
                 parts.append(engine.evaluate(u[some], own, temperature=temperature[some]))
             count_done(len(seed))

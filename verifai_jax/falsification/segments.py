@@ -136,11 +136,11 @@ def write_segment(run: Path, first: int, columns: Columns) -> Segment:
 
     **Raises:** `OSError` where they cannot be written.
     """
-    places = standing_out(columns)
-    few = {name: values[places] for name, values in columns.items()}
+    indices = standing_out(columns)
+    few = {name: values[indices] for name, values in columns.items()}
     stop = first + len(columns["rho"])
     # First: without its segment it is none, and the segment comes with one.
-    _write(run / FAILURES, first, stop, parquet(few, first + places))
+    _write(run / FAILURES, first, stop, parquet(few, first + indices))
     path = _write(run / SEGMENTS, first, stop, parquet(columns, np.arange(first, stop)))
     return Segment(first, stop, path)
 

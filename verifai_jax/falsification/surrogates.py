@@ -170,7 +170,7 @@ class Surrogate:
             before = self.form
             self.form = self._form(before.signals, before.dt, trace.length)
             whole = [np.asarray(before.held(row)) for row in self.traces]
-            here = np.minimum(self.form.places, before.length - 1)
+            here = np.minimum(self.form.positions, before.length - 1)
             own = np.arange(before.length)
             each = [np.concatenate([np.interp(here, own, c) for c in row]) for row in whole]
             empty = np.zeros((0, 0), np.float32)
@@ -194,9 +194,9 @@ class Surrogate:
         form = self.form
         assert form is not None
         # Signals count alike, whatever their unit.
-        grouped = self.traces.reshape(len(self.traces), -1, len(form.places))
+        grouped = self.traces.reshape(len(self.traces), -1, len(form.positions))
         scale = np.std(grouped, axis=(0, 2))
-        scale = np.repeat(np.where(scale > 0, scale, 1.0), len(form.places)).astype(np.float32)
+        scale = np.repeat(np.where(scale > 0, scale, 1.0), len(form.positions)).astype(np.float32)
         mean, components = models.principal_components(self.traces / scale)
         coefficients = ((self.traces / scale - mean) @ components.T).astype(np.float32)
         size = _padded(len(self.rho), self.options.capacity)
@@ -290,10 +290,10 @@ class Descents:
             return jnp.where(jnp.isfinite(gradient), gradient, 0.0)
 
         def one(weights: Float[Array, "terms c"]) -> tuple[Array, Array]:
-            lowest, place = jax.lax.top_k(
+            lowest, index = jax.lax.top_k(
                 -_number(values(pool, weights, hard)), self.options.starts
             )
-            start = pool[place]
+            start = pool[index]
 
             def step(carry: tuple, part: Array) -> tuple:
                 u, first, second, best, lowest = carry

@@ -475,16 +475,16 @@ class ErrorTable(InNotebook):
             frame = segment.read_standing_out()
             yield frame.index.to_numpy(), from_frame(frame)
         for numbers, block in self._memory():
-            places = standing_out(block)
-            yield numbers[places], {name: values[places] for name, values in block.items()}
+            indices = standing_out(block)
+            yield numbers[indices], {name: values[indices] for name, values in block.items()}
 
     def _select(self, wanted: Callable[[Columns], Bool[np.ndarray, " n"]]) -> "pd.DataFrame":
         """Return rows that stand out, in their order."""
         found = []
         for numbers, block in self._standing_out():
-            places = np.flatnonzero(wanted(block))
-            few = {name: values[places] for name, values in block.items()}
-            found.append(to_frame(numbers[places], few))
+            indices = np.flatnonzero(wanted(block))
+            few = {name: values[indices] for name, values in block.items()}
+            found.append(to_frame(numbers[indices], few))
         return self._concatenate(found)
 
     def _close_segment(self, rows: int) -> None:

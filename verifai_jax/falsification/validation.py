@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def writing(place: Path | None) -> Iterator[None]:
+def writing(folder: Path | None) -> Iterator[None]:
     """Turn what a file system refuses into one line that says what to do."""
     try:
         yield
     except OSError as error:
         raise ValueError(
-            f"folder {str(place)!r} cannot be written ({error.strerror or error}); give one that "
+            f"folder {str(folder)!r} cannot be written ({error.strerror or error}); give one that "
             "can be, or none to keep the run in memory"
         ) from error
 
@@ -419,22 +419,22 @@ def new_folder(folder: str | Path | None) -> Iterator[Path | None]:
     if folder is None:
         yield None
         return
-    place = Path(folder)
-    if not (place / LOCK).exists():  # Whoever writes there is told by the lock.
-        _check_empty(place)
-    with locked(place):
-        _check_empty(place)  # Another run may have begun in it, and ended, since.
-        yield place
+    path = Path(folder)
+    if not (path / LOCK).exists():  # Whoever writes there is told by the lock.
+        _check_empty(path)
+    with locked(path):
+        _check_empty(path)  # Another run may have begun in it, and ended, since.
+        yield path
 
 
-def _check_empty(place: Path) -> None:
+def _check_empty(folder: Path) -> None:
     # A process that dies before its first record leaves a part of one.
     leftover = {f"{RECORD}.part", LOCK}
-    if place.exists() and (not place.is_dir() or {p.name for p in place.iterdir()} - leftover):
-        if (place / RECORD).is_file():
+    if folder.exists() and (not folder.is_dir() or {p.name for p in folder.iterdir()} - leftover):
+        if (folder / RECORD).is_file():
             raise ValueError(
-                f"folder {str(place)!r} exists and is not empty: it holds a run, with which "
-                f"vj.resume, or verifai-jax falsify --resume {place}, goes on; a new one needs "
+                f"folder {str(folder)!r} exists and is not empty: it holds a run, with which "
+                f"vj.resume, or verifai-jax falsify --resume {folder}, goes on; a new one needs "
                 "another folder"
             )
-        raise ValueError(f"folder {str(place)!r} exists and is not empty; a run needs a new one")
+        raise ValueError(f"folder {str(folder)!r} exists and is not empty; a run needs a new one")

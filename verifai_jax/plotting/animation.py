@@ -86,8 +86,8 @@ def animate(
         animation = Animation(_drawn(replay, draw, pixels or SIZE, fps))
     elif can_draw(system):
         with TemporaryDirectory() as folder:
-            place = Path(folder) / "animation.gif"
-            file = film(record(replay), place, pixels, camera=camera, fps=fps)
+            file_path = Path(folder) / "animation.gif"
+            file = film(record(replay), file_path, pixels, camera=camera, fps=fps)
             animation = Animation(file.read_bytes())
     elif episode_of(system) is not None:
         animation = Animation(film_episode(replay, pixels, fps))
@@ -137,7 +137,7 @@ def _drawn(
 class _Layout(NamedTuple):
     """Where the axes are in a frame, and what decides on it."""
 
-    place: Any
+    position: Any
     reasons: tuple[Any, ...]
 
 
@@ -165,7 +165,7 @@ def _frame(
     alone = figure.axes == [axes] and not figure.texts and axes.get_legend() is None
     if alone and before is not None and before.reasons == reasons:
         figure.set_layout_engine("none")
-        axes.set_position(before.place)
+        axes.set_position(before.position)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     layout = _Layout(axes.get_position(original=True), reasons) if alone else None

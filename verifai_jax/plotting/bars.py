@@ -103,7 +103,7 @@ def plot_bars(
 def draw_bars(axes: Axes, table: pd.DataFrame, columns: Mapping[str, str]) -> None:
     """Draw the bars of `plot_bars` into `axes`, the first row on top."""
     height = 0.76 / len(columns)
-    place = np.arange(len(table))
+    position = np.arange(len(table))
     for j, (column, name) in enumerate(columns.items()):
         values = table[column].to_numpy(float)
         low, high = (
@@ -113,7 +113,7 @@ def draw_bars(axes: Axes, table: pd.DataFrame, columns: Mapping[str, str]) -> No
         # An interval of resampled values need not contain the value itself.
         reach = np.nan_to_num([np.maximum(values - low, 0), np.maximum(high - values, 0)])
         axes.barh(
-            place + (j - (len(columns) - 1) / 2) * height,
+            position + (j - (len(columns) - 1) / 2) * height,
             np.nan_to_num(values),
             height * 0.92,
             color=SECOND if column in ("first", "rho") else FAILING,
@@ -121,7 +121,7 @@ def draw_bars(axes: Axes, table: pd.DataFrame, columns: Mapping[str, str]) -> No
             xerr=reach,
             error_kw={"ecolor": BOUND, "elinewidth": 1, "capsize": 2},
         )
-    axes.set_yticks(place, [wrap_name(str(name)) for name in table.index])
+    axes.set_yticks(position, [wrap_name(str(name)) for name in table.index])
     axes.invert_yaxis()
     axes.axvline(0, color=BOUND, linewidth=0.8)
     tidy(axes)

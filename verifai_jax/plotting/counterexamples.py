@@ -101,14 +101,14 @@ def draw_decision(axes: Axes, why: Explanation) -> None:
     )  # fmt: skip
     decided = ""
     if np.isfinite(why.time):
-        place = int(np.argmin(np.abs(clock - why.time)))
-        axes.axvline(clock[place], color=FAILING, linewidth=1, linestyle=":")
-        axes.plot([clock[place]], [values[place]], "o", color=FAILING, markersize=6)
-        shown = format_number(float(values[place]))
+        index = int(np.argmin(np.abs(clock - why.time)))
+        axes.axvline(clock[index], color=FAILING, linewidth=1, linestyle=":")
+        axes.plot([clock[index]], [values[index]], "o", color=FAILING, markersize=6)
+        shown = format_number(float(values[index]))
         if bounds:
-            nearest = min(bounds, key=lambda b: abs(b - values[place]))
-            shown = format_apart(float(values[place]), nearest)[0]
-        decided = f"\n{shown} at {format_seconds(clock[place], 4)}"
+            nearest = min(bounds, key=lambda b: abs(b - values[index]))
+            shown = format_apart(float(values[index]), nearest)[0]
+        decided = f"\n{shown} at {format_seconds(clock[index], 4)}"
     axes.set_ylabel(wrap_name(label, 28))
     # Above the axes, where no curve runs through it.
     title = f"decides: {_short(str(predicate), 100)}{decided}"
@@ -214,8 +214,8 @@ def plot_shrunk(shrunk: Shrunk, path: str | Path | None = None) -> Figure:
     draw_decision(right, replay.explain())
     right.set_xlabel("time [s]")
     space = shrunk.problem.space
-    places = [space.coordinates.index(name) for name in shown if name in space.coordinates]
-    for y, (i, name) in enumerate(zip(places, shown, strict=False)):
+    indices = [space.coordinates.index(name) for name in shown if name in space.coordinates]
+    for y, (i, name) in enumerate(zip(indices, shown, strict=False)):
         was, now = shrunk.changed[name]
         left.plot([0, 1], [y, y], color=QUIET, linewidth=3, alpha=0.25, solid_capstyle="round")
         if was is not None:
@@ -227,9 +227,9 @@ def plot_shrunk(shrunk: Shrunk, path: str | Path | None = None) -> Figure:
             (0.5, y), xytext=(0, 5), ha="center",
             textcoords="offset points", fontsize=7, color=BOUND,
         )  # fmt: skip
-    labels = [wrap_name(label, 24) for label in shrunk.labels[: len(places)]]
-    left.set_yticks(range(len(places)), labels)
-    left.set_ylim(max(len(places), 1) - 0.4, -0.8)
+    labels = [wrap_name(label, 24) for label in shrunk.labels[: len(indices)]]
+    left.set_yticks(range(len(indices)), labels)
+    left.set_ylim(max(len(indices), 1) - 0.4, -0.8)
     left.set_xlim(-0.03, 1.03)
     left.set_xlabel("share of the range: green nominal, red failing")
     title = f"{shrunk.count} of {len(shrunk.u)} depart, by {shrunk.distance:z.3g}"

@@ -52,12 +52,12 @@ def _draw_interval(axes: Axes, estimate: Estimate) -> None:
     if estimate.probability is not None:
         rows.append(("estimate", estimate.probability, estimate.low, estimate.high, FAILING))
     lowest = min([estimate.upper_bound, *(low for *_, low, _, _ in rows if low > 0)]) / 5
-    for place, (_, value, low, high, color) in enumerate(rows):
-        axes.plot([max(low, lowest), high], [place, place], color=color, linewidth=4, alpha=0.6)
+    for height, (_, value, low, high, color) in enumerate(rows):
+        axes.plot([max(low, lowest), high], [height, height], color=color, linewidth=4, alpha=0.6)
         if value is not None:
-            axes.plot(value, place, "o", color=color)
+            axes.plot(value, height, "o", color=color)
         else:
-            axes.plot(high, place, "|", color=color, markersize=14)
+            axes.plot(high, height, "|", color=color, markersize=14)
     axes.set_xscale("log")
     axes.set_xlim(lowest, min(1.5, estimate.upper_bound * 4))
     log_ticks(axes.xaxis)

@@ -8,7 +8,7 @@ from verifai_jax.analysis.overview import Analysis
 from verifai_jax.core.figure import Axes, Figure
 from verifai_jax.core.text import format_percent
 from verifai_jax.plotting.bars import draw_bars
-from verifai_jax.plotting.panels import draw_rule, draw_samples, places, two_features
+from verifai_jax.plotting.panels import cells, draw_rule, draw_samples, two_features
 from verifai_jax.plotting.style import BOUND, new_figure, show_or_save
 
 MAX_BARS = 10
@@ -68,13 +68,13 @@ def _mark_representatives(axes: Axes, analysis: Analysis, across: str, up: str) 
     samples = analysis.samples
     assert samples is not None
     rows = analysis.representatives[:MAX_MARKED]
-    x, y = places(samples, across, up)
+    x, y = cells(samples, across, up)
     for number, row in enumerate(rows):
-        place = int(np.flatnonzero(samples.rows == row)[0])
-        if not np.isfinite([x[place], y[place]]).all():
+        index = int(np.flatnonzero(samples.rows == row)[0])
+        if not np.isfinite([x[index], y[index]]).all():
             continue
-        axes.plot(x[place], y[place], "o", ms=13, mfc="white", mec=BOUND, mew=1.2)
-        axes.annotate(str(number), (x[place], y[place]), ha="center", va="center", fontsize=8)
+        axes.plot(x[index], y[index], "o", ms=13, mfc="white", mec=BOUND, mew=1.2)
+        axes.annotate(str(number), (x[index], y[index]), ha="center", va="center", fontsize=8)
     if rows:
         axes.plot([], [], "o", mfc="white", mec=BOUND, label="typical row of a cluster of failures")
         axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(0, 1.1))

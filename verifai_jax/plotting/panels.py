@@ -55,7 +55,7 @@ def draw_samples(axes: Axes, samples: Samples, across: str, up: str, size: float
     Unordered values are spread a little around their place.
     """
     columns = {column.name: column for column in samples.columns}
-    x, y = places(samples, across, up)
+    x, y = cells(samples, across, up)
     for part, color, dot in (
         (~samples.failing, SAFE, size * 0.6),
         (samples.failing, FAILING, size),
@@ -76,7 +76,7 @@ def draw_samples(axes: Axes, samples: Samples, across: str, up: str, size: float
             axis.get_major_locator().set_params(integer=True)
 
 
-def places(
+def cells(
     samples: Samples, across: str, up: str
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return where the rows are drawn; over a single feature the robustness is the other axis."""

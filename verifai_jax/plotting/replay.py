@@ -174,8 +174,8 @@ def _telling(
         n: np.array_equal(curves[n], np.broadcast_to(curves[n][:1], curves[n].shape)) for n in names
     }
     # Each once, in their own order, before they are sorted.
-    place = {name: (still[name], 0 if still[name] else turn(name)) for name in names}
-    return sorted(names, key=place.__getitem__)
+    rank = {name: (still[name], 0 if still[name] else turn(name)) for name in names}
+    return sorted(names, key=rank.__getitem__)
 
 
 def _left_out(names: list[str]) -> str:
@@ -280,8 +280,8 @@ def _name_bounds(axes: Axes, predicates: dict[str, tuple[str, float]], decided: 
     - `decided`: what decided there, for a line above them; empty for nothing.
     """
     ranks = [FAILING, BOUND, SAFE]
-    place = {text: (ranks.index(color), lowest) for text, (color, lowest) in predicates.items()}
-    ranked = sorted(predicates, key=place.__getitem__)
+    rank = {text: (ranks.index(color), lowest) for text, (color, lowest) in predicates.items()}
+    ranked = sorted(predicates, key=rank.__getitem__)
     named, others = ranked[:MAX_BOUNDS], ranked[MAX_BOUNDS:]
     lines = [(text, predicates[text][0]) for text in named]
     if others:

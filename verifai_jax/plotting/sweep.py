@@ -196,9 +196,9 @@ def _spread(table: "pd.DataFrame", lowest: float) -> "pd.DataFrame":
         strict=True,
     ))  # fmt: skip
     counts: dict[tuple[float, float], int] = {}
-    for i, place in zip(shown.index, cell, strict=True):
-        turn = counts.get(place, 0)
-        counts[place] = turn + 1
+    for i, index in zip(shown.index, cell, strict=True):
+        turn = counts.get(index, 0)
+        counts[index] = turn + 1
         side = (turn + 1) // 2 * (-1 if turn % 2 else 1)
         shown.loc[i, "nominal_return"] += np.clip(side, -4, 4) * span / 200
     return shown
@@ -281,10 +281,10 @@ def _draw_shares(axes: Axes, importance: HyperparameterImportance) -> None:
     targets = [target for target in importance.scores if importance.is_reliable(target)]
     targets = targets or list(importance.scores)
     shown = importance.table.head(MAX_BARS)
-    height, place = 0.76 / len(targets), np.arange(len(shown))
+    height, position = 0.76 / len(targets), np.arange(len(shown))
     for k, target in enumerate(targets):
         colour, what, hatch = BARS[target]
-        at = place + (k - (len(targets) - 1) / 2) * height
+        at = position + (k - (len(targets) - 1) / 2) * height
         axes.barh(
             at,
             shown[f"{target}_total"].to_numpy(float),
@@ -304,7 +304,7 @@ def _draw_shares(axes: Axes, importance: HyperparameterImportance) -> None:
             linewidth=1.6,
             label="without interactions" if k == len(targets) - 1 else "",
         )
-    axes.set_yticks(place, [wrap_name(str(name), 18) for name in shown.index])
+    axes.set_yticks(position, [wrap_name(str(name), 18) for name in shown.index])
     axes.invert_yaxis()
     axes.set_xlim(0, 1.02)
     axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0", "25 %", "50 %", "75 %", "100 %"])
@@ -321,13 +321,13 @@ def _draw_trends(axes: Axes, importance: HyperparameterImportance) -> None:
     shown = importance.table.loc[importance.table[names].notna().any(axis=1)]
     order = shown[names].abs().max(axis=1).sort_values(ascending=False, kind="stable").index
     shown = shown.loc[order[:MAX_BARS]]
-    height, place = 0.76 / len(names), np.arange(len(shown))
+    height, position = 0.76 / len(names), np.arange(len(shown))
     chance = max(importance.chance.values())
     axes.axvspan(-chance, chance, color=WITHOUT_VERDICT, alpha=0.18, linewidth=0, label="by chance")
     for k, target in enumerate(importance.scores):
         colour, what, hatch = BARS[target]
         axes.barh(
-            place + (k - (len(names) - 1) / 2) * height,
+            position + (k - (len(names) - 1) / 2) * height,
             shown[f"{target}_trend"].to_numpy(float),
             height * 0.9,
             color=colour,
@@ -337,7 +337,7 @@ def _draw_trends(axes: Axes, importance: HyperparameterImportance) -> None:
             label=what,
         )
     axes.axvline(0, color=BOUND, linewidth=0.8)
-    axes.set_yticks(place, [wrap_name(str(name), 18) for name in shown.index])
+    axes.set_yticks(position, [wrap_name(str(name), 18) for name in shown.index])
     axes.invert_yaxis()
     axes.set_xlim(-1, 1)
     axes.set_xlabel("rank correlation with each alone")

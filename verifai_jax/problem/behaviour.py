@@ -32,7 +32,7 @@ class Axis:
     high: float
     cells: int
 
-    def place(self, trace: Trace) -> Int[Array, " time"]:
+    def cell_of(self, trace: Trace) -> Int[Array, " time"]:
         """Return the cell of each sample; -1 where the signal is not finite."""
         signal = as_array(trace.signals[self.name])
         values = signal.astype(jnp.result_type(float))
@@ -105,9 +105,9 @@ class Behaviour:
         """Return a cell in words, such as `mode 2 to 3, speed 10 to 20`."""
         parts = []
         for axis in reversed(self.axes):
-            number, place = divmod(number, axis.cells)
+            number, cell = divmod(number, axis.cells)
             width = (axis.high - axis.low) / axis.cells
-            begin = axis.low + place * width
+            begin = axis.low + cell * width
             parts.append(f"{axis.name} {begin:z.4g} to {begin + width:z.4g}")
         return ", ".join(reversed(parts))
 
@@ -120,8 +120,8 @@ class Behaviour:
             if all(axis.name in trace.signals for axis in self.axes):
                 joint, there = jnp.zeros(trace.length, jnp.int32), jnp.array(True)
                 for axis in self.axes:
-                    place = axis.place(trace)
-                    joint, there = joint * axis.cells + jnp.maximum(place, 0), there & (place >= 0)
+                    cell = axis.cell_of(trace)
+                    joint, there = joint * axis.cells + jnp.maximum(cell, 0), there & (cell >= 0)
                 # Counting visits would cost a pass for each cell; a scatter costs one.
                 visited = jnp.zeros(self.cells, bool).at[joint].max(there)
                 cells = jnp.where(visited, np.arange(self.cells, dtype=np.int32), -1)

@@ -74,13 +74,13 @@ class Rulebook:
         Equal rows are all in it or all not. Rows that break nothing are in it only if all do.
         """
         broken = np.asarray(violations, np.float64).reshape(-1, len(self.names))
-        unique, place = np.unique(broken, axis=0, return_inverse=True)
+        unique, index = np.unique(broken, axis=0, return_inverse=True)
         kept = np.ones(len(unique), bool)
         # In blocks, so that memory stays small with thousands of different rows.
         for start in range(0, len(unique), 256):
             block = slice(start, start + 256)
             kept[block] = ~np.any(self._outdone(unique[block], unique), axis=1)
-        return kept[place.ravel()]
+        return kept[index.ravel()]
 
     def grade(
         self, violated: Bool[np.ndarray, "n k"] | Float[np.ndarray, "n k"]
@@ -89,9 +89,9 @@ class Rulebook:
 
         A linear extension of the order: of two rows that cannot be compared one is larger too.
         """
-        places = [self.names.index(name) for name in self.order]
-        weights = 2.0 ** np.arange(len(places) - 1, -1, -1)
-        return np.asarray(violated, np.float64)[..., places] @ weights
+        indices = [self.names.index(name) for name in self.order]
+        weights = 2.0 ** np.arange(len(indices) - 1, -1, -1)
+        return np.asarray(violated, np.float64)[..., indices] @ weights
 
     def _outdone(
         self, rows: Float[np.ndarray, "n k"], others: Float[np.ndarray, "m k"]

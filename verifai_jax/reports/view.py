@@ -71,8 +71,8 @@ def view_data(
     features = features[:MAX_COLUMNS]
     maximum = max(200, min(MAX_ROWS, MAX_CELLS // (len(features) + 1)))
     numbers = table.index.to_numpy()
-    places = _thinned(group, maximum, np.flatnonzero(np.isin(numbers, list(traces))))
-    shown = table.iloc[places]
+    indices = _thinned(group, maximum, np.flatnonzero(np.isin(numbers, list(traces))))
+    shown = table.iloc[indices]
     described = [_column("robustness", shown["rho"])]
     described += [_column(name, shown[name]) for name in features]
     described = [column for column in described if column is not None]
@@ -82,8 +82,8 @@ def view_data(
     counts = [int(np.sum(group == i)) for i in range(len(GROUPS))]
     return {
         "columns": described,
-        "rows": [int(number) for number in numbers[places]],
-        "group": [int(each) for each in group[places]],
+        "rows": [int(number) for number in numbers[indices]],
+        "group": [int(each) for each in group[indices]],
         "groups": [
             {"name": name, "color": color, "count": f"{count:,}"}
             for (name, color, _), count in zip(GROUPS, counts, strict=True)
@@ -93,7 +93,7 @@ def view_data(
         "traces": {str(number): dict(trace) for number, trace in traces.items()},
         "replay": "This command simulates it again:" if command else "",
         "command": command,
-        "shown": len(places),
+        "shown": len(indices),
         "simulations": run.simulations,
     }
 
@@ -104,11 +104,11 @@ def _thinned(
     """Return places of rows, evenly spread over each verdict, the graver ones first."""
     chosen, left = [kept], maximum - len(kept)
     for verdict in reversed(range(len(GROUPS))):
-        places = np.flatnonzero(group == verdict)
-        count = min(len(places), left, GROUPS[verdict][2] * maximum // MAX_ROWS)
+        indices = np.flatnonzero(group == verdict)
+        count = min(len(indices), left, GROUPS[verdict][2] * maximum // MAX_ROWS)
         if count:
-            spread = np.linspace(0, len(places) - 1, count).astype(int)
-            chosen.append(places[np.unique(spread)])
+            spread = np.linspace(0, len(indices) - 1, count).astype(int)
+            chosen.append(indices[np.unique(spread)])
             left -= count
     return np.unique(np.concatenate(chosen))
 
@@ -122,11 +122,11 @@ def _column(name: str, values: "pd.Series") -> dict[str, Any] | None:
     levels = sorted({text for text in texts if text is not None})
     if not levels or len(levels) > MAX_CHOICES:
         return None
-    place = {text: i for i, text in enumerate(levels)}
+    codes = {text: i for i, text in enumerate(levels)}
     return {
         "name": name,
         "levels": levels,
-        "values": [None if text is None else place[text] for text in texts],
+        "values": [None if text is None else codes[text] for text in texts],
     }
 
 

@@ -223,11 +223,11 @@ def _visible(requirement: Any) -> Check:
 
     def check(values: Values) -> Any:
         viewer = values.body(source)
-        place = as_vec(viewer.get("position"))
+        position = as_vec(viewer.get("position"))
         if "cameraOffset" in viewer.names:
             camera = as_vec(viewer.get("cameraOffset"))
-            place = place.offsetRotated(viewer.get("orientation"), camera)
+            position = position.offsetRotated(viewer.get("orientation"), camera)
         distance = viewer.get("visibleDistance")
-        return sees_all_around(place.x, place.y, distance, rectangle_of(values.body(target)))
+        return sees_all_around(position.x, position.y, distance, rectangle_of(values.body(target)))
 
     return check

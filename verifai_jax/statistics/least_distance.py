@@ -89,10 +89,10 @@ def smallest_change(
 
     **Returns:** the step; None where the linear model has no such point.
     """
-    places = np.flatnonzero(free)
+    indices = np.flatnonzero(free)
     rows = np.flatnonzero(np.isfinite(rho))
-    linear = gradients[np.ix_(rows, places)]
-    gap = (theta - nominal)[places]
+    linear = gradients[np.ix_(rows, indices)]
+    gap = (theta - nominal)[indices]
     # With z = theta + step - nominal: linear @ z >= bound.
     bound = target - rho[rows] + linear @ gap
     sizes = np.linalg.norm(linear, axis=1)
@@ -101,12 +101,12 @@ def smallest_change(
     moved = sizes > 0
     matrix, bound = linear[moved] / sizes[moved, None], bound[moved] / sizes[moved]
     if bounded:
-        identity = np.eye(len(places))
+        identity = np.eye(len(indices))
         matrix = np.vstack([matrix, identity, -identity])
-        bound = np.concatenate([bound, -nominal[places], nominal[places] - 1])
+        bound = np.concatenate([bound, -nominal[indices], nominal[indices] - 1])
     z = shortest(matrix, bound)
     if z is None:
         return None
     step = np.zeros_like(theta)
-    step[places] = z - gap
+    step[indices] = z - gap
     return step

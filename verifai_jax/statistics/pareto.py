@@ -31,10 +31,10 @@ def fronts(points: ArrayLike) -> Int[np.ndarray, " n"]:
     if points.ndim != 2:
         raise ValueError(f"points must have shape [n, objectives]; got {list(points.shape)}")
     numbers = np.full(len(points), -1, np.int64)
-    places = np.flatnonzero(~np.isnan(points).any(axis=1))
+    indices = np.flatnonzero(~np.isnan(points).any(axis=1))
     # Equal points share a front: the distinct ones are enough, and there are often few.
-    distinct, which = np.unique(points[places], axis=0, return_inverse=True)
-    numbers[places] = _fronts_of_distinct(distinct)[which.ravel()]
+    distinct, which = np.unique(points[indices], axis=0, return_inverse=True)
+    numbers[indices] = _fronts_of_distinct(distinct)[which.ravel()]
     return numbers
 
 

@@ -317,11 +317,11 @@ def _inputs(
         domain = None if name == "steps" else domains.get(name)
         if domain is not None and domain.size == 1:
             present = entries.dropna().unique().tolist()
-            place = {
+            index = {
                 entry: float(domain.to_unit(domain.from_columns({name: entry}, name))[0])
                 for entry in present
             }
-            values = entries.map(place).to_numpy(np.float64)
+            values = entries.map(index).to_numpy(np.float64)
             levels, weights = domain.levels[0], domain.weights[0]
             edges = np.linspace(0, 1, levels + 1) if levels else None
             if weights is not None:

@@ -48,10 +48,10 @@ class Attack(NamedTuple):
 
     def select(self, maximum: int) -> Float[np.ndarray, "k d"]:
         """Select the worst violating environment, and those of the worst half farthest apart."""
-        places = np.flatnonzero(self.violating)
-        places = places[np.argsort(self.rho[places], kind="stable")]
-        places = places[: max(maximum, (len(places) + 1) // 2)]
-        points = self.environments[places]
+        indices = np.flatnonzero(self.violating)
+        indices = indices[np.argsort(self.rho[indices], kind="stable")]
+        indices = indices[: max(maximum, (len(indices) + 1) // 2)]
+        points = self.environments[indices]
         if len(points) <= maximum:
             return points
         taken, far = [0], np.linalg.norm(points - points[0], axis=1)
@@ -176,16 +176,16 @@ def _gradients(
         pairs = loop.evaluate(theta[None], points, warmth)
         assert pairs.by_environment is not None
         return pairs.by_environment[0], (points, pairs)
-    places = np.flatnonzero(free)
-    beside = np.repeat(points[:, None], 1 + len(places), axis=1)
-    gaps = np.where(points[:, places] > 0.5, -GAP, GAP)
-    beside[:, 1 + np.arange(len(places)), places] += gaps
+    indices = np.flatnonzero(free)
+    beside = np.repeat(points[:, None], 1 + len(indices), axis=1)
+    gaps = np.where(points[:, indices] > 0.5, -GAP, GAP)
+    beside[:, 1 + np.arange(len(indices)), indices] += gaps
     rows = beside.reshape(-1, points.shape[1])
     pairs = loop.evaluate(theta[None], rows)
     rho = np.where(pairs.proper & np.isfinite(pairs.rho), pairs.rho, np.nan)[0]
     rho = rho.reshape(len(points), -1)
     gradients = np.zeros(points.shape)
-    gradients[:, places] = np.nan_to_num((rho[:, 1:] - rho[:, :1]) / gaps)
+    gradients[:, indices] = np.nan_to_num((rho[:, 1:] - rho[:, :1]) / gaps)
     return gradients, (rows, pairs)
 
 

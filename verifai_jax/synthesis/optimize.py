@@ -221,15 +221,15 @@ def _gradients(
         pairs = loop.evaluate(theta[None], environments, warmth)
         assert pairs.by_parameters is not None
         return np.where(pairs.proper[0], pairs.rho[0], np.inf), pairs.by_parameters[0]
-    places = np.flatnonzero(loop.free)
+    indices = np.flatnonzero(loop.free)
     # Away from the nearer end of the cube; wide enough that float32 has digits left.
-    gaps = np.where(theta[places] > 0.5, -1.0, 1.0) * np.clip(gap, 1e-3, 0.02)
-    beside = np.repeat(theta[None], len(places), axis=0)
-    beside[np.arange(len(places)), places] += gaps
+    gaps = np.where(theta[indices] > 0.5, -1.0, 1.0) * np.clip(gap, 1e-3, 0.02)
+    beside = np.repeat(theta[None], len(indices), axis=0)
+    beside[np.arange(len(indices)), indices] += gaps
     pairs = loop.evaluate(np.concatenate([theta[None], beside]), environments)
     rho = np.where(pairs.proper & np.isfinite(pairs.rho), pairs.rho, np.nan)
     gradients = np.zeros((len(environments), loop.dim))
-    gradients[:, places] = np.nan_to_num((rho[1:] - rho[0]) / gaps[:, None]).T
+    gradients[:, indices] = np.nan_to_num((rho[1:] - rho[0]) / gaps[:, None]).T
     return np.where(np.isnan(rho[0]), np.inf, rho[0]), gradients
 
 

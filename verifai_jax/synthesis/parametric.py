@@ -222,9 +222,9 @@ class ArrayParameters:
 
         for path, leaf in jax.tree_util.tree_leaves_with_path(parameters):
             if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
-                place = jax.tree_util.keystr(path)
+                leaf_path = jax.tree_util.keystr(path)
                 raise TypeError(
-                    f"parameters must be arrays of real numbers; {place or 'they'} is "
+                    f"parameters must be arrays of real numbers; {leaf_path or 'they'} is "
                     f"{jnp.result_type(leaf)}"
                 )
         flat, self._restore = ravel_pytree(parameters)
@@ -284,10 +284,10 @@ class ArrayParameters:
         slopes: Any = (None, None)
         if temperature is not None:
             slopes = np.zeros((len(rows), self.dim)), np.zeros((len(rows), space.dim))
-        places = np.flatnonzero(happens)
+        indices = np.flatnonzero(happens)
         engine = self._values if temperature is None else self._gradients
-        for start in range(0, len(places), engine.batch):
-            these = places[start : start + engine.batch]
+        for start in range(0, len(indices), engine.batch):
+            these = indices[start : start + engine.batch]
             verdicts = engine.evaluate(
                 rows[these], self._key, self.simulations, temperature or 1.0, shared=theta
             )

@@ -111,8 +111,8 @@ class Clusters(Drawn):
         nearest to the centre; `worst`: the row of least robustness, and `worst_rho`. A name that a
         feature has gets `_` added.
         """
-        placed = _place(self.samples, self.scale, self.weight)
-        centred = _place(self.samples, self.scale, self.weight, self.centres)
+        placed = _embed(self.samples, self.scale, self.weight)
+        centred = _embed(self.samples, self.scale, self.weight, self.centres)
         rho = np.nan_to_num(self.samples.rho, nan=np.inf)
         own = []
         for i, cluster in enumerate(self.centres.index):
@@ -212,7 +212,7 @@ def clusters(
     if radius is not None:
         raise ValueError(f"a radius is for method='dbscan'; got {radius!r} with {method!r}")
     weight = _weight(samples, scale)
-    placed = _place(samples, scale, weight)
+    placed = _embed(samples, scale, weight)
     different = len(np.unique(np.concatenate(placed, axis=1), axis=0))
     if count is None:
         count = _best_count(placed, min(check_count("max_clusters", max_clusters), different), rng)
@@ -228,7 +228,7 @@ def clusters(
 
 def _weight(samples: Samples, scale: Scale) -> float:
     """Return the weight with which numbers and choices differ equally on average."""
-    coordinates, codes = samples.place(scale)
+    coordinates, codes = samples.embed(scale)
     apart = 2 * coordinates.var(axis=0).sum() / max(len(samples.ordered), 1)
     if not codes.shape[1] or apart <= 0:
         return 1.0
@@ -236,11 +236,11 @@ def _weight(samples: Samples, scale: Scale) -> float:
     return float(apart / np.mean(unlike)) if np.mean(unlike) > 0 else 1.0
 
 
-def _place(
+def _embed(
     samples: Samples, scale: Scale, weight: float, frame: pd.DataFrame | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return `Samples.place`, divided so that a different choice has this weight."""
-    coordinates, codes = samples.place(scale, frame)
+    """Return `Samples.embed`, divided so that a different choice has this weight."""
+    coordinates, codes = samples.embed(scale, frame)
     return coordinates / np.sqrt(weight), codes
 
 
@@ -287,7 +287,7 @@ def _dense(
         check_positive("radius", radius, finite=True)
     needed = max(4, 2 * len(samples.columns))
     found, radius = dbscan(samples.points(scale), needed, radius, rng)
-    score = _silhouette(samples.place(scale), found, rng)
+    score = _silhouette(samples.embed(scale), found, rng)
     return Clusters(samples, _by_size(found), "dbscan", score, scale, radius=radius)
 
 

@@ -54,5 +54,5 @@ def knee(points: Float[np.ndarray, "n d"], k: int) -> float:
         # All rows have equals: any radius will do that separates different ones.
         return 1e-9
     across, up = np.linspace(0, 1, len(far)), (far - far[0]) / max(far[-1] - far[0], 1e-300)
-    place = int(np.argmax(across - up)) if far[-1] > far[0] else -1
-    return float(far[place]) if far[place] > 0 else float(far[far > 0][0])
+    at = int(np.argmax(across - up)) if far[-1] > far[0] else -1
+    return float(far[at]) if far[at] > 0 else float(far[far > 0][0])

@@ -299,9 +299,9 @@ class _Batch:
         None where nothing is left, or only what it has simulated before and others will now.
         """
         with self._lock:
-            for place, task in enumerate(self.tasks):
+            for index, task in enumerate(self.tasks):
                 if seen.get(task[2]) != worker.number:
-                    del self.tasks[place]
+                    del self.tasks[index]
                     return task
             if self.tasks and self._busy <= {worker, *self._leaving}:
                 return self.tasks.popleft()

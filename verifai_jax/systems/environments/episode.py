@@ -281,9 +281,9 @@ def count_required(function: Callable[..., Any]) -> int | None:
         return None
     if any(p.kind is p.VAR_POSITIONAL for p in parameters):
         return None
-    places = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     return sum(
-        p.kind in places and p.default is p.empty and p.name != "features" for p in parameters
+        p.kind in kinds and p.default is p.empty and p.name != "features" for p in parameters
     )
 
 

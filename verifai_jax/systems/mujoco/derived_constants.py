@@ -220,11 +220,11 @@ def _inertia(kind: int, size: Float[Array, "3"]) -> Float[Array, "3"]:
 
 
 def _combine(parts: list[Any]) -> tuple[Array, Array, Array, Array]:
-    masses, places = (jnp.stack([part[i] for part in parts]) for i in range(2))
+    masses, centres = (jnp.stack([part[i] for part in parts]) for i in range(2))
     mass = jnp.sum(masses)
-    centre = masses @ places / mass
+    centre = masses @ centres / mass
     full = jnp.zeros((3, 3), centre.dtype)
-    for own, place, moments, quat in parts:
+    for own, locate, moments, quat in parts:
         turn, arm = _rotation(quat), place - centre
         full = full + (turn * moments) @ turn.T
         full = full + own * (jnp.dot(arm, arm) * jnp.eye(3, dtype=arm.dtype) - jnp.outer(arm, arm))

@@ -212,7 +212,7 @@ def _mjx_model(bindings: Bindings) -> tuple[Any, Any]:
     if precision not in bindings.models:
         compiled = copy.copy(bindings.model.compiled)
         for binding in bindings.parameters:
-            array, where = binding.place.array, binding.place.index
+            array, where = binding.location.array, binding.location.index
             if array in _SWITCHES:
                 flat = getattr(compiled, array).reshape(-1)
                 flat[where] = np.maximum(flat[where], MIN_POSITIVE)
@@ -232,8 +232,8 @@ def why_not(bindings: Bindings) -> str | None:
     except NotImplementedError as error:
         return f"MJX cannot do this model: {error}{_cure(bindings.model)}"
     compiled = bindings.model.compiled
-    places = {"body_pos", "body_quat", "site_pos", "site_quat"}
-    if compiled.neq and bindings.arrays & places:
+    arrays = {"body_pos", "body_quat", "site_pos", "site_quat"}
+    if compiled.neq and bindings.arrays & arrays:
         return "MJX does not recompute the anchors of equality constraints that features move"
     if compiled.nplugin:
         return "MJX has no plugins"

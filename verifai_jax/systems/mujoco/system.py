@@ -316,7 +316,7 @@ def mujoco(
         substeps=count_periods(control_period, timestep, "control_period", "the model's timestep"),
         delay=delay,
     )
-    _ = loop.places
+    _ = loop.locations
     system = MuJoCo(loop)
     return system if backend == "auto" else system.with_backend(backend)
 

@@ -201,7 +201,7 @@ def remote(
         raise ValueError(
             f"max_memory must be an integer of at least max_bytes={max_bytes}; got {max_memory}"
         )
-    if token is None and not all(_is_loopback(place[4][0]) for place in _places(host, port)):
+    if token is None and not all(_is_loopback(address[4][0]) for address in _addresses(host, port)):
         raise ValueError(
             f"host {host!r} is open to other machines, and whoever connects answers for the "
             "simulator: give token='...', the same here and to the clients, or host='127.0.0.1'"
@@ -233,17 +233,17 @@ def _next(batch: Batch, server: Server) -> tuple[int, Outcome]:
         return outcome
 
 
-def _places(host: str, port: int) -> list[Any]:
+def _addresses(host: str, port: int) -> list[Any]:
     """Return the addresses that `host` resolves to, each once; both loopbacks for `localhost`."""
-    places = []
+    addresses = []
     for name in LOOPBACKS if host == "localhost" else (host,):
         try:
             kind = socket.SOCK_STREAM
             resolved = socket.getaddrinfo(name, port, type=kind, flags=socket.AI_PASSIVE)
         except OSError as error:
             raise ValueError(f"host {host!r} is no address of this machine: {error}") from error
-        places += [p for p in resolved if p[4] not in [other[4] for other in places]]
-    return places
+        addresses += [p for p in resolved if p[4] not in [other[4] for other in addresses]]
+    return addresses
 
 
 def _is_loopback(address: str) -> bool:
@@ -256,7 +256,7 @@ def _listen(host: str, port: int) -> list[socket.socket]:
         opened: list[socket.socket] = []
         chosen = port
         try:
-            for family, kind, _, _, place in _places(host, port):
+            for family, kind, _, _, address in _addresses(host, port):
                 if host == "localhost" and family == socket.AF_INET6 and not _has_ipv6():
                     continue
                 sock = socket.socket(family, kind)
@@ -265,7 +265,7 @@ def _listen(host: str, port: int) -> list[socket.socket]:
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 if family == socket.AF_INET6:
                     sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-                sock.bind((place[0], chosen, *place[2:]))
+                sock.bind((address[0], chosen, *address[2:]))
                 sock.listen(128)
                 chosen = sock.getsockname()[1]
             return opened
