@@ -150,11 +150,11 @@ class Candidates:
             order = [i for i, n in zip(order, items, strict=True) if n <= self.max_items]
         if self.nominal.space.where is None or not order:
             return order
-        accepted_places = []
+        accepted_indices = []
         for start in range(0, len(order), BATCH):
             part = order[start : start + BATCH]
             block = np.zeros((BATCH, points.shape[1]), np.float32)
             block[: len(part)] = points[part]
             accepted = np.asarray(self.nominal.space.accepts_points(block))[: len(part)]
-            accepted_places += [i for i, good in zip(part, accepted, strict=True) if good]
-        return accepted_places
+            accepted_indices += [i for i, good in zip(part, accepted, strict=True) if good]
+        return accepted_indices

@@ -484,7 +484,7 @@ class _RunningSweep:
                     steps=steps,
                     values=configuration.values,
                     status=status if checkpoint.finite else NONFINITE,
-                    place=(run, rung),
+                    entry=(run, rung),
                     checkpoint=checkpoint,
                     nominal_return=self.returns.get((run, rung), float("nan")),
                     safety=self.safety.get((run, rung)),
@@ -498,7 +498,7 @@ class _RunningSweep:
                     steps=training.checkpoints[-1],
                     values=configuration.values,
                     status=error_status(self.runs.errors[run]),
-                    place=(run, -1),
+                    entry=(run, -1),
                 )
             )
         return rows

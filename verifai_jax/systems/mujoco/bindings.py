@@ -26,8 +26,8 @@ from verifai_jax.systems.mujoco.derived_constants import (
 )
 from verifai_jax.systems.mujoco.model import (
     GEOM_MASS,
-    Model,
     Location,
+    Model,
     free_centres_of_mass,
     locate,
 )

@@ -224,8 +224,8 @@ def _combine(parts: list[Any]) -> tuple[Array, Array, Array, Array]:
     mass = jnp.sum(masses)
     centre = masses @ centres / mass
     full = jnp.zeros((3, 3), centre.dtype)
-    for own, locate, moments, quat in parts:
-        turn, arm = _rotation(quat), place - centre
+    for own, position, moments, quat in parts:
+        turn, arm = _rotation(quat), position - centre
         full = full + (turn * moments) @ turn.T
         full = full + own * (jnp.dot(arm, arm) * jnp.eye(3, dtype=arm.dtype) - jnp.outer(arm, arm))
     moments, axes = jnp.linalg.eigh(full)
