@@ -46,8 +46,10 @@ def run(args, shifted):
     for metric in result.metrics:
         compare(result, metric)
     differences = result.compare("error", "none")
-    guided, blind = differences["counterexamples"], differences["random"]
-    print(f"\ngain of counterexamples over that of random inputs: {guided.mean / blind.mean:.2f}")
+    by_search, blind = differences["counterexamples"], differences["random"]
+    print(
+        f"\ngain of counterexamples over that of random inputs: {by_search.mean / blind.mean:.2f}"
+    )
     print(f"counterexamples against random: {result.compare('error', 'random')['counterexamples']}")
     errors = {
         arm: result.table.loc[result.table["arm"] == arm, "error"].to_numpy() for arm in result.arms

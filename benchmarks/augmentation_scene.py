@@ -81,11 +81,11 @@ def scene(features, distance):
         for number in range(3)
     )
     ahead = distance + features["ahead"]
-    beside = features["aside"] - features["lateral"]
+    lateral = features["aside"] - features["lateral"]
     cosine, sine = jnp.cos(features["yaw"]), jnp.sin(features["yaw"])
-    body = Box((ahead, beside, 0.3), (4.4, 1.8, 0.6), colour, features["yaw"])
+    body = Box((ahead, lateral, 0.3), (4.4, 1.8, 0.6), colour, features["yaw"])
     cabin = Box(
-        (ahead + 0.3 * cosine, beside + 0.3 * sine, 0.9),
+        (ahead + 0.3 * cosine, lateral + 0.3 * sine, 0.9),
         (2.2, 1.6, 0.55),
         0.6 * colour,
         features["yaw"],

@@ -119,15 +119,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--budget", type=int, default=1000)
     arguments = parser.parse_args()
-    ways = {"plain": False, "inputs": True, "behaviour": "behaviour"}
+    settings = {"plain": False, "inputs": True, "behaviour": "behaviour"}
     searches = ("cross_entropy", "portfolio")
-    print(f"| problem | search | {' | '.join(ways)} |")
-    print(f"|---|---|{'---|' * len(ways)}")
+    print(f"| problem | search | {' | '.join(settings)} |")
+    print(f"|---|---|{'---|' * len(settings)}")
     for make in (bands, boxes, balance):
         problem, kinds = make()
         for search in searches:
             cells = []
-            for diverse in ways.values():
+            for diverse in settings.values():
                 counts = []
                 for seed in range(arguments.seeds):
                     # In batches of 16 as the others, which learn once a round.
@@ -141,7 +141,7 @@ def main() -> None:
     problem, maximum = stages(), 5 * arguments.budget
     for search in searches:
         cells = []
-        for diverse in ways.values():
+        for diverse in settings.values():
             runs = [
                 vj.falsify(
                     problem, search, maximum, batch=16, seed=seed, diverse=diverse, stop_after=1,

@@ -3,7 +3,8 @@
     python benchmarks/fuzzing.py                        # 20 seeds each, then one is shrunk
 
 Both draw from the automaton of `specs/handover.py`, a black box in Python, and stop at the first
-counterexample. Uniform sequences are cut off at `MAX_SIMULATIONS` simulations, which counts as the number.
+counterexample. Uniform sequences are cut off at `MAX_SIMULATIONS` simulations, which counts as the
+number.
 """
 
 import argparse

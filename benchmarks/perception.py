@@ -173,7 +173,8 @@ def compositional(seeds: int) -> None:
         fewer = np.median(np.array(counts["uniform"]) / np.array(values))
         print(
             f"| {name} | {median:,.0f} | {first:,.0f} to {third:,.0f} | {lowest:,.0f} to "
-            f"{maximum:,.0f} | {np.median(counts['uniform']) / median:.3g} (of pairs: {fewer:.3g}) |"
+            f"{maximum:,.0f} | {np.median(counts['uniform']) / median:.3g} (of pairs: "
+            f"{fewer:.3g}) |"
         )
 
 

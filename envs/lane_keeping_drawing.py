@@ -9,7 +9,7 @@ import numpy as np
 from envs.lane_keeping import CAR_WIDTH, FRONT, LANE_WIDTH, REAR, feature
 from verifai_jax import Trace
 
-BEHIND, AHEAD = 11.0, 25.0
+BACKWARD, AHEAD = 11.0, 25.0
 BELOW, ABOVE = 7.5, 10.5
 VERGE, ASPHALT, PAINT = "#dfe7d5", "#5b6069", "#f4f4f2"
 FINE, BROKEN, TRAIL = "#3a7ca5", "#d1495b", "#f2c14e"
@@ -45,7 +45,7 @@ def draw(axes: Any, trace: Trace, sample: int, features: Mapping[str, Any]) -> N
         color=BROKEN if over else "#30323d",
         family="monospace",
     )
-    axes.set_xlim(-BEHIND, AHEAD)
+    axes.set_xlim(-BACKWARD, AHEAD)
     axes.set_ylim(-BELOW, ABOVE)
     axes.set_aspect("equal")
     axes.set_xticks([])
@@ -59,7 +59,7 @@ class _Road:
 
     def __init__(self, features: Mapping[str, Any], here: float) -> None:
         margin = 15.0
-        self.first, self.last = here - BEHIND - margin, here + AHEAD + margin
+        self.first, self.last = here - BACKWARD - margin, here + AHEAD + margin
         self.distance = np.linspace(self.first, self.last, 321)
         step = self.distance[1] - self.distance[0]
         curvature = np.asarray(feature(features, "curvature", self.distance))

@@ -60,7 +60,8 @@ def cartpole(
 
     - `controller(time, state, features) -> force` in N, of `envs.cartpole`; `linear()` when left
       out.
-    - `features`: which of `BOUND_FEATURES` the feature space has. Others go to the controller alone.
+    - `features`: which of `BOUND_FEATURES` the feature space has. Others go to the controller
+      alone.
     - `duration`: simulated seconds, a multiple of 0.02.
     - `terminate`: end where CartPole-v1 would; otherwise the pole may fall and the cart run on.
     - `backend`: `"auto"`, `"mjx"` or `"native"`.

@@ -101,10 +101,10 @@ class Waveform:
         gaps = np.diff(times)
         if held:
             shortest = gaps.min() if count > 1 else self.duration or 1.0
-            late = time + 1e-5 * shortest
-            piece = max(int(np.searchsorted(times, late, side="right")) - 1, 0)
+            later = time + 1e-5 * shortest
+            piece = max(int(np.searchsorted(times, later, side="right")) - 1, 0)
             width = shortest / 2 if self.width is None else self.width
-            on = self.hold == "constant" or 0 <= late - times[piece] < width
+            on = self.hold == "constant" or 0 <= later - times[piece] < width
             return self.knots[piece] if on else 0 * self.knots[piece]
         if count == 1:
             return self.knots[0]
@@ -227,7 +227,7 @@ class _Connection:
         self.capacity = capacity
         self._received = bytearray()
         self._max_bytes = GREETING_BYTES
-        self._told = 0
+        self._described = 0
         self._points: deque[dict[str, Any]] = deque()
         self._unsent: list[bytes] = []
         try:
@@ -257,9 +257,9 @@ class _Connection:
                 flushed = time.monotonic()
             point = self._points.popleft()
             self._unsent.append(answer(point, simulate))
-            late = time.monotonic() - flushed > FLUSH_SECONDS
+            overdue = time.monotonic() - flushed > FLUSH_SECONDS
             many = 4 * len(self._unsent) >= self.capacity
-            if late or many or sum(map(len, self._unsent)) > FLUSH_BYTES:
+            if overdue or many or sum(map(len, self._unsent)) > FLUSH_BYTES:
                 self._flush()
                 flushed = time.monotonic()
                 if self._readable():
@@ -320,8 +320,8 @@ class _Connection:
                 case "bye":
                     raise EOFError("the run has ended")
                 case "error":
-                    self._told += 1
-                    if self._told <= MAX_LOGGED:
+                    self._described += 1
+                    if self._described <= MAX_LOGGED:
                         log.warning("the server says: %s", plain(message.get("message")))
                     if message.get("fatal") and not self.welcome:
                         raise _refusal(message)

@@ -70,7 +70,7 @@ def case(number: int) -> str:
         try:
             run = vj.load(folder, _problem())
         except NAMED as error:
-            told(error)
+            check_described(error)
             return "refused"
         _rows(run.table.all, whole)
         if not run.summary():
@@ -78,7 +78,7 @@ def case(number: int) -> str:
         try:
             resumed = vj.resume(run, budget=BUDGET, progress=False)
         except NAMED as error:
-            told(error)
+            check_described(error)
             return "loaded, not resumed"
         if run.damage:
             raise Broken(f"a damaged run went on: {run.damage}")
@@ -96,7 +96,7 @@ def _printed(folder: Path) -> None:
         raise Broken(f"the command line prints {done.output[-300:]!r}")
 
 
-def told(error: Exception) -> None:
+def check_described(error: Exception) -> None:
     """Check that an error says something, and not a book."""
     message = str(error)
     if not message or len(message) > 3000:

@@ -80,5 +80,5 @@ def soak(seconds: float) -> Report:
         table = run.table.all
         rows, size = len(table), table.memory_usage(deep=True).sum() / 1e9
     early = next((m for t, m in seen if t - begun > seconds / 5), seen[0][1])
-    late = max(m for t, m in seen if t - begun > seconds / 2)
-    return Report(time.monotonic() - begun, rows, early, late, late - early - 0.8 * size)
+    last = max(m for t, m in seen if t - begun > seconds / 2)
+    return Report(time.monotonic() - begun, rows, early, last, last - early - 0.8 * size)

@@ -108,8 +108,8 @@ def _corner_distances(a: Pose, body: Body, b: Pose, other: Body) -> tuple[Scalar
         along.append(x * cos + y * sin - body.ahead)
         across.append(y * cos - x * sin)
         out = jnp.maximum(jnp.abs(along[-1]) - half_length, 0.0)
-        beside = jnp.maximum(jnp.abs(across[-1]) - half_width, 0.0)
-        squares.append(out**2 + beside**2)
+        lateral = jnp.maximum(jnp.abs(across[-1]) - half_width, 0.0)
+        squares.append(out**2 + lateral**2)
     first = jnp.maximum(_lowest(along), -_greatest(along)) - half_length
     second = jnp.maximum(_lowest(across), -_greatest(across)) - half_width
     return _lowest(squares), jnp.maximum(first, second)
@@ -164,5 +164,5 @@ def sight(
     across = jnp.maximum(jnp.minimum(b, d), -jnp.maximum(b, d)) - half_width
     span = jnp.sqrt((c - a) ** 2 + (d - b) ** 2 + TINY)
     reach = half_length * jnp.abs(d - b) + half_width * jnp.abs(c - a)
-    beside = (jnp.abs(a * d - b * c) - reach) / span
-    return jnp.maximum(jnp.maximum(along, across), beside)
+    lateral = (jnp.abs(a * d - b * c) - reach) / span
+    return jnp.maximum(jnp.maximum(along, across), lateral)

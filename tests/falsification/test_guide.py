@@ -12,7 +12,7 @@ from checked_types import unchecked
 import verifai_jax as vj
 from verifai_jax.evaluation.engine import engine_for
 from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.evaluation.steering import Steering
+from verifai_jax.evaluation.guidance import Guidance
 
 SPACE = {name: vj.Box(0.0, 1.0) for name in "abcd"}
 
@@ -48,7 +48,7 @@ def test_verdicts_and_robustness_are_those_without_it():
     points = np.random.default_rng(0).uniform(size=(64, 4)).astype(np.float32)
     points[:3] = [0.9, 0.2, 0.7, 0.4]
     plain = Evaluator(PLAIN, 64)(points)
-    guided = Evaluator(GUIDED, 64, steering=Steering(guide=True))(points)
+    guided = Evaluator(GUIDED, 64, steering=Guidance(guide=True))(points)
     np.testing.assert_array_equal(plain.rho, guided.rho)
     np.testing.assert_array_equal(plain.violated, guided.violated)
     assert guided.violated[:3].all()
@@ -93,7 +93,7 @@ def test_its_gradient_passes(clauses):
         return made.evaluate(point, key, 0, temperature=0.05)
 
     plain = evaluate(replace(problem, guide=None))
-    guided = evaluate(problem, steering=Steering(guide=True))
+    guided = evaluate(problem, steering=Guidance(guide=True))
     name = "clause_gradients" if clauses else "gradient"
     own, both = (np.reshape(getattr(each, name), (-1, 2))[0] for each in (plain, guided))
 

@@ -60,7 +60,7 @@ def legal(automaton):
 
 
 def taken_by(points):
-    marks = np.asarray(SPACE.marks_at(points))[:, : TRAFFIC.max_events]
+    marks = np.asarray(SPACE.coverage_ids_at(points))[:, : TRAFFIC.max_events]
     return [tuple(int(m) for m in row if m >= 0) for row in marks]
 
 
@@ -106,8 +106,8 @@ def test_what_can_be_covered_is_counted_exactly():
     assert set(TRAFFIC.graph.pairs) == pairs
     assert set(TRAFFIC.graph.transitions) == {number for taken in sequences for number in taken}
     assert set(TRAFFIC.graph.reachable_states) == {"cruise", "crowded", "over"}
-    marks = np.asarray(SPACE.marks_at(POINTS))
-    assert set(np.unique(marks)) == {-1, *range(TRAFFIC.mark_count)}
+    marks = np.asarray(SPACE.coverage_ids_at(POINTS))
+    assert set(np.unique(marks)) == {-1, *range(TRAFFIC.coverage_id_count)}
 
 
 def test_without_events_is_legal_too_and_closes_up():

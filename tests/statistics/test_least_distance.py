@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from verifai_jax.statistics.least_distance import smallest_change
 from verifai_jax.statistics.max_min import max_min_step
+from verifai_jax.statistics.smallest_change import smallest_change
 from verifai_jax.synthesis.optimize import worst_case
 from verifai_jax.synthesis.parametric import Pairs
 

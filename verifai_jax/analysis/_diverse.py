@@ -22,8 +22,8 @@ from verifai_jax.analysis.data.samples import (
     Scale,
     Source,
     Which,
-    beside,
     distances,
+    with_columns,
 )
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.figure import Drawn
@@ -52,7 +52,7 @@ class Diverse(Drawn):
     def table(self) -> pd.DataFrame:
         """The rows of the error table, with their `distance` (`distance_` if a feature is it)."""
         own = pd.DataFrame({"distance": self.distances}, index=pd.Index(self.rows))
-        return beside(self.samples.at(self.rows), own)
+        return with_columns(self.samples.at(self.rows), own)
 
     def __len__(self) -> int:
         return len(self.rows)

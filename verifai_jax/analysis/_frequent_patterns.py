@@ -251,7 +251,7 @@ def _has_both_verdicts(samples: Samples) -> bool:
 def _frequent(
     items: tuple[Item, ...], present: np.ndarray, elsewhere: np.ndarray, min_count: int, size: int
 ) -> tuple[list[tuple[int, ...]], np.ndarray, np.ndarray]:
-    """Return all combinations of at most `size` items, of different columns, with `min_count` rows."""
+    """Return combinations of up to `size` items of different columns with `min_count` rows."""
     combinations: list[tuple[int, ...]] = []
     counts: list[int] = []
     shares: list[float] = []

@@ -22,9 +22,9 @@ from verifai_jax.analysis.data.samples import (
     Seed,
     Source,
     Which,
-    beside,
     distances,
     generator,
+    with_columns,
 )
 from verifai_jax.analysis.tightest import tightest
 from verifai_jax.core.checks import check_count
@@ -56,7 +56,7 @@ class Neighbours(Drawn):
     def table(self) -> pd.DataFrame:
         """The rows of the error table, with their `distance` (`distance_` if a feature is it)."""
         own = pd.DataFrame({"distance": self.distances}, index=pd.Index(self.rows))
-        return beside(self.samples.at(self.rows), own)
+        return with_columns(self.samples.at(self.rows), own)
 
     def __len__(self) -> int:
         return len(self.rows)

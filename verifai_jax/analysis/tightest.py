@@ -89,8 +89,8 @@ def _within(
 
 def _taken(weights: Int[np.ndarray, "n k"], k: int) -> Int[np.ndarray, "n k"]:
     """Count how many of each neighbour, the nearest first, are among the `k` nearest rows."""
-    behind = np.cumsum(weights, axis=1) - weights
-    return np.clip(k - behind, 0, weights)
+    before = np.cumsum(weights, axis=1) - weights
+    return np.clip(k - before, 0, weights)
 
 
 def _tree(coordinates: np.ndarray) -> Any:

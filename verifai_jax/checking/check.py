@@ -71,7 +71,8 @@ class Check:
         if self.budget < minimum:
             raise ValueError(
                 f"a budget of {self.budget:,} simulations cannot show a failure probability of at "
-                f"most {format_percent(self.max_failure_probability)}: if none fails, {minimum:,} do"
+                f"most {format_percent(self.max_failure_probability)}: if none fails, {minimum:,} "
+                "do"
             )
 
     def run(

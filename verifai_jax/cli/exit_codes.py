@@ -86,7 +86,7 @@ def command_error(error: BaseException, show_traceback: bool = False) -> Command
     """
     from verifai_jax.core.text import printable
 
-    message, code = _told(error)
+    message, code = _message_and_code(error)
     if show_traceback or not message:
         sys.stderr.write(printable("".join(traceback.format_exception(error))))
     if not message:
@@ -97,7 +97,7 @@ def command_error(error: BaseException, show_traceback: bool = False) -> Command
     return CommandError(printable(message, _MAX_ERROR_LENGTH), code)
 
 
-def _told(error: BaseException) -> tuple[str, int]:
+def _message_and_code(error: BaseException) -> tuple[str, int]:
     """Return the message and the exit code of an error; no message for a bug."""
     if isinstance(error, USAGE_ERRORS):
         return str(error), WRONG_USAGE

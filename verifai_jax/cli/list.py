@@ -90,8 +90,8 @@ def _print_target(target: "Problem | Study") -> None:
 def _no_specs() -> str:
     """Say that there is no folder of problems here, and what there is."""
     files = sorted(file.name for file in Path().glob("[!_]*.py"))
-    beside = f". Python files here: {', '.join(files)}" if files else ""
+    others = f". Python files here: {', '.join(files)}" if files else ""
     return (
         "there is no folder specs/ here; verifai-jax list FILE.py (or FOLDER) lists the problems "
-        f"of a file or folder{beside}"
+        f"of a file or folder{others}"
     )

@@ -158,8 +158,8 @@ def _is_of_project(location: str, folder: Path) -> bool:
     if any(name in RESULTS for name in folders):
         return False
     # What came with the folder, as from one archive, lies beside it.
-    beside = folder.relative_to(here).parts[:1] if folder.is_relative_to(here) else ()
-    if beside and beside == folders[:1]:
+    inside = folder.relative_to(here).parts[:1] if folder.is_relative_to(here) else ()
+    if inside and inside == folders[:1]:
         return False
     inner = file.parents[: len(folders)]
     return not any((each / name).exists() for each in inner for name in _OF_RESULTS)

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Int, Real
 
 from verifai_jax.core.checks import check_name, is_number
 from verifai_jax.core.gaps import known_times, with_gaps
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_seconds
 
@@ -178,7 +178,7 @@ class Trace(InNotebook):
         **Raises:** `ValueError` for a frame without rows, numbers or sample times, and for times
         that do not increase.
         """
-        return late("verifai_jax.mtl.recording", "read")(frame, time=time, dt=dt)
+        return lazy_import("verifai_jax.mtl.recording", "read")(frame, time=time, dt=dt)
 
     @property
     def length(self) -> int:

@@ -238,9 +238,9 @@ def _sentence(error: BaseException, step: TracebackType, features: object) -> st
 def _advice_on_tracing(error: BaseException) -> str:
     """Write what to do about an error that comes of tracing; empty for others."""
     # NumPy raises an error of its own from that of JAX.
-    for told in (error, error.__cause__):
+    for each in (error, error.__cause__):
         for kind, advice in TRACING:
-            if isinstance(told, kind):
+            if isinstance(each, kind):
                 return WRITES if "array element" in storable(error) else advice
     if not isinstance(error, TypeError | IndexError):
         return ""

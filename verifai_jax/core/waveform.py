@@ -137,9 +137,9 @@ class Waveform:
             starts = xp.asarray(self.times, time.dtype)
             gap = _shortest(self.times)
             rounding = 4 * float(jnp.finfo(time.dtype).eps) * self.times[-1]
-            late = time + sign * max(1e-5 * gap, rounding)
-            piece = xp.clip(_last_not_after(starts, late, xp), 0, count - 1)
-            since, width = late - starts[piece], gap / 2 if self.width is None else self.width
+            later = time + sign * max(1e-5 * gap, rounding)
+            piece = xp.clip(_last_not_after(starts, later, xp), 0, count - 1)
+            since, width = later - starts[piece], gap / 2 if self.width is None else self.width
         else:
             if count == 1 and self.hold == "constant":
                 return knots[0]

@@ -67,8 +67,8 @@ def confirm(
       counterexamples of the table when left out.
     - `simulator`: another system for the same features and signals, a problem with one, or the
       name of another backend, that has to agree.
-    - `max_rows`: how many rows are replayed at least, by default 256, and more where a row takes few
-      replays; of more, the worst and those nearest to zero, until the rest
+    - `max_rows`: how many rows are replayed at least, by default 256, and more where a row takes
+      few replays; of more, the worst and those nearest to zero, until the rest
       is far from it (see `evaluation.confirmer.Confirmer`).
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
 

@@ -339,7 +339,7 @@ class _Search:
         candidates.limit = candidates.budget - 2 * nominal.space.dim
         self.follow(self.starts()[:1])
         # A boundary of many pieces has a nearest point on each: some of those beside this one.
-        search_beside(candidates, self.failures()[0], self.rng)
+        search_alongside(candidates, self.failures()[0], self.rng)
         self.follow(self.starts(self.failures()[:1], cosine=0.97)[1:], rounds=10)
         for _ in range(2):
             if candidates.left < candidates.budget // 20:
@@ -389,8 +389,8 @@ class _Search:
             if len(chosen) >= FOLLOWED:
                 break
             v = u - nominal.u
-            ways = [w - nominal.u for w in chosen]
-            if all(v @ w < cosine * np.linalg.norm(v) * np.linalg.norm(w) for w in ways):
+            departures = [w - nominal.u for w in chosen]
+            if all(v @ w < cosine * np.linalg.norm(v) * np.linalg.norm(w) for w in departures):
                 chosen.append(u)
         return np.array(chosen)
 
@@ -403,7 +403,7 @@ class _Search:
             self.note()
 
 
-def search_beside(
+def search_alongside(
     candidates: Candidates, u: Float[np.ndarray, " d"], rng: np.random.Generator
 ) -> None:
     """Search failures on the same coordinates, a little farther away in other directions."""

@@ -178,9 +178,9 @@ def describe_gradient(influences: Sequence[Influence]) -> str:
     what = i.name if len(i.gradient) == 1 else i.coordinates[k]
     if i.spans is not None:
         what = f"{i.name} {format_spans([i.spans[k]])}"
-    way = "less" if slope < 0 else "more"
+    direction = "less" if slope < 0 else "more"
     return (
-        f"A small change helps most in {what}: {way} of it raises the robustness by about "
+        f"A small change helps most in {what}: {direction} of it raises the robustness by about "
         f"{format_number(abs(slope), 3)} for each unit, near this value."
     )
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from verifai_jax.core.figure import Drawn
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 from verifai_jax.statistics.binomial import simulations_until
@@ -179,4 +179,4 @@ class Estimate(Drawn, InNotebook):
 
         **Returns:** the path.
         """
-        return late("verifai_jax.reports", "write_report")(self, path, **options)
+        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)

@@ -93,8 +93,8 @@ class Confirmer:
     - `seed`: of the run; a simulation gets the random key that it had.
     - `simulator`: another system for the same features and signals, or a problem with one, that
       has to agree.
-    - `max_rows`: how many rows are examined whatever comes; by default 256, and more where a row takes
-      few replays: 2048 where the step stays. Of more, those nearest to zero are, and
+    - `max_rows`: how many rows are examined whatever comes; by default 256, and more where a row
+      takes few replays: 2048 where the step stays. Of more, those nearest to zero are, and
       further ones until the rest is ten times farther from zero than any replay has moved a row;
       these stay `unexamined`. Only where rows have a column `rho`. A row that is worse than all
       examined before is examined whatever else was.

@@ -32,10 +32,10 @@ from verifai_jax.core.executors import (
 from verifai_jax.core.programs import Slot
 from verifai_jax.core.shapes import power_of_two
 from verifai_jax.evaluation.engine import chunks_and_lanes
+from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.remarks import Remarks
-from verifai_jax.evaluation.steering import NOTHING, Steering
 from verifai_jax.evaluation.verdicts import RowVerdict, Verdicts
 from verifai_jax.evaluation.worker import ARRAYS, BlockMode, evaluate_block, question_of
 from verifai_jax.problem.problem import Problem
@@ -68,7 +68,7 @@ class ExecutorEngine:
     - `problem`: a checked one, on the backend it is to run on.
     - `batch`: rows of a batch on one machine, which says how many lanes go together.
     - `executor`: with `submit`.
-    - `gradient`, `clauses`, `precision`, `steering`: as of `engine.Engine`.
+    - `gradient`, `clauses`, `precision`, `guidance`: as of `engine.Engine`.
     - `given`: whether points are rows of given features, as of `CubePoints`.
     - `journal`: of rows in flight, for a problem on the host.
     - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
@@ -88,7 +88,7 @@ class ExecutorEngine:
         precision: str = "float32",
         journal: Journal | None = None,
         target: str | None = None,
-        steering: Steering = NOTHING,
+        guidance: Guidance = NOTHING,
         given: bool = False,
     ) -> None:
         check_executor(executor)
@@ -106,7 +106,7 @@ class ExecutorEngine:
         smallest = power_of_two(batch)
         backend = problem.system.backend if problem.system.backends else None
         self.mode = BlockMode(
-            lanes, gradient, clauses, precision, smallest, backend, steering, given
+            lanes, gradient, clauses, precision, smallest, backend, guidance, given
         )
         self._dtype = np.dtype(precision if given else "float32")
         self.unit = lanes
@@ -221,7 +221,7 @@ class ExecutorEngine:
                 self.problem,
                 self.precision,
                 self._journal,
-                steering=self.mode.steering,
+                guidance=self.mode.guidance,
                 given=self.mode.given,
             )
         return self._recalling.evaluate(u, key, first, padded_to=self.mode.padded_to)
@@ -247,12 +247,12 @@ class ExecutorEngine:
             self._remarks.join(result["remarks"])
         if self._journal is not None and result["seconds"] > WORTH_KEEPING * count:
             for i in range(count):
-                marks = None if verdicts.marks is None else verdicts.marks[i]
+                coverage_ids = None if verdicts.coverage_ids is None else verdicts.coverage_ids[i]
                 message = "" if verdicts.messages is None else verdicts.messages[i]
                 holds = np.array(not verdicts.violated[i])
-                steering = None if verdicts.steering is None else verdicts.steering[i]
+                guidance = None if verdicts.guidance is None else verdicts.guidance[i]
                 rho, status = verdicts.rho[i], int(verdicts.status[i])
-                row = RowVerdict(rho, status, holds, message, marks, steering)
+                row = RowVerdict(rho, status, holds, message, coverage_ids, guidance)
                 self._journal.add(first + i, u[i], row)
         return verdicts
 

@@ -129,9 +129,9 @@ def _likeliest_of(
     """
     region, ends = np.full(len(z), -1), found.design_points
     nearest = np.argsort(squared_distances(z, ends), axis=1)
-    ways = [(ends[column], column) for column in nearest.T]
-    ways += [(found.points[rows], found.region[rows]) for rows in found.candidates(z).T]
-    for points, number in ways:
+    candidates = [(ends[column], column) for column in nearest.T]
+    candidates += [(found.points[rows], found.region[rows]) for rows in found.candidates(z).T]
+    for points, number in candidates:
         left = np.flatnonzero(region < 0)
         joined = left[connected(own, z[left], points[left])] if len(left) else left
         region[joined] = number[joined]

@@ -27,7 +27,7 @@ SAME = 0.05
 """Distance below which two least distant failures are one, in parts of the first one's."""
 LOOKED_AT = 150
 """Failures from which paths to their region are tried, at a time."""
-WHOLE_EFFORT = 4500
+FULL_SEARCH = 4500
 """Simulations left from which so many are looked at; with fewer, as many fewer are."""
 A_LOOK = 8
 """Simulations that a look at a failure takes, about."""
@@ -89,7 +89,7 @@ def share_explained(
 
 def _scaled(limit_state: LimitState, maximum: int) -> int:
     """Return how many to look at, at least two."""
-    return max(2, round(maximum * min(1.0, _left(limit_state) / WHOLE_EFFORT)))
+    return max(2, round(maximum * min(1.0, _left(limit_state) / FULL_SEARCH)))
 
 
 def _left(limit_state: LimitState) -> int:

@@ -229,7 +229,7 @@ def repeat(
     each = min(rounds, max(1, SIMULATIONS_A_CALL // batch))
     with in_precision(precision):
         program = traced.programs.get(
-            WHOLE_ROUNDS,
+            MERGED_ROUNDS,
             (search, batch, each, precision),
             lambda: _WholeRounds(traced, search, batch, each, precision),
         )
@@ -377,5 +377,5 @@ class _WholeRounds:
         return state, jax.tree.map(lambda each: each.reshape(-1, *each.shape[2:]), results)
 
 
-WHOLE_ROUNDS: Slot[tuple[Search, int, int, str], _WholeRounds] = Slot("whole rounds")
+MERGED_ROUNDS: Slot[tuple[Search, int, int, str], _WholeRounds] = Slot("whole rounds")
 """Compiled rounds by (search, batch, rounds, precision)."""

@@ -24,7 +24,7 @@ from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.confirm_seeds import SeedConfirmer
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Observations, Search
-from verifai_jax.search.proposals import effort_of
+from verifai_jax.search.proposals import optimization_of
 from verifai_jax.search.repetition import Repetition
 
 VALUES_AT_ONCE = 256
@@ -97,12 +97,14 @@ def lockstep(
         rows = np.minimum(rows, left)
         if not rows.any():
             break
-        u, told = u.copy(), u.copy()
+        u, learned = u.copy(), u.copy()
         proposed += planned
         for seed, repetition in enumerate(repetitions):
             chosen = np.arange(batch) < planned[seed]
             number = int(proposed[seed])
-            u[seed], told[seed] = repetition.avoid(told[seed], chosen, not wanted[seed], number)
+            u[seed], learned[seed] = repetition.avoid(
+                learned[seed], chosen, not wanted[seed], number
+            )
             repetition.add(u[seed, : rows[seed]])
         values = np.full((n, batch), np.nan, np.float32)
         valid, broken = np.zeros((n, batch), bool), np.zeros((n, batch), bool)
@@ -151,7 +153,7 @@ def lockstep(
             if len(first) and not failed[seed]:
                 failed[seed], failures[seed] = True, u[seed, first[0]]
         observations = Observations(
-            u=jnp.asarray(told),
+            u=jnp.asarray(learned),
             rho=jnp.asarray(values),
             valid=jnp.asarray(valid),
             clauses=jnp.asarray(clauses),
@@ -189,7 +191,7 @@ def _search_programs(
 
     def make() -> tuple[jax.stages.Wrapped, ...]:
         # As for `falsify`: what is rounded otherwise may end up elsewhere.
-        options = options_of(effort_of(search, batch))
+        options = options_of(optimization_of(search, batch))
         compiled = partial(jax.jit, compiler_options=options)
         return (
             compiled(jax.vmap(lambda key: search.init(key, cube, batch))),

@@ -41,7 +41,7 @@ from verifai_jax.search.proposals import compiled_search
 if TYPE_CHECKING:
     import pandas as pd
 
-    from verifai_jax.falsification.ahead import Ahead
+    from verifai_jax.falsification.prefetch import Prefetch
     from verifai_jax.falsification.suggestions import Suggestions
 
 COMPILE, SEARCH, SIMULATE, CONFIRM, REST = "compile", "search", "simulate", "confirm", "rest"
@@ -91,7 +91,7 @@ class Rounds:
             journal=self._journal,
             executor=executor,
             target=target,
-            steering=self.learning.steering,
+            guidance=self.learning.guidance,
             keep_traces=self.learning.surrogate is not None,
             given=suggests or self.first.shape[1] > problem.space.dim,
         )
@@ -105,8 +105,8 @@ class Rounds:
         self.checkpoint: dict[str, Any] = {}
         self.record_checksum = 0
         self._pending: Any = None  # Points of the first round that are proposed already.
-        self._sends_ahead = executor is not None and not search.learns
-        self._ahead: Ahead | None = None
+        self._prefetches = executor is not None and not search.learns
+        self._prefetch: Prefetch | None = None
         self._saved = time.perf_counter()
         self._raising = Raising()
 
@@ -123,7 +123,7 @@ class Rounds:
         if differentiates:
             # They take longest to load: first, where nothing of them is to be traced.
             self._simulations.begin_if_recalled()
-        compiled_search(stage, cube, self.batch, self.learning.mark_width)
+        compiled_search(stage, cube, self.batch, self.learning.coverage_id_count)
         self.evaluate.begin_compiling()
         if differentiates:
             self._simulations.begin_derivatives()
@@ -166,14 +166,14 @@ class Rounds:
             left = maximum if limit is None else max(limit - done, 0)
             if len(given[:left]):
                 return Batch(given[:left], "suggested", limit is not None and len(given) > left)
-        if self._sends_ahead:
-            if self._ahead is None:
-                from verifai_jax.falsification.ahead import Ahead
+        if self._prefetches:
+            if self._prefetch is None:
+                from verifai_jax.falsification.prefetch import Prefetch
 
                 limit = done + maximum if limit is None else limit
                 proposals = self.learning.proposals
-                self._ahead = Ahead(proposals, self.evaluate, self.batch, limit, done)
-            points, verdicts = self._ahead.next()
+                self._prefetch = Prefetch(proposals, self.evaluate, self.batch, limit, done)
+            points, verdicts = self._prefetch.next()
             return Batch(points, "search", verdicts=verdicts)
         points, self._pending = self._pending, None
         if points is not None:
@@ -209,11 +209,11 @@ class Rounds:
         columns = rows_of(self.problem, verdicts, self._simulations.differentiates)
         if self.suggestions is not None:
             columns["suggested"] = np.full(len(batch.points), batch.source == "suggested")
-        marks, book = None, self.learning.marks
+        coverage_ids, book = None, self.learning.coverage_ids
         if book is not None:
-            marks = book.of(batch.points, verdicts)
-            columns["new_marks"] = book.add(marks)
-            marks = book.of_kinds(marks)
+            coverage_ids = book.of(batch.points, verdicts)
+            columns["new_coverage"] = book.add(coverage_ids)
+            coverage_ids = book.of_kinds(coverage_ids)
         objective = self.learning.objective(verdicts)
         claimed = verdicts.violated
         if self._confirmer is not None:
@@ -221,7 +221,7 @@ class Rounds:
             verdicts = without_failure(verdicts, verdicts.violated & ~claimed)
         if learns:
             with self._searching():
-                self.learning.learn(batch, objective, verdicts, marks)
+                self.learning.learn(batch, objective, verdicts, coverage_ids)
         self.table.append(columns)
         self.tally.add(verdicts, claimed)
 
@@ -280,7 +280,7 @@ class Rounds:
         waiting = suggestions.waiting(rows)
         if len(waiting) or not suggestions.due(rows):
             return waiting
-        from verifai_jax.falsification.question import describe_run
+        from verifai_jax.falsification.suggestion_prompt import describe_run
 
         question = describe_run(
             self.problem,
@@ -397,14 +397,16 @@ class Rounds:
     @property
     def exhausted(self) -> bool:
         """True if a finite search has come to its end."""
-        waiting = self._pending is not None or (self._ahead is not None and not self._ahead.empty)
+        waiting = self._pending is not None or (
+            self._prefetch is not None and not self._prefetch.empty
+        )
         proposals = self.learning.proposals
         return proposals is not None and proposals.exhausted and not waiting
 
     def close(self) -> None:
         """Cancel what workers have been sent ahead and have not begun."""
-        if self._ahead is not None:
-            self._ahead.close()
+        if self._prefetch is not None:
+            self._prefetch.close()
 
     def save(self, seldom: bool = False) -> None:
         """Write the checkpoint to the folder; if `seldom`, only when the last one is a second old.
@@ -437,7 +439,7 @@ class Rounds:
 
     def _keep(self) -> None:
         """Take the checkpoint: nothing is copied, as nothing in it is ever written to."""
-        ahead, proposals = self._ahead, self.learning.proposals
+        ahead, proposals = self._prefetch, self.learning.proposals
         state = proposals.checkpoint() if ahead is None else ahead.checkpoint
         self.checkpoint = {**state, "rows": np.array(len(self.table))}
         for part in self._parts:

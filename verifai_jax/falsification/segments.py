@@ -109,9 +109,9 @@ class Segment:
     def read_standing_out(self) -> "pd.DataFrame":
         """Return those of its rows that stand out, from their own file where it is whole."""
         folder = self.path.parent.parent / FAILURES
-        for beside in list_segments(folder):
-            if (beside.first, beside.stop) == (self.first, self.stop) and not beside.damage:
-                return beside.read()
+        for others in list_segments(folder):
+            if (others.first, others.stop) == (self.first, self.stop) and not others.damage:
+                return others.read()
         frame = self.read()
         return frame.iloc[standing_out({str(name): frame[name].to_numpy() for name in frame})]
 
@@ -147,12 +147,12 @@ def write_segment(run: Path, first: int, columns: Columns) -> Segment:
 
 def _write(folder: Path, first: int, stop: int, content: "pa.Buffer") -> Path:
     folder.mkdir(exist_ok=True)
-    return write_whole(
+    return write_complete(
         folder / f"rows-{first:012d}-{stop:012d}-{zlib.crc32(content):08x}.parquet", content
     )
 
 
-def write_whole(path: Path, content: "pa.Buffer | bytes") -> Path:
+def write_complete(path: Path, content: "pa.Buffer | bytes") -> Path:
     """Write a file such that a reader never meets a half of it; return its path."""
     partial = path.with_name(f".{path.name}.part")  # Readers of a folder leave it out.
     try:

@@ -43,7 +43,7 @@ from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.evaluation.worker import ARRAYS, evaluate_block
 from verifai_jax.falsification._falsify import falsify
 from verifai_jax.falsification.run import Run
-from verifai_jax.falsification.segments import write_whole
+from verifai_jax.falsification.segments import write_complete
 from verifai_jax.falsification.validation import (
     adapt_search,
     check_options,
@@ -197,7 +197,7 @@ def _simulate(
     proposals = Proposals(search, space.cube, batch, key, space.constraint, 0)
     done = set()
     for block, path in list(_blocks(folder)):
-        if _is_whole(path):
+        if _is_complete(path):
             done.add((block.start, block.stop))
         else:
             path.unlink()  # It is made anew.
@@ -235,7 +235,7 @@ def _claim(folder: Path, record: Mapping[str, Any]) -> None:
     if {path.name for path in folder.iterdir()} - {LOCK}:
         raise ValueError(f"folder {str(folder)!r} is not empty; a part of a run needs a new one")
     with writing(folder):
-        write_whole(folder / RECORD, json.dumps(sealed(record), indent=2).encode())
+        write_complete(folder / RECORD, json.dumps(sealed(record), indent=2).encode())
 
 
 def _check_same_model(folder: Path, record: Mapping[str, Any], now: Sources) -> None:
@@ -285,7 +285,7 @@ def _write(folder: Path, first: int, u: Float[np.ndarray, "n d"], verdicts: Verd
     data = content.getvalue()
     stop = first + len(u)
     with writing(folder):
-        write_whole(folder / f"block-{first:012d}-{stop:012d}-{zlib.crc32(data):08x}.npz", data)
+        write_complete(folder / f"block-{first:012d}-{stop:012d}-{zlib.crc32(data):08x}.npz", data)
 
 
 def _blocks(folder: Path) -> Iterator[tuple[range, Path]]:
@@ -294,7 +294,7 @@ def _blocks(folder: Path) -> Iterator[tuple[range, Path]]:
             yield range(int(match[1]), int(match[2])), path
 
 
-def _is_whole(path: Path) -> bool:
+def _is_complete(path: Path) -> bool:
     return path.name.endswith(f"-{zlib.crc32(path.read_bytes()):08x}.npz")
 
 

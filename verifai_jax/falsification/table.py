@@ -49,8 +49,8 @@ from verifai_jax.falsification.segments import (
     parquet,
     remove_segments,
     standing_out,
+    write_complete,
     write_segment,
-    write_whole,
 )
 from verifai_jax.falsification.tail import TAIL, Tail, read_tail, replace_tail
 
@@ -69,7 +69,7 @@ RESERVED = (
     "differentiated",
     "verdict",
     "rho_again",
-    "new_marks",
+    "new_coverage",
     "suggested",
 )
 """Names of the table's own columns, which no feature may have."""
@@ -500,7 +500,7 @@ class ErrorTable(InNotebook):
     def _write_finished(self, folder: Path) -> None:
         batches = list(self._parts(0, self._next))
         columns = merge(batches) if batches else from_frame(self._empty)
-        write_whole(folder / FINISHED, parquet(columns, np.arange(self._next)))
+        write_complete(folder / FINISHED, parquet(columns, np.arange(self._next)))
 
     def _replace_by(self, parts: Iterator[Batch]) -> None:
         """Take these rows, in place of what the folder holds."""

@@ -15,7 +15,7 @@ import zlib
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
-from verifai_jax.falsification.segments import TableError, write_whole
+from verifai_jax.falsification.segments import TableError, write_complete
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -69,7 +69,7 @@ def replace_tail(folder: Path, first: int, batch: "pa.RecordBatch | None") -> No
 
     **Raises:** `OSError` where it cannot be written.
     """
-    write_whole(folder / TAIL, b"" if batch is None else _frame(first, batch))
+    write_complete(folder / TAIL, b"" if batch is None else _frame(first, batch))
 
 
 def read_tail(folder: Path) -> "list[tuple[int, pa.RecordBatch]]":

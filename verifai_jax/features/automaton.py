@@ -30,11 +30,11 @@ class Automaton(Domain):
             ("crowded", "brake"): dict(to="cruise", wait=Box(0.2, 2), rate=Box(2, 8), weight=2.0),
         })
 
-    A value is an `Events`. The prior: the number of events is uniform over `min_events` to `max_events`, and a
-    sequence ends early in a state that no event can leave; each event is drawn among those that
-    are enabled after the ones before it, in proportion to their weights; waiting times and
-    parameters come from their domains. Each of these is one unit coordinate by its inverse
-    cumulative distribution, so every point of the cube is a legal sequence.
+    A value is an `Events`. The prior: the number of events is uniform over `min_events` to
+    `max_events`, and a sequence ends early in a state that no event can leave; each event is drawn
+    among those that are enabled after the ones before it, in proportion to their weights; waiting
+    times and parameters come from their domains. Each of these is one unit coordinate by its
+    inverse cumulative distribution, so every point of the cube is a legal sequence.
 
     **Arguments:**
 
@@ -52,9 +52,9 @@ class Automaton(Domain):
     - `min_events`: events at least, unless no event is possible any longer.
 
     **Raises:** `ValueError` for events that are none, options that are unknown or out of range,
-    states that no event leads to, a `to` that is nearly the name of another state, a `min_events` that
-    no sequence reaches, guards that tell too many pasts apart; `TypeError` for a parameter that is
-    no domain.
+    states that no event leads to, a `to` that is nearly the name of another state, a `min_events`
+    that no sequence reaches, guards that tell too many pasts apart; `TypeError` for a parameter
+    that is no domain.
     """
 
     start: str
@@ -76,7 +76,8 @@ class Automaton(Domain):
             or not 0 <= min_events <= max_events
         ):
             raise ValueError(
-                f"min_events must be an integer from 0 to max_events, {max_events}; got {min_events!r}"
+                f"min_events must be an integer from 0 to max_events, {max_events}; got "
+                f"{min_events!r}"
             )
         if not isinstance(events, Mapping) or not events:
             raise ValueError(
@@ -101,8 +102,9 @@ class Automaton(Domain):
         longest = self.graph.longest(max_events)
         if longest < min_events:
             raise ValueError(
-                f"min_events={min_events} events are impossible: no sequence from {start!r} has more than "
-                f"{longest}, after which no event is enabled; allow fewer, or add events that go on"
+                f"min_events={min_events} events are impossible: no sequence from {start!r} has "
+                f"more than {longest}, after which no event is enabled; allow fewer, or add "
+                "events that go on"
             )
 
     def _check_parameters(self) -> None:
@@ -340,12 +342,12 @@ class Automaton(Domain):
         return jnp.split(slots, np.cumsum(self._tables.widths)[:-1].tolist(), axis=1)
 
     @property
-    def mark_count(self) -> int:
+    def coverage_id_count(self) -> int:
         return len(self.transitions) + len(self.graph.pairs)
 
-    def marks(self, value: Events) -> Int[jax.Array, " marks"]:
+    def coverage_ids(self, value: Events) -> Int[jax.Array, " ids"]:
         taken, _ = self._follow(jnp.asarray(value.kinds))
-        pairs = jnp.asarray(self._tables.pair_marks)[taken[:-1], taken[1:]]
+        pairs = jnp.asarray(self._tables.pair_ids)[taken[:-1], taken[1:]]
         both = (taken[:-1] >= 0) & (taken[1:] >= 0)
         return jnp.concatenate([taken, jnp.where(both, pairs, ABSENT)])
 

@@ -82,9 +82,9 @@ def _moving(
     drawn = (model.geom_group < 3) & (model.geom_rgba[:, 3] > 0)
     (first, turned), *others = positions
     far = np.zeros(model.ngeom)
-    for position, way in others:
+    for position, rotation in others:
         shift = np.linalg.norm(position - first, axis=1)
-        turn = np.linalg.norm(way - turned, axis=1) * model.geom_rbound
+        turn = np.linalg.norm(rotation - turned, axis=1) * model.geom_rbound
         far = np.maximum(far, np.maximum(shift, turn))
     # What shakes a little beside what moves is not what one looks at.
     moving = drawn & (far > max(0.02 * far[drawn].max(initial=0.0), 1e-6))

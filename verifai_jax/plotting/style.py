@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax.core import figure
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.figure import Axes, Figure
 from verifai_jax.core.text import shorten
-from verifai_jax.core.whole_files import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axis import Axis

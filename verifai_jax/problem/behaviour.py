@@ -1,7 +1,7 @@
 """Behaviour of a trace as numbers: cells that its signals visit, the clause nearest to breaking.
 
 behaviour = Behaviour({"mode": (0, 4, 5), "speed": (0, 40, 4)})
-behaviour(trace)                                    # [marks], -1 for what it does not show
+behaviour(trace)                                    # [ids], -1 for what it does not show
 """
 
 import math
@@ -92,12 +92,12 @@ class Behaviour:
 
     @property
     def size(self) -> int:
-        """Number of marks of a trace."""
+        """Number of coverage ids of a trace."""
         return self.cells + bool(self.formulas)
 
     @property
     def total(self) -> int:
-        """Number of different marks: cells first, then clauses."""
+        """Number of different coverage_ids: cells first, then clauses."""
         goals = self.goals
         return self.cells + (0 if goals is None else len(goals.goals))
 
@@ -111,8 +111,8 @@ class Behaviour:
             parts.append(f"{axis.name} {begin:z.4g} to {begin + width:z.4g}")
         return ", ".join(reversed(parts))
 
-    def __call__(self, trace: Trace, end: End = "hold") -> Int[Array, " marks"]:
-        """Return the marks of a trace; traced by JAX. A trace without the signals has no cells."""
+    def __call__(self, trace: Trace, end: End = "hold") -> Int[Array, " ids"]:
+        """Return the ids of a trace; traced by JAX. A trace without the signals has no cells."""
         trace = trace.hold()
         parts = []
         if self.axes:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.checks import check_name
 from verifai_jax.core.errors import missing_name
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook, text_html
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import ProgramCache, Slot
@@ -247,7 +247,7 @@ class Problem(InNotebook):
         **Raises:** `ProblemError` for a system that JAX does not trace; `UnknownNameError` for an
         `of` or a formula that there is not; what `check` raises.
         """
-        function = late("verifai_jax.evaluation.objective", "objective")
+        function = lazy_import("verifai_jax.evaluation.objective", "objective")
         return function(self, semantics, of, key, formula)
 
     @truncate_silently()

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from verifai_jax.comparison.result import Comparison
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.progress import shows_progress
-from verifai_jax.core.whole_files import replacing
 from verifai_jax.estimation.result import Estimate
 from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace

@@ -140,7 +140,7 @@ def study(
                 "The worst failure was not explained and not shrunk, since simulations of this "
                 "black box take long; studies=True does both."
             )
-    ways = None if modes is None else _attempt(MODES, lambda: _modes(run, modes), left_out)
+    directions = None if modes is None else _attempt(MODES, lambda: _modes(run, modes), left_out)
     return Studies(
         tuple(failures),
         data,
@@ -148,7 +148,7 @@ def study(
         explained,
         shrunk,
         found,
-        ways,
+        directions,
         tuple(left_out),
         tuple(findings),
     )

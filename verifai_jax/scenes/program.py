@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.trace import Trace
 from verifai_jax.features import FeatureSpace
 from verifai_jax.scenes.outputs import Outputs
@@ -230,7 +230,7 @@ class ScenicProgram:
         - `scene`: of Scenic.
         - `path`: file to write the picture to.
         """
-        return late("verifai_jax.plotting.scenes", "draw_scene")(self, scene, path)
+        return lazy_import("verifai_jax.plotting.scenes", "draw_scene")(self, scene, path)
 
     def describe(self) -> str:
         """Describe the features, and say what Scenic computes and decides in Python."""

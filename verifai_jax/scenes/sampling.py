@@ -246,8 +246,8 @@ class Sampling:
         features: dict[str, Any] = {}
         complete = True
         for node in self.order:
-            leaf, told = self.leaves.get(id(node)), node in sample
-            if told:
+            leaf, given = self.leaves.get(id(node)), node in sample
+            if given:
                 values[node] = sample[node]
             elif leaf is not None:
                 complete = False

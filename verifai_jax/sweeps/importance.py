@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.text import format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.statistics.confidence_sequences import verdict_kind
@@ -107,7 +107,7 @@ class HyperparameterImportance:
         """
         if not self.scores:
             raise ValueError(f"there is nothing to draw: {'; '.join(self._lines())}")
-        return late("verifai_jax.plotting.sweep", "plot_importance")(self, path)
+        return lazy_import("verifai_jax.plotting.sweep", "plot_importance")(self, path)
 
     def __repr__(self) -> str:
         return str(self)

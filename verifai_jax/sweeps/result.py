@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.figure import Drawn
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.sources import Change, list_changes
 from verifai_jax.core.targets import load_target
 from verifai_jax.core.trace import Trace
@@ -370,7 +370,7 @@ class Sweep(Drawn):
 
         **Returns:** the path.
         """
-        return late("verifai_jax.reports", "write_report")(self, path, **options)
+        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
 
     def save(self, folder: str | Path) -> Path:
         """Write the sweep to a folder: table, policies, curves, record.

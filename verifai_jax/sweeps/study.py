@@ -133,9 +133,11 @@ class Study:
         maximum = self.trainer.steps
         if STEPS in self.space.domains:
             maximum = max(int(value) for value, _ in probe_values(self.space.domains[STEPS]))
-        late = [at for at in self.checkpoints if at > maximum]
-        if late:
-            raise StudyError(f"checkpoints must lie between 1 and steps = {maximum}; got {late[0]}")
+        beyond = [at for at in self.checkpoints if at > maximum]
+        if beyond:
+            raise StudyError(
+                f"checkpoints must lie between 1 and steps = {maximum}; got {beyond[0]}"
+            )
         for name in self.algorithms:
             problem = self._problem_of(name)
             try:

@@ -27,8 +27,8 @@ from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.validation import check_options, usual_batch
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
-from verifai_jax.statistics.least_distance import smallest_change
 from verifai_jax.statistics.max_min import max_min_step
+from verifai_jax.statistics.smallest_change import smallest_change
 from verifai_jax.synthesis._synthesize import (
     ATTACK,
     attack_search,
@@ -460,11 +460,11 @@ class _Repair:
             low, high = 0.0, 1.0  # Shares of the way that are kept: `high` is known to be enough.
             for _ in range(3):
                 shares = low + (high - low) * np.arange(8) / 8
-                ways = [np.where(block, self.start + s * (theta - self.start), theta)
+                fractions = [np.where(block, self.start + s * (theta - self.start), theta)
                         for s in shares]  # fmt: skip
-                if limits.left < len(ways) * len(self.environments) or high - low < 1e-3:
+                if limits.left < len(fractions) * len(self.environments) or high - low < 1e-3:
                     return
-                values = evaluate(self.loop, ways, self.environments, archive)
+                values = evaluate(self.loop, fractions, self.environments, archive)
                 good = values >= self.enough
                 # Nearest above which all are good, so that it is not an island.
                 upper = len(good) - int(np.argmin(np.append(good[::-1], False)))

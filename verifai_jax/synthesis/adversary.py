@@ -146,8 +146,8 @@ def _descend(
         each = 1 if loop.differentiable else 1 + int(free.sum())
         if limits.left < len(points) * (each + len(STEPS)) or not free.any():
             break
-        gradients, beside = _gradients(loop, theta, points, 0.02 * scale, free)
-        tried.append(beside)
+        gradients, shifted = _gradients(loop, theta, points, 0.02 * scale, free)
+        tried.append(shifted)
         down = -np.sign(gradients) * free
         moved = np.stack([np.clip(points + step * down, 0.0, 1.0) for step in STEPS], axis=1)
         rows = region.project(moved.reshape(-1, points.shape[1]))
@@ -177,10 +177,10 @@ def _gradients(
         assert pairs.by_environment is not None
         return pairs.by_environment[0], (points, pairs)
     indices = np.flatnonzero(free)
-    beside = np.repeat(points[:, None], 1 + len(indices), axis=1)
+    shifted = np.repeat(points[:, None], 1 + len(indices), axis=1)
     gaps = np.where(points[:, indices] > 0.5, -GAP, GAP)
-    beside[:, 1 + np.arange(len(indices)), indices] += gaps
-    rows = beside.reshape(-1, points.shape[1])
+    shifted[:, 1 + np.arange(len(indices)), indices] += gaps
+    rows = shifted.reshape(-1, points.shape[1])
     pairs = loop.evaluate(theta[None], rows)
     rho = np.where(pairs.proper & np.isfinite(pairs.rho), pairs.rho, np.nan)[0]
     rho = rho.reshape(len(points), -1)

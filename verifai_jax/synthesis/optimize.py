@@ -224,9 +224,9 @@ def _gradients(
     indices = np.flatnonzero(loop.free)
     # Away from the nearer end of the cube; wide enough that float32 has digits left.
     gaps = np.where(theta[indices] > 0.5, -1.0, 1.0) * np.clip(gap, 1e-3, 0.02)
-    beside = np.repeat(theta[None], len(indices), axis=0)
-    beside[np.arange(len(indices)), indices] += gaps
-    pairs = loop.evaluate(np.concatenate([theta[None], beside]), environments)
+    shifted = np.repeat(theta[None], len(indices), axis=0)
+    shifted[np.arange(len(indices)), indices] += gaps
+    pairs = loop.evaluate(np.concatenate([theta[None], shifted]), environments)
     rho = np.where(pairs.proper & np.isfinite(pairs.rho), pairs.rho, np.nan)
     gradients = np.zeros((len(environments), loop.dim))
     gradients[:, indices] = np.nan_to_num((rho[1:] - rho[0]) / gaps[:, None]).T

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias, TypeVar
 import jax
 from jaxtyping import Array, Int, Key, PyTree
 
-from verifai_jax.core.compilation import Effort
+from verifai_jax.core.compilation import XlaOptimization
 from verifai_jax.core.locks import returning_once
 from verifai_jax.core.notebook import ForUsers
 from verifai_jax.core.trace import Status, Trace
@@ -91,7 +91,7 @@ class System(ForUsers):
     black_box: bool = False
     # About 1 MB of a trace with 200 samples and two signals.
     lanes: int = 512
-    effort: Effort = "most"
+    effort: XlaOptimization = "most"
     forward_up_to: int = 1
     notes: tuple[str, ...] = ()
     reverse_hint: str = ""

@@ -26,9 +26,9 @@ from verifai_jax.analysis.data.samples import (
     Seed,
     Source,
     Which,
-    beside,
     distances,
     generator,
+    with_columns,
 )
 from verifai_jax.core.checks import check_count, check_positive
 from verifai_jax.core.figure import Drawn
@@ -130,7 +130,7 @@ class Clusters(Drawn):
                     "worst_rho": self.samples.rho[worst],
                 }
             )
-        table = beside(self.centres, pd.DataFrame(own, index=self.centres.index))
+        table = with_columns(self.centres, pd.DataFrame(own, index=self.centres.index))
         return table.loc[[*range(self.count), *([-1] if -1 in table.index else [])]]
 
     def __str__(self) -> str:
@@ -179,9 +179,9 @@ def clusters(
     - `method`: `"kmeans"` looks at ordered columns only, `"kmodes"` at unordered ones only,
       `"kprototypes"` at both; `"auto"` takes the one that fits the columns. `"dbscan"` looks at
       both, and finds the number of clusters and the noise itself.
-    - `count`: number of clusters; by default that from 2 to `max_clusters` with the greatest silhouette
-      (Rousseeuw, Journal of Computational and Applied Mathematics 20, 1987), or 1 if none is above
-      0.25, or there are less than three rows. It is chosen on at most 5000 rows.
+    - `count`: number of clusters; by default that from 2 to `max_clusters` with the greatest
+      silhouette (Rousseeuw, Journal of Computational and Applied Mathematics 20, 1987), or 1 if
+      none is above 0.25, or there are less than three rows. It is chosen on at most 5000 rows.
     - `radius`: of DBSCAN, by default the knee of the distances to the k-th neighbour, where k is
       twice the number of columns, and 4 at least.
     - `seed`: an integer, a NumPy generator or a `jax.random` key.

@@ -333,7 +333,7 @@ Source: TypeAlias = Run | ErrorTable | pd.DataFrame | Samples
 """A run, its table, a DataFrame with feature columns, or samples of one of them."""
 
 
-def beside(frame: pd.DataFrame, own: pd.DataFrame) -> pd.DataFrame:
+def with_columns(frame: pd.DataFrame, own: pd.DataFrame) -> pd.DataFrame:
     """Append the columns of `own` to those of `frame`, with `_` added to a name that is taken."""
     return frame.join(own.rename(columns={name: f"{name}_" for name in own if name in frame}))
 

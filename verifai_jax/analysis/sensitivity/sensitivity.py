@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.core.errors import check_names
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 from verifai_jax.evaluation.backends import resolved
@@ -50,7 +50,7 @@ class Sensitivity(InNotebook):
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the indices with their intervals; returns the figure."""
-        return late("verifai_jax.plotting.bars", "plot_sensitivity")(self, path)
+        return lazy_import("verifai_jax.plotting.bars", "plot_sensitivity")(self, path)
 
     def __repr__(self) -> str:
         return str(self)
@@ -182,11 +182,11 @@ def _words(method: str, row: Any) -> str:
         alone = f"{format_percent(max(row['first'], 0))} alone"
         return f"{format_percent(row['total'])} of the variance in all ({between}), {alone}"
     if "mu_star" in row:
-        way = {1.0: ", up on average", -1.0: ", down on average"}.get(np.sign(row["mu"]), "")
+        direction = {1.0: ", up on average", -1.0: ", down on average"}.get(np.sign(row["mu"]), "")
         return (
             f"moves the robustness by {row['mu_star']:z.3g} "
             f"({row['low']:z.3g} to {row['high']:z.3g}) over its range, "
-            f"standard deviation {row['sigma']:z.3g}{way}"
+            f"standard deviation {row['sigma']:z.3g}{direction}"
         )
     if np.isnan(row["bound"]):
         return "discrete: has no gradient"

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import jax
 from jaxtyping import Array, Int, Key, PyTree
 
-from verifai_jax.core.compilation import Effort
+from verifai_jax.core.compilation import XlaOptimization
 from verifai_jax.core.errors import require, suggests_options, unknown_name
 from verifai_jax.systems.base import Features
 from verifai_jax.systems.delays import DelayOption
@@ -52,7 +52,7 @@ class Brax(PolicyLoop):
     exact_step: bool = True
 
     @property
-    def effort(self) -> Effort:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def effort(self) -> XlaOptimization:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Effort of XLA: with `little` the generalized backend compiles sooner and runs as fast."""
         backend = getattr(self.env.unwrapped, "_backend", None)
         return "little" if backend == "generalized" else "most"

@@ -182,8 +182,8 @@ def with_value(sys: BraxSystem, location: Location, value: ArrayLike, feature: s
         entry = (*(location.index or ()), *[0] * target.ndim)
         raise ValueError(
             f"feature {feature!r} has shape {list(jnp.shape(value))} and {location} has "
-            f"{list(target.shape)}; name one entry, as in '{Location(location.parts, entry)}', or use "
-            "configure=(sys, features) -> sys"
+            f"{list(target.shape)}; name one entry, as in '{Location(location.parts, entry)}', or "
+            "use configure=(sys, features) -> sys"
         )
     new = jnp.asarray(value, jnp.result_type(old, value))
     if location.index is not None:

@@ -250,7 +250,7 @@ def _quaternion(matrix: Float[Array, "3 3"]) -> Float[Array, "4"]:
     m = matrix
     signs = jnp.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], m.dtype)
     squares = 1 + signs @ jnp.diag(m)
-    ways = jnp.array(
+    candidates = jnp.array(
         [
             [squares[0], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
             [m[2, 1] - m[1, 2], squares[1], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
@@ -258,7 +258,7 @@ def _quaternion(matrix: Float[Array, "3 3"]) -> Float[Array, "4"]:
             [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], squares[3]],
         ]
     )
-    best = ways[jnp.argmax(squares)]
+    best = candidates[jnp.argmax(squares)]
     return best / jnp.linalg.norm(best)
 
 

@@ -156,12 +156,12 @@ class Loop:
     @cached_property
     def delayed_sensors(self) -> np.ndarray:
         """A mask of the `sensordata` that describe the last physics step, `[nsensordata]`."""
-        late = np.zeros(self.compiled.nsensordata, bool)
+        delayed = np.zeros(self.compiled.nsensordata, bool)
         for i in range(self.compiled.nsensor):
             if self.compiled.sensor_needstage[i] >= 3:
                 start = int(self.compiled.sensor_adr[i])
-                late[start : start + int(self.compiled.sensor_dim[i])] = True
-        return late
+                delayed[start : start + int(self.compiled.sensor_dim[i])] = True
+        return delayed
 
     def start(self, features: Features, key: Seed) -> dict[str, Array]:
         """Return `qpos`, `qvel` and `act` at time 0."""

@@ -30,7 +30,7 @@ class _Round(NamedTuple):
     checkpoint: dict[str, Any]
 
 
-class Ahead:
+class Prefetch:
     """The rounds that are on their way; see the module's docstring.
 
     **Arguments:**
