@@ -21,7 +21,7 @@ class Report:
     """What one run took, in seconds and GB.
 
     - `begun`: resident memory after a fifth of the time.
-    - `most`: the most of it in the second half.
+    - `largest`: the most of it in the second half.
     - `grown`: the difference, beyond the memory that the rows would take.
     """
 

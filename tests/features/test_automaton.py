@@ -244,12 +244,12 @@ W = {"wait": Box(0, 1)}
         (
             {("cruise", "a"): {"to": "near", **W}, ("near", "b"): {"to": "over", **W}},
             {"min_events": 3},
-            "least=3 events are impossible: no sequence from 'cruise' has more than 2",
+            "min_events=3 events are impossible: no sequence from 'cruise' has more than 2",
         ),
         (
             {("cruise", "a"): {"at_most": 2, **W}},
             {"min_events": 4, "max_events": 5},
-            "least=4 events are impossible: no sequence from 'cruise' has more than 2",
+            "min_events=4 events are impossible: no sequence from 'cruise' has more than 2",
         ),
         ({("cruise", "a"): {"to": 3, **W}}, {}, "to of event .* must be the name of a state"),
     ],
