@@ -198,14 +198,14 @@ class Allocation:
         limit = required_evidence(self.confidence, among)
         maximum = max(self.budget, 2 * self.block)
         steps = np.geomspace(self.block, maximum, 32)
-        fewest = np.full(len(failures), np.inf)
+        smallest = np.full(len(failures), np.inf)
         k, n = failures[:, None].astype(float), simulations[:, None] + steps
         for evidence, level in ((evidence_below, 0.25), (evidence_above, 0.75)):
             rates = betaincinv(k + 0.5, simulations[:, None] - k + 0.5, level)
             found = evidence(k + rates * steps, n, np.full(n.shape, self.p)) > limit
             first = np.where(found.any(axis=1), steps[np.argmax(found, axis=1)], np.inf)
-            fewest = np.minimum(fewest, first)
-        return fewest
+            smallest = np.minimum(smallest, first)
+        return smallest
 
 
 def _within(blocks: Int[np.ndarray, " n"], left: int) -> Int[np.ndarray, " n"]:

@@ -327,7 +327,7 @@ class _Search:
         # Half for what decides where to go, so that some is left to go there.
         candidates.limit = candidates.budget // 2
         if self.by == "count" and nominal.space.items:
-            points = self.with_fewest_items()
+            points = self.without_needless_items()
         if self.by == "count":
             own = points[:1][candidates(points[:1])[1]]
             minimize_count(candidates, self.starts(own, alike=False), self.rng)
@@ -355,7 +355,7 @@ class _Search:
         revert_features(candidates, self.failures()[0])
         self.note()
 
-    def with_fewest_items(self) -> Float[np.ndarray, "1 d"]:
+    def without_needless_items(self) -> Float[np.ndarray, "1 d"]:
         """Return the failure with the fewest items, such as events; from now on none has more."""
         candidates = self.candidates
         lowest = remove_items(candidates, self.failures()[0])

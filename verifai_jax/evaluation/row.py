@@ -109,10 +109,10 @@ class RowFunction(NamedTuple):
         nearest = jnp.argmin(jnp.max(values, axis=1))
         # A goal that is broken is a failure, whatever the guide says.
         broken = jnp.max(values[nearest]) < 0
-        told = self._with_guide(values[nearest], trace, features)
+        observed = self._with_guide(values[nearest], trace, features)
         # And clauses that there are not stay absent.
-        told = jnp.where(broken | (values[nearest] <= 0.5 * ABSENT), values[nearest], told)
-        results = (*verdict, features, told, more)
+        observed = jnp.where(broken | (values[nearest] <= 0.5 * ABSENT), values[nearest], observed)
+        results = (*verdict, features, observed, more)
         if not self.gradient:
             return values[nearest], results
         semantics = smooth(temperature.astype(dtype))
