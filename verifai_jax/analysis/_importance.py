@@ -156,8 +156,8 @@ def _unlearnable(target: str, values: np.ndarray) -> str:
         smallest = int(min(values.sum(), (~values).sum()))
         if smallest < 2 * MIN_OF_A_KIND:
             kind = "failing" if values.sum() <= (~values).sum() else "safe"
-            return f"{smallest or 'no'} {kind} {'row' if smallest < 2 else 'rows'}, too few to learn
-            from"
+            rows = "row" if smallest < 2 else "rows"
+            return f"{smallest or 'no'} {kind} {rows}, too few to learn from"
     elif len(values) < 4 * MIN_OF_A_KIND:
         rows = "row" if len(values) == 1 else "rows"
         return f"{len(values)} {rows} with a robustness, too few to learn from"

@@ -88,7 +88,7 @@ class Rules(Drawn, InNotebook):
 
     **Fields:** `rules`; `coverage` and `precision` of all of them together, 0 and None without a
     rule; `unsupported`: how many further boxes the measured rows do not support; `measured`: how
-    many rows were kept aside; `doubt`: why precision is no rate of failure, empty where it is;
+    many rows were kept aside; `doubt`: why precision is no rate of failure, empty if it is;
     `samples`: all rows with a verdict.
     """
 
@@ -246,7 +246,7 @@ def rules(
 
 
 def _too_few(failing: Bool[np.ndarray, " n"]) -> str:
-    """Say that there are too few failing or safe rows for rules; empty where there are enough."""
+    """Say that there are too few failing or safe rows for rules; empty if there are enough."""
     counts = {"fail": int(failing.sum()), "are safe": int((~failing).sum())}
     for verb, count in counts.items():
         if count < MIN_FAILURES:
@@ -258,7 +258,7 @@ def _too_few(failing: Bool[np.ndarray, " n"]) -> str:
 
 
 def _doubt(source: Source) -> str:
-    """Explain why the share of failures among rows is not their probability; empty where it is."""
+    """Explain why the share of failures among rows is not their probability; empty if it is."""
     if not isinstance(source, Run):
         return "the rows may not be samples of the prior"
     if not source.prior:
@@ -403,7 +403,7 @@ def _doubt_allowed(region: Region, looser: Region, samples: Samples) -> float:
 def _measured(
     inside: Bool[np.ndarray, " n"], failing: Bool[np.ndarray, " n"]
 ) -> tuple[float, Rate] | None:
-    """Measure coverage and precision on rows kept aside; None where these do not support it."""
+    """Measure coverage and precision on rows kept aside; None if these do not support it."""
     hits = int((inside & failing).sum())
     if hits < SUPPORT:
         return None

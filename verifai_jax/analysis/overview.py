@@ -2,7 +2,7 @@
 
 found = analyze(run)
 print(found)
-found["rules"]                      the result of one of them; None where it was skipped
+found["rules"]                      the result of one of them; None if it was skipped
 found.plot("overview.png")
 found.save("report")                report.md and a picture of each
 """
@@ -51,7 +51,7 @@ TITLES = {
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """An analysis: `name`, `words` of it, `result`; None where it was skipped."""
+    """An analysis: `name`, `words` of it, `result`; None if it was skipped."""
 
     name: str
     words: str
@@ -80,7 +80,7 @@ class Analysis(Drawn):
     samples: Samples | None
 
     def __getitem__(self, name: str) -> Any:
-        """Return the result of an analysis by name; None where it was skipped.
+        """Return the result of an analysis by name; None if it was skipped.
 
         **Raises:** `UnknownNameError` for a name that is not one of the parts'.
         """

@@ -65,7 +65,7 @@ class Addition:
     - `rows`: a DataFrame with the columns of the space; for transformed inputs, of those that they
       were made from.
     - `rendered`: inputs that had to be rendered to choose these, themselves included.
-    - `why`: the reason, in words, why they are fewer than asked for; empty where they are not.
+    - `why`: the reason why they are fewer than asked for; empty if they are not.
     - `transformed`: True for inputs of the initial set that are to be transformed.
     """
 
@@ -192,7 +192,7 @@ Generator = Callable[[Key[Array, ""], int], pd.DataFrame]
 
 
 def _pca_generator(base: Base) -> Generator | str:
-    """Return a generator of features; or the reason, in words, why there is none."""
+    """Return a generator of features; or the reason why there is none."""
     if not len(base.counterexamples):
         return _few(base)
     try:

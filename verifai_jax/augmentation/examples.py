@@ -64,7 +64,7 @@ class Judgement:
     """The judgement of a network's predictions.
 
     - `wrongness` `[n]`: positive where a prediction is wrong.
-    - `present`, `detected` `[n]`: what there is to be found, and what is found; None where the task
+    - `present`, `detected` `[n]`: what there is to be found, and what is found; None if the task
       does not say.
     """
 

@@ -31,7 +31,7 @@ def repeat_failures(
     - `policy`: its number.
     - `sampled`, `attacked`: its simulations, of which verdicts are replaced.
 
-    **Returns:** what that says of the system; empty where all came again.
+    **Returns:** what that says of the system; empty if all came again.
     """
     rows = [
         (float(verdicts.lowest[index]), record, block, index)

@@ -125,8 +125,8 @@ class CheckOutcome:
     - `problem`: its name.
     - `check`: the settings.
     - `target`: the command line's name of the problem, where it is known.
-    - `replayed`: the corpus; None where there is none.
-    - `run`: what the budget was spent on; None where the corpus failed already.
+    - `replayed`: the corpus; None if there is none.
+    - `run`: what the budget was spent on; None if the corpus failed already.
     - `saved`: files that were added to the corpus.
     """
 

@@ -71,7 +71,7 @@ def check_again(finding: str, even_if_changed: bool) -> None:
 
     **Arguments:**
 
-    - `finding`: what differs, in words; empty where nothing does.
+    - `finding`: what differs, as text; empty if nothing does.
     - `even_if_changed`: whether the user has said that another model is meant.
     """
     if finding and not even_if_changed:

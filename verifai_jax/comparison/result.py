@@ -32,7 +32,7 @@ class Compared:
     - `discordant`: the pairs in which only one fails, a row each with the features; `worse` is true
       where it is the candidate. Its index is the number of the pair, of which
       `Comparison.random_key` is the key.
-    - `pairs`: features of all pairs, and `worse` and `better`; None where they were not kept.
+    - `pairs`: features of all pairs, and `worse` and `better`; None if they were not kept.
     """
 
     name: str

@@ -36,11 +36,11 @@ class Compositional(InNotebook):
       with the worst perception too, `"fails anyway"`, `"no verdict"`); `best` and `worst`, the
       robustness with either perception; `severity`, the least error with which it fails, and
       `erring`, the number of instants at which the perception errs then, NaN unless uncertain.
-    - `images`: the run that looked for images; None where nothing is uncertain.
+    - `images`: the run that looked for images; None if nothing is uncertain.
     - `simulations`: a run of one simulation for each candidate that was simulated.
     - `candidates`: a row for each image on which the network errs: features; `image`, how far it
       errs (minus the robustness of `error`); `simulated`, the status of its simulation with the
-      network, empty where there was none; `rho` and `fails` of it; `rendered`, the images rendered
+      network, empty if there was none; `rho` and `fails` of it; `rendered`, the images rendered
       until then, in all.
     - `images_per_simulation`: rendered in one simulation.
     - `budget`, `search`, `seed`: as it was called.

@@ -190,7 +190,7 @@ class Cache:
             raise CacheError(f"{self.path} is damaged in its note {name!r}: {error}") from error
 
     def get(self, name: str) -> Arrays | None:
-        """Return the arrays of a finished computation; None where it is not, or is damaged."""
+        """Return the arrays of a finished computation; None if it is not, or is damaged."""
         with self._transaction(reading=True):
             row = self._base.execute(
                 "SELECT form, checksum, bytes FROM work WHERE name=?", (name,)

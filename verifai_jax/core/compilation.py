@@ -176,7 +176,7 @@ def _said(name: str) -> Iterator[None]:
 
 
 def describe_compilation() -> str:
-    """Say what is being compiled and for how long so far; empty where nothing is."""
+    """Say what is being compiled and for how long so far; empty if nothing is."""
     with _lock:
         running = list(_running.values())
     if not running:
@@ -207,7 +207,7 @@ def _compiled(
 
 @cache
 def options_of(effort: XlaOptimization) -> dict[str, Any] | None:
-    """Return XLA's options for this effort; None where it does the most."""
+    """Return XLA's options for this effort; None if it does the most."""
     options = _OPTIONS[effort]
     if not options or jax.default_backend() != "cpu":
         return None

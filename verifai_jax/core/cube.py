@@ -17,7 +17,7 @@ class Cube:
 
     - `levels`: 0 if it is continuous, or the number `n >= 1` of its cells, inside which points
       mean the same.
-    - `weights`: the probabilities of its cells, which are their widths; None where they are equal.
+    - `weights`: the probabilities of its cells, which are their widths; None if they are equal.
     - `ordered`: whether its cells have an order; all of them when left out.
     - `names`: what it is called, such as `cars[0].x`; nothing when left out.
 

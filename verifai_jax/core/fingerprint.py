@@ -1,7 +1,7 @@
 """The identity of a traced function: all of what it computes, and of how it is differentiated.
 
     traced = jax.jit(function).trace(*arguments)
-    fingerprint(traced.jaxpr)                           # a hash, or None where one cannot be taken
+    fingerprint(traced.jaxpr)                           # a hash, or None if one cannot be taken
 
 Two functions of equal fingerprints compute the same, and so do all programs that are derived from
 them by the same rules, such as their derivatives. A user's code itself cannot be read for that:
@@ -40,7 +40,7 @@ def fingerprint(program: Any, derivatives: bool = True) -> str | None:
     - `derivatives`: whether rules of derivatives are read too. They are traced for that, and only
       programs that differentiate this one depend on them.
 
-    **Returns:** the hash in hexadecimal digits; None where a part of the function is opaque, such
+    **Returns:** the hash in hexadecimal digits; None if a part of the function is opaque, such
     as a call of Python from the device.
     """
     reader = _Reader(derivatives)
@@ -55,7 +55,7 @@ def fingerprint(program: Any, derivatives: bool = True) -> str | None:
 def identity(*values: object) -> str | None:
     """Return a hash of plain values: numbers, texts, arrays, tuples, and dataclasses of them.
 
-    **Returns:** the hash in hexadecimal digits; None where one of them is something else.
+    **Returns:** the hash in hexadecimal digits; None if one of them is something else.
     """
     reader = _Reader()
     try:

@@ -47,7 +47,7 @@ class LiftedNumbers:
         return vector
 
     def index_of(self, name: str, owner: object, values: np.ndarray) -> int | None:
-        """Return where these numbers begin in the vector; None where there is no room for them."""
+        """Return where these numbers begin in the vector; None if there is no room for them."""
         key = (id(owner), name)
         if key not in self._indices:
             if len(self._values) + values.size > CAPACITY:

@@ -7,7 +7,7 @@ To trace the derivative of a simulation takes ten times as long as to trace the 
 what comes out depends on nothing else. So a simulation is traced afresh in each process, and where
 it is the same as in an earlier one, so is its derivative: that is read from a file, in a form that
 JAX exports and that can compute nothing but arrays. A file that is missing, damaged, or of another
-version of JAX or of this package is one that there is not.
+version of JAX or of this package is one that does not exist.
 """
 
 import contextlib
@@ -54,7 +54,7 @@ def remembered_as(kind: str, *values: object) -> str | None:
     - `kind`: of the program, for people who look into the folder.
     - `values`: all that the program follows from, beside this package and JAX; see `identity`.
 
-    **Returns:** the name; None where it cannot be said, or nothing is kept on disk.
+    **Returns:** the name; None if it cannot be said, or nothing is kept on disk.
     """
     if cache_folder() is None or None in values:
         return None

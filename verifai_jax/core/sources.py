@@ -207,7 +207,7 @@ class Sources:
         return tuple(found)
 
     def other_versions(self, now: "Sources") -> tuple[str, ...]:
-        """Return packages whose version is another one now, in words."""
+        """Return packages whose version is another one now, as text."""
         return tuple(
             f"{name} {was} then, {now.versions[name]} now"
             for name, was in self.versions.items()

@@ -82,7 +82,7 @@ def format_features(features: Mapping[str, object], labels: Mapping[str, str] | 
     """Write features with four digits: `x0=0.1353, alg=sac, wind=16 values from -1 to 0.93`.
 
     Of columns `wind[0]`, `wind[1]`, ... that are more than four only the range is written; parts of
-    items that there are not, such as `cars[3].x`, are left out.
+    items that do not exist, such as `cars[3].x`, are left out.
 
     **Arguments:**
 
@@ -103,7 +103,7 @@ def format_features(features: Mapping[str, object], labels: Mapping[str, str] | 
             parts += [f"{labels.get(n, n)}={_format_value(value)}" for n, value in columns]
             continue
         values = np.array([value for _, value in columns], float)
-        values = values[~np.isnan(values)]  # Items that there are not.
+        values = values[~np.isnan(values)]  # Items that do not exist.
         low, high = (_format_value(float(end(values))) for end in (np.min, np.max))
         span = f"all {low}" if low == high else f"from {low} to {high}"
         parts.append(f"{stem}={len(values)} values {span}")

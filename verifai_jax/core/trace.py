@@ -382,7 +382,7 @@ def _is_known(value: Leaf) -> bool:
 
 
 def _range(signal: Samples, valid: Leaf) -> str:
-    """Return the shape of a signal and its range where it counts, in words."""
+    """Return the shape of a signal and its range where it counts, as text."""
     shape: tuple[int, ...] = signal.shape
     text = "" if len(shape) == 1 else f"[{', '.join(map(str, shape[1:]))}]  "
     if not _is_known(signal):

@@ -1,4 +1,4 @@
-"""Errors that code of a user raises, in words, with the line of the user's own file.
+"""Messages for errors that user code raises, with the line of the user's own file.
 
     try:
         system(features, key)
@@ -114,7 +114,7 @@ class UserLine(NamedTuple):
     - `file`: its path, relative where it lies below the working directory.
     - `line`: its number.
     - `function`: name of the function around it.
-    - `code`: the text of the line; empty where the file cannot be read.
+    - `code`: the text of the line; empty if the file cannot be read.
     """
 
     file: str
@@ -134,7 +134,7 @@ def user_line(error: BaseException) -> UserLine | None:
 
 
 def defined_at(function: Callable[..., object] | None) -> str:
-    """Write where a function is defined, ` (sim.py, line 3)`; empty where it is not known."""
+    """Write where a function is defined, ` (sim.py, line 3)`; empty if it is not known."""
     code = getattr(getattr(function, "__wrapped__", function), "__code__", None)
     if not isinstance(code, CodeType) or not is_user_file(code.co_filename):
         return ""
@@ -149,7 +149,7 @@ def check_called_with(
     **Arguments:**
 
     - `role`: what the function is, for the message: "dynamics".
-    - `function`: what was given; None where nothing was.
+    - `function`: what was given; None if nothing was.
     - `arguments`: names of the arguments.
 
     **Raises:** `ValueError`, with what it takes and where it is defined.
@@ -171,7 +171,7 @@ def check_called_with(
 
 
 def source_line(traceback: object) -> str | None:
-    """Return the user's line at which JAX recorded an operation; None where it is not known.
+    """Return the user's line at which JAX recorded an operation; None if it is not known.
 
     **Arguments:**
 
@@ -250,7 +250,7 @@ def _advice_on_tracing(error: BaseException) -> str:
 
 
 def _missing_key(key: object, step: TracebackType, features: object) -> str:
-    """Write which mapping lacks a key, and what it has; empty where that is not known."""
+    """Write which mapping lacks a key, and what it has; empty if that is not known."""
     text, mapping = _subscripted(step)
     if mapping is None:
         # Without the text of the line: features that the function holds are the likeliest.

@@ -239,7 +239,7 @@ IS_CALLED = (
     "a Signal is a function of time and not a number: call it with a time in seconds, as in "
     "features['wind'](time); its control points are its .knots"
 )
-"""Advice for who takes a function of time for a number."""
+"""Advice for users who take a function of time for a number."""
 
 
 def _refuse(self: Waveform, *_: object) -> None:

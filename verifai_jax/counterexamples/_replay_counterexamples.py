@@ -50,7 +50,7 @@ class ReplayedCounterexample:
       problem"`.
     - `robustness`: the least now; NaN without one.
     - `before`: the least when it was saved.
-    - `note`: what has changed, or what is wrong, in words.
+    - `note`: what has changed, or what is wrong, as text.
     - `changed`: whether the model is another one than that which it was saved with.
     """
 
@@ -287,7 +287,7 @@ def _lowest(entry: SavedCounterexample) -> float:
 
 
 def _misfit(space: FeatureSpace, columns: Mapping[str, Any]) -> str:
-    """Return why the space has no place for a counterexample; empty where it has."""
+    """Return why the space has no place for a counterexample; empty if it has."""
     try:
         return _why_not_in(space, columns)
     except (ValueError, TypeError, KeyError, OverflowError, AttributeError) as error:

@@ -474,7 +474,7 @@ def _length(rows: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n 1"]:
 def _verified(
     problem: Problem, search: _Search, key: Key[Array, ""], number: int, precision: str
 ) -> tuple[np.ndarray, Replay] | None:
-    """Return the least failure that fails alone too, in float64 as well; None where none does.
+    """Return the least failure that fails alone too, in float64 as well; None if none does.
 
     It is taken a little farther from nominal than the boundary, where rounding would decide.
     """

@@ -44,7 +44,7 @@ class Candidates:
     `limit`: simulations after which no more are made for now; `max_items`: points with more items
     (such as events) are not simulated; `temperature` of the smooth
     robustness that is differentiated; `differentiable`: whether gradients can be had; `note`: why
-    not, in words; `without_verdict`: simulations that had none, and `trouble`, what the first of
+    not, as text; `without_verdict`: simulations that had none, and `trouble`, what the first of
     them raised.
     """
 
@@ -115,7 +115,7 @@ class Candidates:
         return np.array([rho for rho, _ in known]), np.array([fails for _, fails in known], bool)
 
     def tangents(self, points: Float[np.ndarray, "n d"]) -> list[Tangent | None]:
-        """Return the tangents of the robustness at points `[n, d]`; None where it has none."""
+        """Return the tangents of the robustness at points `[n, d]`; None if it has none."""
         points = self.nominal.settle(points)
         keys = [point.tobytes() for point in points]
         if self.differentiable:

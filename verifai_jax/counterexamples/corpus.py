@@ -48,7 +48,7 @@ class SavedCounterexample:
     - `robustness`: of each formula, as simulated.
     - `seed`, `row`: of the run and in its table: they decide the random key of the simulation.
     - `precision`, `backend`: that it was simulated with.
-    - `verdict`: of closer replays of the row that it came from; empty where there were none.
+    - `verdict`: of closer replays of the row that it came from; empty if there were none.
     - `changed`: what departs from nominal, `[nominal, value]` by coordinate, where it was shrunk.
     - `found`: the search, its budget, the number of simulations, the version, and the `sources`:
       what the model was made of, as a run records it.
@@ -159,7 +159,7 @@ _FORMS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "changed": (lambda value: value is None or _maps_to(_is_pair)(value), "an object of pairs"),
     "found": (lambda value: isinstance(value, dict), "an object"),
 }
-"""For each entry of a file whether a value can be it, and what it must be, in words."""
+"""For each entry of a file whether a value can be it, and what it must be, as text."""
 
 
 def save_counterexamples(

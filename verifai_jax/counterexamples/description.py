@@ -164,7 +164,7 @@ def format_spans(spans: list[Span]) -> str:
 
 
 def describe_gradient(influences: Sequence[Influence]) -> str:
-    """Write which small change helps most; empty where no gradient is known."""
+    """Write which small change helps most; empty if no gradient is known."""
     changes = [
         (abs(change), i, k)
         for i in influences

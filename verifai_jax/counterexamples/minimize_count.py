@@ -155,7 +155,7 @@ def distinct_sets(candidates: Candidates, points: Points) -> Results:
 
 
 def exchange(candidates: Candidates, u: Point, rng: np.random.Generator) -> Point | None:
-    """Search a failing point with one departure less than `u`; None where none is found.
+    """Search a failing point with one departure less than `u`; None if none is found.
 
     The other coordinates are pushed away from nominal, along the gradient of the robustness, and at
     random, three rounds, with more for the sets that came nearest to a failure.

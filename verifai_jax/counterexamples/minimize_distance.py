@@ -178,7 +178,7 @@ def boundary_steps(
 def fit_tangent(
     candidates: Candidates, track: Track, coordinates: Int[np.ndarray, " k"]
 ) -> list[Tangent]:
-    """Fit a tangent to the points that were simulated nearby; none where they are too few."""
+    """Fit a tangent to the points that were simulated nearby; empty if they are too few."""
     others = np.ones(len(track.u), bool)
     others[coordinates] = False
     alike = np.isfinite(candidates.rho) & np.all(

@@ -111,7 +111,7 @@ class Nominal:
             middles = self.centres(cells)
             u[:, discrete] = np.where(same, self.u[discrete], middles)
         if self.space.items and len(u):
-            # Coordinates of items that there are not mean nothing, and do not depart; an item that
+            # Coordinates of items that do not exist mean nothing, and do not depart; an item that
             # comes back is nominal's.
             used = self._compiled(self.space.used, u)
             u = np.where(used, self._compiled(self.space.settle, u), self.u)

@@ -102,7 +102,7 @@ class Anchors:
 
     @cached_property
     def _directions(self) -> tuple[Float[np.ndarray, "d p"] | None, ...]:
-        """Orthonormal directions that decide in each region; None where there are many, or none."""
+        """Orthonormal directions that decide in each region; None if there are many, or none."""
         if not self.chains.normals:
             return (None,) * len(self.regions)
         return tuple(
@@ -138,7 +138,7 @@ class Anchors:
 
 
 def _span(normals: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "d p"] | None:
-    """Return orthonormal directions that span normals; None where they are many, or none."""
+    """Return orthonormal directions that span normals; None if they are many, or none."""
     _, size, rows = np.linalg.svd(normals, full_matrices=False)
     rank = int(np.sum(size > DIRECTION * size.max(initial=0.0)))
     return rows[:rank].T if 0 < rank <= min(MAX_DIRECTIONS, normals.shape[1] - 1) else None

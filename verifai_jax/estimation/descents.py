@@ -105,7 +105,7 @@ class _Descents:
 def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulations: int) -> Ends:
     """Descend from as many starts as the simulations allow, a few more at most.
 
-    **Returns:** the failures; none where no descent found one.
+    **Returns:** the failures; empty if no descent found one.
 
     **Raises:** `Ended` where time is over.
     """

@@ -95,7 +95,7 @@ def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int)
 
     - `simulations`: number of them, about.
 
-    **Returns:** the failures; none where no descent found one.
+    **Returns:** the failures; empty if no descent found one.
 
     **Raises:** `Ended` where time is over.
     """

@@ -195,7 +195,7 @@ def fit_copula(
     steps: Marginals,
     worth: float = 1.0,
 ) -> Copula | None:
-    """Join marginals by the correlations beyond sampling noise; None where there are none."""
+    """Join marginals by the correlations beyond sampling noise; None if there are none."""
     d, size = z.shape[1], effective_size(weight) * worth
     v = rank_scores(steps, z)
     centred = v - weight @ v

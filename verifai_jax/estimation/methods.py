@@ -96,14 +96,14 @@ class Answer:
     """An answer of a method; fields are those of `Estimate`.
 
     - `prior`: counts of the independent samples of the prior that the bound rests on.
-    - `probability`: the estimate; None where none is claimed.
+    - `probability`: the estimate; None if none is claimed.
     - `low`, `high`: ends of the interval.
     - `method`: the method that gave the estimate.
     - `effective`, `relative_error`: precision of the estimate.
     - `diagnostics`: further numbers of the method.
-    - `notes`: surprises, in words.
+    - `notes`: sentences on anything surprising.
     - `drawn`: data of the pictures.
-    - `samples`: the weighted samples that the estimate rests on; None where there are none.
+    - `samples`: the weighted samples that the estimate rests on; None if there are none.
     - `nearest`: least distant failures `[m, d]` that the searches found.
     """
 
@@ -523,7 +523,7 @@ def bound_from_pilot(limit_state: LimitState, plan: Plan) -> Answer:
 def _first_level(
     limit_state: LimitState, rng: np.random.Generator, plan: Plan
 ) -> FirstLevel | None:
-    """Simulate the first level, samples of the prior; None where time ends before it does."""
+    """Simulate the first level, samples of the prior; None if time ends before it does."""
     try:
         z = limit_state.sample_prior(rng, min(CHAIN * plan.chains, limit_state.left))
         scores = limit_state(z)

@@ -47,7 +47,7 @@ class SplittingRun:
     - `chain_ids`: the chain `[n]` that each failure comes from.
     - `first`: counts of the first level, independent samples of the prior: simulations, failures,
       and missing verdicts.
-    - `stopped`: the reason for an early end; None where the run reached failures.
+    - `stopped`: the reason for an early end; None if the run reached failures.
     """
 
     levels: list[float] = field(default_factory=list)

@@ -337,7 +337,7 @@ class Repetitions:
         )
 
     def __str__(self) -> str:
-        """Say what that means of the system; empty where all rows came again bit for bit."""
+        """Say what that means of the system; empty if all rows came again bit for bit."""
         plural = "s" * (self.rows != 1)
         of = f"of {self.rows} violating row{plural} simulated again with the same features and seed"
         if self.moved:

@@ -122,7 +122,7 @@ class Replay(InNotebook):
         - `path`: of a picture to write; none when left out.
         - `signals`: the signals, and features that are Signals, to draw; chosen when left out.
 
-        **Raises:** `UnknownNameError` for a signal that there is not.
+        **Raises:** `UnknownNameError` for a signal that does not exist.
         """
         return lazy_import("verifai_jax.plotting.replay", "plot_replay")(self, path, signals)
 

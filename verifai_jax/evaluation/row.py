@@ -110,7 +110,7 @@ class RowFunction(NamedTuple):
         # A goal that is broken is a failure, whatever the guide says.
         broken = jnp.max(values[nearest]) < 0
         observed = self._with_guide(values[nearest], trace, features)
-        # And clauses that there are not stay absent.
+        # And clauses that do not exist stay absent.
         observed = jnp.where(broken | (values[nearest] <= 0.5 * ABSENT), values[nearest], observed)
         results = (*verdict, features, observed, more)
         if not self.gradient:

@@ -34,7 +34,7 @@ class Verdicts(NamedTuple):
     - `clauses`: `[n, clauses]`, scaled values of the clauses of the goal that is nearest to being
       broken (`mtl.clauses`); None unless wanted.
     - `clause_gradients`: `[n, clauses, d]`, of the clauses by the coordinates; None unless wanted.
-    - `messages`: what a host system raised, one a row, empty where nothing; None for systems that
+    - `messages`: what a host system raised, one a row, empty if nothing; None for systems that
       JAX traces.
     - `coverage_ids`: what each trace shows (`problem.behaviour`), -1 for nothing; None without one.
     - `guidance`: what else a search learns (`evaluation.guidance`); None unless wanted.
@@ -105,7 +105,7 @@ class RowVerdict(NamedTuple):
     - `rho`: `[formulas]`, or one number that stands for all; NaN without a verdict.
     - `status`: a code of `Status`.
     - `holds`: `[formulas]`, or one truth value for all: the Boolean semantics.
-    - `message`: what the system raised; empty where nothing.
+    - `message`: what the system raised; empty if nothing.
     - `coverage_ids`: what its trace shows, `[ids]`; None without a trace, or a `problem.behaviour`.
     - `guidance`: what else a search learns, `[guidance]`; None unless there is a trace, and it
       is wanted.

@@ -99,7 +99,7 @@ def modes(
     - `max_seconds`: wall-clock seconds after which what is finished is divided into modes.
     - `progress`: True draws a progress bar, False none; None draws one on a terminal.
 
-    **Returns:** the modes, the most probable first; none where no failure was found or failures
+    **Returns:** the modes, the most probable first; empty if no failure was found or failures
     could not be weighed, and a note says so. Where the system draws random numbers, probabilities
     are over these too, and each mode holds the random key under which its likeliest failure fails.
 
@@ -404,7 +404,7 @@ def _simulate_under(
 
 
 def _cause(numbers: _Numbers, features: dict[str, Any], key: Any, number: int) -> tuple[float, str]:
-    """Return the robustness at features, and the formula and predicate that decide, in words."""
+    """Return the robustness at features, and the formula and predicate that decide, as text."""
     replayed = replay(numbers.problem, features, key, number, numbers.precision)
     rho = min(replayed.rho.values())
     if not replayed.violated and replayed.rho:

@@ -35,12 +35,12 @@ class Mode(InNotebook):
     - `distance`: of that point from the middle of the prior, in standard deviations of normal
       space (the reliability index).
     - `rho`: robustness there.
-    - `cause`: the formula and the predicate that decide there, in words; empty without a verdict.
+    - `cause`: the formula and the predicate that decide there, as text; empty without a verdict.
     - `failures`: features of failures of this mode, distributed as the prior's, one a row.
     - `problem`: the problem.
     - `run`: the simulations of the likeliest failure, all with its random key where the system
       draws.
-    - `row`: row of `run` that fails at, or just beyond, the likeliest failure; None where
+    - `row`: row of `run` that fails at, or just beyond, the likeliest failure; None if
       none does.
     """
 
@@ -145,7 +145,7 @@ class Modes(Drawn, InNotebook):
     - `rest`: probability of further regions that are too improbable to be listed.
     - `simulations`, `budget`: used and allowed.
     - `upper_bound`: guaranteed, by samples of the prior alone.
-    - `notes`: surprises, in words.
+    - `notes`: sentences on anything surprising.
     - `run`: simulations of the likeliest failures, as `falsify` keeps them.
     - `seconds`: wall-clock time.
     - `sources`: what the model was made of, as a run records it.

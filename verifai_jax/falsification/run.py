@@ -102,7 +102,7 @@ class Run(InNotebook):
     - `first`: points of the unit cube that were simulated before the search began.
     - `guide`: the term that steered the search, as plain data; None without one.
     - `sources`: what the model was made of when the run began, and again where it went on with
-      another one: files with their hashes, and versions, as plain data; empty where that is not
+      another one: files with their hashes, and versions, as plain data; empty if that is not
       recorded.
     - `derived`: what a verb made of the problem that it was given, as plain data; None if it was
       simulated as it was.
@@ -262,7 +262,7 @@ class Run(InNotebook):
         return model_changes(self.sources, now, row)
 
     def changed_since(self, row: int | None = None) -> str:
-        """Say in a sentence which files of the model are others by now; empty where none is."""
+        """Say in a sentence which files of the model are others by now; empty if none is."""
         return changed_since(self.changes(row), row)
 
     def compared(self, seen: Replay) -> Replay:

@@ -58,7 +58,7 @@ class Segment:
 
     @property
     def damage(self) -> str:
-        """Say what has become of the file; empty where it is as it was written."""
+        """Say what has become of the file; empty if it is as it was written."""
         try:
             checksum = 0
             with open(self.path, "rb") as file:

@@ -70,7 +70,7 @@ _OPTIONS = (
 class Shard:
     """The part `number` of `of` parts of a run, counted from 1.
 
-    **Raises:** `ValueError` for a part that there is not.
+    **Raises:** `ValueError` for a part that does not exist.
     """
 
     number: int
@@ -125,7 +125,8 @@ def simulate_shard(
 
     - `shard`: the part.
     - `folder`: of this part alone.
-    - the others as in `falsify`, the same for all parts; `confirm` is done when they are merged.
+    - all other arguments: as in `falsify`, the same for all parts; `confirm` is done when they are
+      merged.
 
     **Returns:** the number of simulations of this part.
 

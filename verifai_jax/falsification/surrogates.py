@@ -333,7 +333,7 @@ def _spread(rho: Float[np.ndarray, " n"], number: int, dim: int) -> float:
     """Return the factor on the model's standard deviations: it grows while no row is progress.
 
     A model that is too sure of itself proposes the neighbours of one hollow again and again; drawn
-    more widely, its simulators have their minima elsewhere. Behind a failure there is no need.
+    more widely, its simulators have their minima elsewhere. After a failure there is no need.
 
     **Arguments:**
 

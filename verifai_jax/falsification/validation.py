@@ -312,7 +312,7 @@ def check_first(
     rule: StoppingRule | None,
     precision: str,
 ) -> Float[np.ndarray, "n row"]:
-    """Return the rows that are simulated before the search begins; none where none are given.
+    """Return the rows that are simulated before the search begins; empty if none are given.
 
     **Raises:** as `points_of`; `ValueError` together with a rule that needs independent samples.
     """

@@ -62,7 +62,7 @@ def plot_replay(
 
     **Returns:** the figure.
 
-    **Raises:** `UnknownNameError` for a signal that there is not; `ValueError` for none.
+    **Raises:** `UnknownNameError` for a signal that does not exist; `ValueError` for none.
     """
     trace, formulas = replay.trace, replay.problem.formulas
     if isinstance(signals, str):
@@ -187,7 +187,7 @@ def _left_out(names: list[str]) -> str:
 
 
 def decisive_instant(formula: Formula, trace: Trace, end: End = "hold") -> tuple[str, int] | None:
-    """Return the signal and the sample that decide the verdict; None where there are none.
+    """Return the signal and the sample that decide the verdict; None if there are none.
 
     A predicate over several signals is marked on the first.
     """

@@ -72,7 +72,7 @@ def has_gradient(problem: Problem) -> bool:
 def without_derivative(problem: Problem) -> str | None:
     """Return which steps from the features to the robustness have no derivative; traced once.
 
-    None where all have one, and for a black box, which JAX does not trace.
+    None if all have one, and for a black box, which JAX does not trace.
     """
     lacking = () if problem.black_box else _slopes(problem).lacking
     return " and ".join(lacking) if lacking else None

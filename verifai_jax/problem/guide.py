@@ -73,8 +73,8 @@ class Guide:
     ) -> Float[Array, ""]:
         """Return the value of the term on one trace; traced by JAX.
 
-        **Raises:** what the formula does for a signal that there is not; `TypeError` for a function
-        that returns no number.
+        **Raises:** what the formula does for a signal that does not exist; `TypeError` for a
+        function that returns no number.
         """
         if isinstance(self.term, Formula):
             return robustness(self.term, trace, hard, end)

@@ -245,7 +245,7 @@ class Problem(InNotebook):
         constraint of the space, is not checked.
 
         **Raises:** `ProblemError` for a system that JAX does not trace; `UnknownNameError` for an
-        `of` or a formula that there is not; what `check` raises.
+        `of` or a formula that does not exist; what `check` raises.
         """
         function = lazy_import("verifai_jax.evaluation.objective", "objective")
         return function(self, semantics, of, key, formula)
@@ -294,7 +294,7 @@ class Problem(InNotebook):
     def form(self) -> Trace | None:
         """Return the form of the system's traces, signals as `jax.ShapeDtypeStruct`; traced once.
 
-        None where nothing but a simulation can tell.
+        None if nothing but a simulation can tell.
 
         **Raises:** `ProblemError` for a system that raises, or returns no `Trace`.
         """
@@ -302,7 +302,7 @@ class Problem(InNotebook):
 
     @property
     def duration(self) -> float | None:
-        """Seconds of a whole trace; None where nothing but a simulation can tell."""
+        """Seconds of a whole trace; None if nothing but a simulation can tell."""
         form = self.form()
         return None if form is None or form.dt is None else (form.length - 1) * form.dt
 

@@ -35,7 +35,7 @@ def comparison_page(comparison: Comparison, about: About, problem: Problem | Non
 
     - `comparison`: the comparison.
     - `about`: units and reasons of the features.
-    - `problem`: the baseline; None where it is not at hand.
+    - `problem`: the baseline; None if it is not at hand.
     """
     # That of one side says nothing of the files of the others.
     model = Model.of(comparison.sources.values())

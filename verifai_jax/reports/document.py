@@ -60,7 +60,7 @@ def write_report(
 
     **Returns:** the path of the HTML file.
 
-    **Raises:** `UnknownNameError` for a unit or a reason of a feature that there is not;
+    **Raises:** `UnknownNameError` for a unit or a reason of a feature that does not exist;
     `ValueError` for a number of simulations that is none, and for a run whose rows have changed
     since they were written;
     `TypeError` for something that is no result.

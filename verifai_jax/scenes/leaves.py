@@ -154,7 +154,7 @@ class Histogram(Leaf):
 class Chosen(Leaf):
     """An integer, or the place of an option.
 
-    - `values`: what the feature's choices stand for; None where the feature is the integer.
+    - `values`: what the feature's choices stand for; None if the feature is the integer.
     """
 
     values: tuple[int, ...] | None = None

@@ -194,7 +194,7 @@ class ScenicProgram:
         return self._sampling.features_of(scene)
 
     def refusal(self, features: Mapping[str, Any]) -> str | None:
-        """Return why Scenic's own checker refuses a scene; None where it accepts it."""
+        """Return why Scenic's own checker refuses a scene; None if it accepts it."""
         here = jax.tree.map(np.asarray, self.space.convert(features))
         try:
             return self._sampling.refusal(self._sampling.values(here), here)

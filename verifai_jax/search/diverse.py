@@ -307,7 +307,7 @@ class Diverse(Wrapper[DiverseState]):
                 gradient=jnp.where(inside[:, None], raised, observations.gradient)
             )
         if observations.clauses is not None:
-            # These have no unit, and of clauses that there are not the values stay very low.
+            # These have no unit, and of clauses that do not exist the values stay very low.
             there = inside[:, None] & (observations.clauses > NOTHING)
             lifted = jnp.maximum(observations.clauses, 0.0) + near[:, None]
             changed = changed._replace(clauses=jnp.where(there, lifted, observations.clauses))

@@ -438,7 +438,7 @@ def _minimax(
     share = jnp.where(above + below > 0, below / (above + below), 0.5)[:, None]
     candidates = jnp.concatenate([corner(gradients), share * a + (1 - share) * b])
     greatest = jnp.max(linear(candidates), axis=1)
-    # Of clauses that there are not, and of equally good points the first: a corner.
+    # Of clauses that do not exist, and of equally good points the first: a corner.
     there = clauses > NOTHING
     usable = jnp.concatenate([there, there[pairs[:, 0]] & there[pairs[:, 1]]])
     greatest = jnp.where(usable, greatest, jnp.inf)

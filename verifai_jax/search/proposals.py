@@ -422,7 +422,7 @@ def optimization_of(search: Search, batch: int) -> XlaOptimization:
 
 
 class SearchProgram(NamedTuple):
-    """Compiled functions of a search; `init` is None where they begin with the state of another."""
+    """Compiled functions of a search; `init` is None if they begin with the state of another."""
 
     init: Callable[..., PyTree] | None
     ask: Callable[..., tuple[Array, PyTree]]

@@ -20,7 +20,7 @@ def shortest(
     - `matrix`: rows of length one, up to rounding, so that one tolerance fits them all.
     - `bound`: least value of each row.
 
-    **Returns:** the vector; None where the inequalities contradict each other.
+    **Returns:** the vector; None if the inequalities contradict each other.
     """
     if np.all(bound <= 0):
         return np.zeros(matrix.shape[1])
@@ -52,7 +52,7 @@ def shortest_in_box(
     - `rows`, `maximum`: linear inequalities; rows of zeros are left out.
     - `low`, `high`: the box.
 
-    **Returns:** the vector; None where there is none.
+    **Returns:** the vector; None if there is none.
     """
     sizes = np.linalg.norm(rows, axis=1)
     rows, maximum, sizes = rows[sizes > 0], maximum[sizes > 0], sizes[sizes > 0]
@@ -87,7 +87,7 @@ def smallest_change(
     - `free`: coordinates that may move.
     - `bounded`: whether they stay in the unit cube.
 
-    **Returns:** the step; None where the linear model has no such point.
+    **Returns:** the step; None if the linear model has no such point.
     """
     indices = np.flatnonzero(free)
     rows = np.flatnonzero(np.isfinite(rho))

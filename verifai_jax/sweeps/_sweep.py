@@ -392,7 +392,7 @@ class _RunningSweep:
     # Certification
 
     def _certify(self) -> Certificates | None:
-        """Certify the finite policies of all rows; None where there are none."""
+        """Certify the finite policies of all rows; None if there are none."""
         entries = [
             (run, rung)
             for run in self._runs_of(range(len(self.configurations)))

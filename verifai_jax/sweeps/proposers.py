@@ -2,7 +2,7 @@
 
     proposer = make_proposer("bayes", space, configurations=64, seed=0)
     values = proposer.propose(8)                        # dictionaries of plain values, 8 at most
-    proposer.observe([0.02, None, ...])                 # their objective; None where it is unknown
+    proposer.observe([0.02, None, ...])                 # their objective; None if it is unknown
 
 Proposers look for the least `objective`: failure rate first, then worst robustness, then return.
 """
@@ -46,7 +46,7 @@ class Proposer(Protocol):
         ...
 
     def observe(self, objectives: Sequence[float | None]) -> None:
-        """Record the objectives of the last proposals, one by one; None where one is unknown."""
+        """Record the objectives of the last proposals, one by one; None if one is unknown."""
         ...
 
     def to_json(self) -> object:
@@ -150,7 +150,7 @@ def objective(
     - `nominal_return`: mean return on the nominal task.
     - `return_range`: least and greatest nominal return of the first round.
 
-    **Returns:** the objective; None where the failure rate is not known.
+    **Returns:** the objective; None if the failure rate is not known.
     """
     if not math.isfinite(failure_rate):
         return None

@@ -59,11 +59,11 @@ class Sweep(Drawn):
 
     - `record`: everything that was trained and certified, as plain data.
     - `study`: the study that was swept; None for a loaded sweep without it.
-    - `space`: of the hyper-parameters; the study's if left out, None where it is not known.
+    - `space`: of the hyper-parameters; the study's if left out, None if it is not known.
     - `folder`: place on disk of a loaded sweep.
     - `failing`: counterexamples of each row of a loaded sweep, by its number; others have
       certificates.
-    - `used`: names of the hyper-parameters of each algorithm; empty where all have all.
+    - `used`: names of the hyper-parameters of each algorithm; empty if all have all.
     - `reuse`: how much was cached before: by kind of work (`"train"`, `"return"`, `"certify"`) the
       number of entries that were, and of all; empty for a loaded sweep.
     """

@@ -26,9 +26,9 @@ class Row:
     - `values`: hyper-parameters.
     - `status`: see `record`.
     - `entry`: numbers of the training run and of its checkpoint.
-    - `checkpoint`: the run there; None where it did not train.
+    - `checkpoint`: the run there; None if it did not train.
     - `nominal_return`: mean return on the nominal task; NaN where it is not known.
-    - `safety`: of the policy; None where it was not certified.
+    - `safety`: of the policy; None if it was not certified.
     """
 
     configuration: int

@@ -35,7 +35,7 @@ _WORK = {
     "return": "nominal return",
     "certify": "block of simulations",
 }
-"""Kinds of cached work, in words."""
+"""What each kind of cached work is called in a summary."""
 _CSS = {"safe": "#3a9e7d", "unsafe": "#d1495b"}
 """Colours of verdicts in a notebook, those of the pictures; others are grey."""
 
@@ -46,7 +46,7 @@ class Findings(NamedTuple):
     - `record`: the record of the sweep.
     - `table`: one row for each policy.
     - `configurations`: one row for each configuration.
-    - `used`: names of the hyper-parameters of each algorithm; empty where all have all.
+    - `used`: names of the hyper-parameters of each algorithm; empty if all have all.
     - `p`: failure probability below which a policy is safe, where it is known.
     - `reuse`: entries that were cached before, and all, by kind of work.
     """

@@ -66,7 +66,7 @@ class TrainingRun:
     - `seed`: training seed.
     - `key`: digest of the hyper-parameters that the algorithm uses; part of the cache's names.
     - `checkpoints`: environment steps of its rows.
-    - `configuration`: task and algorithm with these values; None where they cannot train.
+    - `configuration`: task and algorithm with these values; None if they cannot train.
     - `error`: the reason for that, in one line.
     """
 
@@ -131,7 +131,7 @@ class TrainingRuns:
         return len(self.runs[number].checkpoints)
 
     def checkpoint(self, number: int, rung: int) -> RunCheckpoint | None:
-        """Return a run at a checkpoint; None where it has not trained so far."""
+        """Return a run at a checkpoint; None if it has not trained so far."""
         return self._checkpoints.get((number, rung))
 
     def structure(self, number: int) -> Hashable:

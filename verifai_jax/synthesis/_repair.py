@@ -101,7 +101,7 @@ def repair(
       changing the backend.
     - `max_seconds`: wall-clock seconds, of which a fifth is kept for the check.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-    - the others as in `falsify`.
+    - all other arguments: as in `falsify`.
 
     **Returns:** a `Repair`; after Ctrl-C what is finished, without the check.
 

@@ -120,7 +120,7 @@ class System(ForUsers):
     def abstract(self, features: Features) -> Trace | None:
         """Return the form of the trace, its signals as `jax.ShapeDtypeStruct`s.
 
-        None where nothing but a simulation can tell.
+        None if nothing but a simulation can tell.
 
         **Arguments:**
 
@@ -134,7 +134,7 @@ class System(ForUsers):
     def known_signals(self) -> KnownSignals:
         """Signals of a trace, of a system without `abstract`: names, with components where known.
 
-        None where nothing but a simulation can tell.
+        None if nothing but a simulation can tell.
         """
         return None
 
@@ -189,7 +189,7 @@ class System(ForUsers):
         raise ValueError(f"{self!r} has no backends to choose from; got backend {name!r}")
 
     def why_not(self, backend: str) -> str | None:
-        """Return the reason why an engine cannot simulate this system, None where it can."""
+        """Return the reason why an engine cannot simulate this system, None if it can."""
         return None if backend in self.backends else "the system has no such backend"
 
     def why_slow_to_compile(self, gradient: bool) -> str:

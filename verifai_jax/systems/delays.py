@@ -70,7 +70,7 @@ class Delay(NamedTuple):
 
 
 def first_refusal(delays: Iterable[Delay], features: Features, owner: str) -> str | None:
-    """Return what is wrong with the first delay that `owner` cannot have; None where all are right.
+    """Return what is wrong with the first delay that `owner` cannot have; None if all are right.
 
     **Arguments:**
 

@@ -296,7 +296,7 @@ class _Batch:
     ) -> tuple[int, tuple[Features, int], int] | None:
         """Return what a worker simulates next: its index, itself, and a number that stands for it.
 
-        None where nothing is left, or only what it has simulated before and others will now.
+        None if nothing is left, or only what it has simulated before and others will now.
         """
         with self._lock:
             for index, task in enumerate(self.tasks):

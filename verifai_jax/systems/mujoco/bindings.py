@@ -155,7 +155,7 @@ class Bindings:
     def check(self, features: Mapping[str, Any]) -> None:
         """Refuse features that the bindings do not fit.
 
-        **Raises:** `ValueError` for a bound feature that there is not, one of another shape than
+        **Raises:** `ValueError` for a bound feature that does not exist, one of another shape than
         its place, and a `Signal` where only constants can go.
         """
         for binding in self.all:

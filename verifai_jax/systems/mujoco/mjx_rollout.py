@@ -226,7 +226,7 @@ def _mjx_model(bindings: Bindings) -> tuple[Any, Any]:
 
 
 def why_not(bindings: Bindings) -> str | None:
-    """Return the reason why MJX cannot simulate a model; None where it can."""
+    """Return the reason why MJX cannot simulate a model; None if it can."""
     try:
         _mjx_model(bindings)
     except NotImplementedError as error:
@@ -241,7 +241,7 @@ def why_not(bindings: Bindings) -> str | None:
 
 
 def _cure(model: Model) -> str:
-    """Return the lines that make MJX take a model, tried out; empty where none are known."""
+    """Return the lines that make MJX take a model, tried out; empty if none are known."""
     mujoco = require("mujoco", extra="mujoco")
     compiled, lines = copy.copy(model.compiled), []
     known = {int(kind) for kind in mjx_module().SensorType}
@@ -307,7 +307,7 @@ def _assign(mujoco: ModuleType, compiled: MjModel, attribute: str, value: Any) -
 
 
 def _refusal(compiled: MjModel) -> str | None:
-    """Return what MJX says against a model; None where it takes it."""
+    """Return what MJX says against a model; None if it takes it."""
     try:
         mjx = mjx_module()
         mjx.make_data(mjx.put_model(compiled, impl="jax"))
@@ -330,7 +330,7 @@ def _integrator(mjx: ModuleType, model: MjxModel) -> Any:
 
 
 def reverse_hint(compiled: MjModel) -> str | None:
-    """Return why reverse mode does not work, and what makes it work; empty where it works."""
+    """Return why reverse mode does not work, and what makes it work; empty if it works."""
     if compiled.opt.integrator != 1 or not has_constraints(compiled):  # 1: Runge-Kutta
         return None
     return (

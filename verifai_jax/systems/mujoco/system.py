@@ -111,7 +111,7 @@ class MuJoCo(System):
         return "native" if has_constraints(self.loop.compiled) else "mjx"
 
     def why_not(self, backend: str) -> str | None:
-        """Return the reason why an engine cannot simulate this model; None where it can."""
+        """Return the reason why an engine cannot simulate this model; None if it can."""
         if backend not in BACKENDS:
             raise unknown_name("backend", backend, (*BACKENDS, "auto"))
         return None if backend == "native" else why_not(self.loop.bindings)
