@@ -42,8 +42,8 @@ class Journal:
             "status": int(verdict.status),
             "holds": np.asarray(verdict.holds).tolist(),
             "message": verdict.message,
-            "marks": None if verdict.marks is None else verdict.marks.tolist(),
-            "steering": None if verdict.steering is None else verdict.steering.tolist(),
+            "coverage_ids": None if verdict.coverage_ids is None else verdict.coverage_ids.tolist(),
+            "guidance": None if verdict.guidance is None else verdict.guidance.tolist(),
         }
         self._last = max(self._last, row)
         # In JSON, which takes less time than many small arrays.
@@ -77,7 +77,7 @@ def _read(log: Log) -> dict[int, tuple[np.ndarray, RowVerdict]]:
     for name in log.names():
         with contextlib.suppress(ValueError, KeyError, TypeError):  # Of another program.
             entry = log.get_json(name)
-            marks, steering = entry["marks"], entry["steering"]
+            coverage_ids, guidance = entry["coverage_ids"], entry["guidance"]
             known[int(name)] = (
                 np.asarray(entry["point"], np.float32),
                 RowVerdict(
@@ -85,8 +85,8 @@ def _read(log: Log) -> dict[int, tuple[np.ndarray, RowVerdict]]:
                     int(entry["status"]),
                     np.asarray(entry["holds"], bool),
                     str(entry["message"]),
-                    None if marks is None else np.asarray(marks, np.int32),
-                    None if steering is None else np.asarray(steering, np.float32),
+                    None if coverage_ids is None else np.asarray(coverage_ids, np.int32),
+                    None if guidance is None else np.asarray(guidance, np.float32),
                 ),
             )
     return known

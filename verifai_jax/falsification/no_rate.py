@@ -48,7 +48,7 @@ _NO_RATE = "The points between the {rows} samples: nothing is known of them."
 
 
 def why_no_rate(run: Run) -> str:
-    """Say why the rows of a run give no failure rate; empty where they are samples of the prior."""
+    """Say why the rows of a run give no failure rate; empty if they are samples of the prior."""
     if run.prior:
         return ""
     if run.origin == "first":

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.sources import Sources
 from verifai_jax.core.text import one_line
 from verifai_jax.falsification.derived import as_simulated
@@ -131,7 +131,9 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
 
 def as_made(run: Run) -> Run:
     """Return a run as the verb that made it does: one of `fuzz` has its coverage."""
-    return run if run.derived is None else late("verifai_jax.fuzzing.run", "as_fuzz_run")(run)
+    return (
+        run if run.derived is None else lazy_import("verifai_jax.fuzzing.run", "as_fuzz_run")(run)
+    )
 
 
 ANEW = "begin anew, from what it has found: vj.falsify(problem, warm_start=run)"
@@ -213,11 +215,11 @@ def read_record(folder: Path) -> dict[str, Any]:
     """
     file = folder / RECORD
     if not file.is_file():
-        raise FileNotFoundError(f"no run in {folder}: {RECORD} is missing{_rows_beside(folder)}")
+        raise FileNotFoundError(f"no run in {folder}: {RECORD} is missing{_rows_alongside(folder)}")
     try:
         return files.read_record(file)
     except DamagedError as error:
-        raise DamagedError(f"no run in {folder}: {error}{_rows_beside(folder)}") from error
+        raise DamagedError(f"no run in {folder}: {error}{_rows_alongside(folder)}") from error
 
 
 def _check_entries(record: Mapping[str, Any], folder: Path) -> None:
@@ -227,9 +229,10 @@ def _check_entries(record: Mapping[str, Any], folder: Path) -> None:
     """
     if other := sorted(record.keys() ^ {"features", *RECORDED}):
         version = one_line(str(record.get("version", "unknown")), 40)
+        names = one_line(", ".join(map(repr, other)), 80)
         raise DamagedError(
             f"{folder / RECORD} is of another version of verifai_jax, {version}, which can load "
-            f"it: {one_line(', '.join(map(repr, other)), 80)} is not in both{_rows_beside(folder)}"
+            f"it: {names} is not in both{_rows_alongside(folder)}"
         )
     for part in record["sources"]:
         Sources.from_json(part)
@@ -296,7 +299,7 @@ _NUMERIC = ("Box", "DiscreteBox", "Normal", "TruncatedNormal", "LogUniform", "Lo
 """Kinds of domains, the usual ones, whose columns are numbers."""
 
 
-def _rows_beside(folder: Path) -> str:
+def _rows_alongside(folder: Path) -> str:
     """Say how the rows of a folder are read without its record."""
     if (folder / FINISHED).is_file():
         return f"; the rows are in {folder / FINISHED}, which pandas.read_parquet reads"

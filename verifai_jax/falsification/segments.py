@@ -3,7 +3,7 @@
     table/rows-000000000000-000001048576-9f3c2a1b.parquet       rows 0 to 1048575
     failures/rows-000000000000-000001048576-07d1e44a.parquet    those of them that stand out
 
-A file is written once, in whole, and renamed into place; its name has its first row, the one behind
+A file is written once, in whole, and renamed into place; its name has its first row, the one after
 its last, and its checksum. Beside each segment stand the rows of it that stand out: those that
 violate the property, have no verdict or a gradient that is not finite, and the one of least
 robustness. What counts or shows failures reads these alone. `pandas.read_parquet` opens either
@@ -21,7 +21,7 @@ from jaxtyping import Int
 
 from verifai_jax.core.text import format_error, printable
 from verifai_jax.falsification.columns import ROW, Columns, column_to_arrow
-from verifai_jax.store.files import DamagedError, checksum, write_whole
+from verifai_jax.store.files import DamagedError, checksum, write_complete
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -60,7 +60,7 @@ class Segment:
 
     @property
     def damage(self) -> str:
-        """Say what has become of the file; empty where it is as it was written."""
+        """Say what has become of the file; empty if it is as it was written."""
         try:
             own = checksum(self.path.read_bytes())
         except OSError as error:
@@ -104,9 +104,9 @@ class Segment:
     def read_standing_out(self) -> "pd.DataFrame":
         """Return those of its rows that stand out, from their own file where it is whole."""
         folder = self.path.parent.parent / FAILURES
-        for beside in list_segments(folder):
-            if (beside.first, beside.stop) == (self.first, self.stop) and not beside.damage:
-                return beside.read()
+        for others in list_segments(folder):
+            if (others.first, others.stop) == (self.first, self.stop) and not others.damage:
+                return others.read()
         frame = self.read()
         return frame.iloc[standing_out({str(name): frame[name].to_numpy() for name in frame})]
 
@@ -115,7 +115,7 @@ class Segment:
 
 
 def standing_out(columns: Columns) -> Int[np.ndarray, " k"]:
-    """Return the places of the rows that counts, statistics and searches for failures need."""
+    """Return the indices of the rows that counts, statistics and searches for failures need."""
     proper = columns["status"] == "ok"
     out = ~proper | columns["violated"].astype(bool)
     if "gradient_finite" in columns:
@@ -131,11 +131,11 @@ def write_segment(run: Path, first: int, columns: Columns) -> Segment:
 
     **Raises:** `OSError` where they cannot be written.
     """
-    places = standing_out(columns)
-    few = {name: values[places] for name, values in columns.items()}
+    indices = standing_out(columns)
+    few = {name: values[indices] for name, values in columns.items()}
     stop = first + len(columns["rho"])
     # First: without its segment it is none, and the segment comes with one.
-    _write(run / FAILURES, first, stop, parquet(few, first + places))
+    _write(run / FAILURES, first, stop, parquet(few, first + indices))
     path = _write(run / SEGMENTS, first, stop, parquet(columns, np.arange(first, stop)))
     return Segment(first, stop, path)
 
@@ -143,7 +143,7 @@ def write_segment(run: Path, first: int, columns: Columns) -> Segment:
 def _write(folder: Path, first: int, stop: int, content: "pa.Buffer") -> Path:
     folder.mkdir(exist_ok=True)
     name = f"rows-{first:012d}-{stop:012d}-{checksum(content):08x}.parquet"
-    return write_whole(folder / name, content)
+    return write_complete(folder / name, content)
 
 
 def parquet(columns: Columns, rows: Int[np.ndarray, " n"]) -> "pa.Buffer":

@@ -66,7 +66,7 @@ _OPTIONS = (
 class Shard:
     """The part `number` of `of` parts of a run, counted from 1.
 
-    **Raises:** `ValueError` for a part that there is not.
+    **Raises:** `ValueError` for a part that does not exist.
     """
 
     number: int
@@ -121,7 +121,8 @@ def simulate_shard(
 
     - `shard`: the part.
     - `folder`: of this part alone.
-    - the others as in `falsify`, the same for all parts; `confirm` is done when they are merged.
+    - all other arguments: as in `falsify`, the same for all parts; `confirm` is done when they are
+      merged.
 
     **Returns:** the number of simulations of this part.
 
@@ -146,7 +147,7 @@ def simulate_shard(
     problem = resolved(problem, batch=batch, budget=budget, precision=precision, wanted=backend)[0]
     problem.check()
     search, _ = adapt_search(problem, search)
-    place = Path(folder)
+    path = Path(folder)
     record = {
         "name": problem.name,
         "formulas": {name: str(formula) for name, formula in problem.formulas.items()},
@@ -162,8 +163,8 @@ def simulate_shard(
         "shard": [shard.number, shard.of],
         "sources": problem.sources().to_json(),
     }
-    with write_lock(place):
-        log = Log(place / SHARD)
+    with write_lock(path):
+        log = Log(path / SHARD)
         _claim(log, record)
         rows = shard.rows(budget, _unit(problem, batch))
         _simulate(problem, search, rows, record, log, progress, str(shard))
@@ -203,7 +204,7 @@ def _simulate(
                     verdicts = evaluate(u, first=begin)
                     _write(log, begin, u, verdicts)
                     found += int(verdicts.violated.sum())
-                    best = float(np.fmin(best, np.fmin.reduce(verdicts.least)))
+                    best = float(np.fmin(best, np.fmin.reduce(verdicts.lowest)))
                 simulated += stop - begin
                 bar.update(simulated, found, best)
             first += len(points)
@@ -212,32 +213,32 @@ def _simulate(
 def _claim(log: Log, record: Mapping[str, Any]) -> None:
     """Write the record of a part, or refuse the folder of another one."""
     assert log.path is not None
-    place = log.path.parent
+    path = log.path.parent
     if not log.names():
-        if {path.name for path in place.iterdir()} - {LOCK, SHARD}:
-            raise ValueError(f"folder {str(place)!r} is not empty; a part of a run needs a new one")
-        with writing(place):
+        if {path.name for path in path.iterdir()} - {LOCK, SHARD}:
+            raise ValueError(f"folder {str(path)!r} is not empty; a part of a run needs a new one")
+        with writing(path):
             log.put_json(_ABOUT, record)
         return
-    known = read_shard(place)
+    known = read_shard(path)
     for name, value in json.loads(json.dumps(record)).items():
         if name == "sources":
-            _check_same_model(place, known, Sources.from_json(value))
+            _check_same_model(path, known, Sources.from_json(value))
         elif known.get(name) != value:
             raise ValueError(
-                f"{place} holds another part: its {name} is {one_line(str(known.get(name)))}, "
+                f"{path} holds another part: its {name} is {one_line(str(known.get(name)))}, "
                 f"here {one_line(str(value))}; give another folder"
             )
 
 
-def _check_same_model(place: Path, record: Mapping[str, Any], now: Sources) -> None:
+def _check_same_model(folder: Path, record: Mapping[str, Any], now: Sources) -> None:
     """Refuse a part that another model has simulated.
 
     **Raises:** `ValueError`.
     """
     if changes := Sources.from_json(record["sources"]).changes(now):
         raise ValueError(
-            f"the model has changed since the part in {place} was simulated: "
+            f"the model has changed since the part in {folder} was simulated: "
             f"{list_changes(changes)}. Restore the files, or simulate the part again in a new "
             "folder: rows of one run are of one model"
         )
@@ -297,7 +298,7 @@ class _StoredRows:
         self._blocks = sorted(blocks, key=lambda block: (block[0].start, block[0].stop))
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any) -> "Future[dict[str, Any]]":
-        """Return a future with the stored rows in place of those that `function` would simulate.
+        """Return a future with the stored rows in path of those that `function` would simulate.
 
         Rows that are replayed before they are claimed are simulated here.
         """
@@ -383,14 +384,14 @@ def merge(
     """
     if not folders:
         raise ValueError("there is no part to merge")
-    places = [Path(place) for place in folders]
-    records = [read_shard(place) for place in places]
+    paths = [Path(path) for path in folders]
+    records = [read_shard(path) for path in paths]
     first, of = records[0], records[0]["shard"][1]
-    for place, record in zip(places, records, strict=True):
+    for path, record in zip(paths, records, strict=True):
         for name in _OPTIONS:
             if record[name] != first[name]:
                 raise ValueError(
-                    f"{place} is a part of another run than {places[0]}: its {name} is "
+                    f"{path} is a part of another run than {paths[0]}: its {name} is "
                     f"{one_line(str(record[name]))}, there {one_line(str(first[name]))}"
                 )
     numbers = [record["shard"] for record in records]
@@ -409,9 +410,9 @@ def merge(
             f"{problem.name!r} has now"
         )
     now = problem.sources()
-    for place, record in zip(places, records, strict=True):
-        _check_same_model(place, record, now)
-    stored = _StoredRows([block for place in places for block in _blocks(Log(place / SHARD))])
+    for path, record in zip(paths, records, strict=True):
+        _check_same_model(path, record, now)
+    stored = _StoredRows([block for path in paths for block in _blocks(Log(path / SHARD))])
     return falsify(
         problem,
         searches.from_json(first["search"]),

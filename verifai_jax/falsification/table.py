@@ -38,7 +38,7 @@ from verifai_jax.falsification.segments import (
 )
 from verifai_jax.falsification.table_view import TableView
 from verifai_jax.falsification.tail import TAIL, read_tail, tail_entry
-from verifai_jax.store.files import write_whole
+from verifai_jax.store.files import write_complete
 from verifai_jax.store.log import Log, write_log
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ RESERVED = (
     "differentiated",
     "verdict",
     "rho_again",
-    "new_marks",
+    "new_coverage",
     "suggested",
 )
 """Names of the table's own columns, which no feature may have."""
@@ -251,7 +251,7 @@ class ErrorTable(TableView):
     def _write_finished(self, folder: Path) -> None:
         batches = list(self._parts(0, self._next))
         columns = merge(batches) if batches else from_frame(self._empty)
-        write_whole(folder / FINISHED, parquet(columns, np.arange(self._next)))
+        write_complete(folder / FINISHED, parquet(columns, np.arange(self._next)))
 
     def _replace_by(self, parts: Iterator[Batch]) -> None:
         """Take these rows, in place of what the folder holds."""

@@ -231,10 +231,10 @@ class TableView(InNotebook):
     def _memory(self) -> Iterator[tuple[Int[np.ndarray, " n"], Columns]]:
         """Yield numbers and columns of the rows in memory, in blocks."""
         self._join()
-        most = segments.SEGMENT_ROWS
+        maximum = segments.SEGMENT_ROWS
         for first, batch in self._batches:
-            for begin in range(first, first + length(batch), most):
-                part = cut((first, batch), begin, begin + most)
+            for begin in range(first, first + length(batch), maximum):
+                part = cut((first, batch), begin, begin + maximum)
                 yield row_numbers([part]), part[1]
 
     def _standing_out(self) -> Iterator[tuple[Int[np.ndarray, " n"], Columns]]:
@@ -242,16 +242,16 @@ class TableView(InNotebook):
             frame = segment.read_standing_out()
             yield frame.index.to_numpy(), from_frame(frame)
         for numbers, block in self._memory():
-            places = standing_out(block)
-            yield numbers[places], {name: values[places] for name, values in block.items()}
+            indices = standing_out(block)
+            yield numbers[indices], {name: values[indices] for name, values in block.items()}
 
     def _select(self, wanted: Callable[[Columns], Bool[np.ndarray, " n"]]) -> "pd.DataFrame":
         """Return rows that stand out, in their order."""
         found = []
         for numbers, block in self._standing_out():
-            places = np.flatnonzero(wanted(block))
-            few = {name: values[places] for name, values in block.items()}
-            found.append(to_frame(numbers[places], few))
+            indices = np.flatnonzero(wanted(block))
+            few = {name: values[indices] for name, values in block.items()}
+            found.append(to_frame(numbers[indices], few))
         return self._concatenate(found)
 
     def _note(self, sentence: str) -> None:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-MOST_AT_ONCE = 32_768
+MAX_AT_ONCE = 32_768
 """Simulations of a round at most, by default; more are no faster."""
 
 
@@ -58,13 +58,13 @@ def usual_batch(
         )
     if not search.learns:
         eighth = 1 << max(0, (int(budget) // 8).bit_length() - 1)
-        return max(search.wants.max_batch, min(MOST_AT_ONCE, eighth) if whole else 0)
-    most = (
+        return max(search.wants.max_batch, min(MAX_AT_ONCE, eighth) if whole else 0)
+    maximum = (
         search.wants.max_batch
         if stop_after is None
         else min(search.wants.max_batch, 16 * stop_after)
     )
-    return min(1 << (most.bit_length() - 1), 1 << max(3, (int(budget) // 20).bit_length() - 1))
+    return min(1 << (maximum.bit_length() - 1), 1 << max(3, (int(budget) // 20).bit_length() - 1))
 
 
 def batch_size(
@@ -301,7 +301,7 @@ def check_first(
     rule: StoppingRule | None,
     precision: str,
 ) -> Float[np.ndarray, "n row"]:
-    """Return the rows that are simulated before the search begins; none where none are given.
+    """Return the rows that are simulated before the search begins; empty if none are given.
 
     **Raises:** as `points_of`; `ValueError` together with a rule that needs independent samples.
     """
@@ -394,22 +394,22 @@ def new_folder(folder: str | Path | None) -> Iterator[Path | None]:
     if folder is None:
         yield None
         return
-    place = Path(folder)
-    if not (place / LOCK).exists():  # Whoever writes there is told by the lock.
-        _check_empty(place)
-    with write_lock(place):
-        _check_empty(place)  # Another run may have begun in it, and ended, since.
-        yield place
+    folder = Path(folder)
+    if not (folder / LOCK).exists():  # Whoever writes there is told by the lock.
+        _check_empty(folder)
+    with write_lock(folder):
+        _check_empty(folder)  # Another run may have begun in it, and ended, since.
+        yield folder
 
 
-def _check_empty(place: Path) -> None:
+def _check_empty(folder: Path) -> None:
     # A process that dies before its first record leaves a part of one.
     leftover = {f".{RECORD}.part", LOCK}
-    if place.exists() and (not place.is_dir() or {p.name for p in place.iterdir()} - leftover):
-        if (place / RECORD).is_file():
+    if folder.exists() and (not folder.is_dir() or {p.name for p in folder.iterdir()} - leftover):
+        if (folder / RECORD).is_file():
             raise ValueError(
-                f"folder {str(place)!r} exists and is not empty: it holds a run, with which "
-                f"vj.resume, or verifai-jax falsify --resume {place}, goes on; a new one needs "
+                f"folder {str(folder)!r} exists and is not empty: it holds a run, with which "
+                f"vj.resume, or verifai-jax falsify --resume {folder}, goes on; a new one needs "
                 "another folder"
             )
-        raise ValueError(f"folder {str(place)!r} exists and is not empty; a run needs a new one")
+        raise ValueError(f"folder {str(folder)!r} exists and is not empty; a run needs a new one")

@@ -187,14 +187,14 @@ def locked_cache(folder: str | Path | None, kind: str = "sweep") -> Iterator[Cac
         yield Cache(folder, kind)
 
 
-def _differences(one: object, other: object, place: str = "") -> Iterable[str]:
+def _differences(one: object, other: object, path: str = "") -> Iterable[str]:
     """Write the differences of two fingerprints: `trainer.steps is 64, in the cache 32`."""
     if isinstance(one, dict) and isinstance(other, dict):
         for name in dict.fromkeys((*one, *other)):
-            inner = f"{place}.{name}" if place else name
+            inner = f"{path}.{name}" if path else name
             yield from _differences(one.get(name), other.get(name), inner)
     elif one != other:
-        yield f"{place} is {_abbreviate(one)}, in the cache {_abbreviate(other)}"
+        yield f"{path} is {_abbreviate(one)}, in the cache {_abbreviate(other)}"
 
 
 def _abbreviate(value: object) -> str:

@@ -1,6 +1,6 @@
 """Files that are there whole or not at all, records in JSON, the checksum of all that is stored.
 
-write_whole(path, content)
+write_complete(path, content)
 write_record(path, {"seed": 0})
 read_record(path)                               # DamagedError, where it has changed since
 """
@@ -33,7 +33,7 @@ def checksum(content: "bytes | memoryview | pa.Buffer", before: int = 0) -> int:
     return zlib.crc32(content, before)
 
 
-def write_whole(path: Path, content: "pa.Buffer | bytes") -> Path:
+def write_complete(path: Path, content: "pa.Buffer | bytes") -> Path:
     """Write a file such that a reader never meets a half of it; return its path.
 
     **Raises:** `OSError` where it cannot be written; what was at `path` stays.
@@ -56,7 +56,7 @@ def write_record(path: Path, record: Mapping[str, Any]) -> dict[str, Any]:
     **Raises:** `OSError` where it cannot be written.
     """
     stored = json.loads(json.dumps(record))
-    write_whole(path, f"{json.dumps(sealed(stored), indent=2)}\n".encode())
+    write_complete(path, f"{json.dumps(sealed(stored), indent=2)}\n".encode())
     return stored
 
 

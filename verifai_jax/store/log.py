@@ -25,7 +25,7 @@ from typing import IO, Any, TypeAlias
 
 import numpy as np
 
-from verifai_jax.store.files import DamagedError, checksum, write_whole
+from verifai_jax.store.files import DamagedError, checksum, write_complete
 
 Arrays: TypeAlias = Mapping[str, np.ndarray]
 """An entry: arrays of numbers or texts, by name."""
@@ -38,7 +38,7 @@ _PLAIN = re.compile(r"[<>|=]?[biufU]\d{1,9}")
 """NumPy's types of the arrays that can be stored: of numbers and texts."""
 _JSON = "json"
 """Array of an entry that is plain data."""
-_Place: TypeAlias = tuple[int, int, list[Any]]
+_Extent: TypeAlias = tuple[int, int, list[Any]]
 """Where the bytes of an entry begin, how many they are; name, type and shape of its arrays."""
 
 
@@ -54,7 +54,7 @@ class Log:
         self.path = path
         self._memory = io.BytesIO()
         self._file: FileIO | io.BytesIO | None = None
-        self._places: dict[str, _Place] | None = None
+        self._extents: dict[str, _Extent] | None = None
         self._damaged = False
 
     def put(self, entries: Mapping[str, Arrays]) -> None:
@@ -77,22 +77,22 @@ class Log:
                 raise
         except OSError as error:
             raise type(error)(error.errno, error.strerror, str(self.path)) from error
-        if self._places is not None:
-            self._places.update(_places(frame, begin))
+        if self._extents is not None:
+            self._extents.update(_extents(frame, begin))
 
     def get(self, name: str) -> dict[str, np.ndarray] | None:
         """Return an entry; None where there is none, or it is damaged."""
-        if (place := self._index().get(name)) is None:
+        if (extent := self._index().get(name)) is None:
             return None
         with self._opened() as file:
-            return _decode(file, place)
+            return _decode(file, extent)
 
     def entries(self) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
         """Yield all entries with their names, in the order in which they came first."""
-        if places := [*self._index().items()]:
+        if extents := [*self._index().items()]:
             with self._opened() as file:
-                for name, place in places:
-                    if (entry := _decode(file, place)) is not None:
+                for name, extent in extents:
+                    if (entry := _decode(file, extent)) is not None:
                         yield name, entry
 
     def put_json(self, name: str, value: object) -> None:
@@ -121,7 +121,7 @@ class Log:
     def clear(self) -> None:
         """Remove the file."""
         self.close()
-        self._places = None
+        self._extents = None
         if self.path is not None:
             self.path.unlink(missing_ok=True)
 
@@ -137,25 +137,25 @@ class Log:
     def _opened(self) -> AbstractContextManager[IO[bytes]]:
         return contextlib.nullcontext(self._memory) if self.path is None else open(self.path, "rb")
 
-    def _index(self) -> dict[str, _Place]:
+    def _index(self) -> dict[str, _Extent]:
         """Find the frames of the file: the place of the last entry of each name.
 
         **Raises:** `DamagedError` for what is no file.
         """
-        if self._places is None:
-            places: dict[str, _Place] = {}
+        if self._extents is None:
+            extents: dict[str, _Extent] = {}
             self._damaged = False
             try:
                 with self._opened() as file:
                     for found in _find_frames(file):
                         self._damaged |= found is None
-                        places.update(found or {})
+                        extents.update(found or {})
             except FileNotFoundError:
                 pass
             except IsADirectoryError as error:
                 raise DamagedError(f"{self.path} is damaged: it is not a file") from error
-            self._places = places
-        return self._places
+            self._extents = extents
+        return self._extents
 
 
 def write_log(path: Path, entries: Mapping[str, Arrays]) -> None:
@@ -163,17 +163,17 @@ def write_log(path: Path, entries: Mapping[str, Arrays]) -> None:
 
     **Raises:** as `Log.put`.
     """
-    write_whole(path, _encode(entries) if entries else b"")
+    write_complete(path, _encode(entries) if entries else b"")
 
 
-def _find_frames(file: IO[bytes]) -> Iterator[dict[str, _Place] | None]:
+def _find_frames(file: IO[bytes]) -> Iterator[dict[str, _Extent] | None]:
     """Yield the entries of each frame of a file; None where there is damage."""
     end, at = file.seek(0, os.SEEK_END), file.seek(0)
     while header := file.read(_HEADER.size):
         with contextlib.suppress(struct.error, ValueError):
             _, head, body, _ = _HEADER.unpack(header)
             # Damaged lengths are larger than any memory.
-            yield _places(header + file.read(min(head + body, end - at)), at)
+            yield _extents(header + file.read(min(head + body, end - at)), at)
             at += _HEADER.size + head + body
             continue
         yield None
@@ -183,7 +183,7 @@ def _find_frames(file: IO[bytes]) -> Iterator[dict[str, _Place] | None]:
         at = file.seek(at + 1 + (len(rest) if found < 0 else found))
 
 
-def _places(frame: bytes, begin: int) -> dict[str, _Place]:
+def _extents(frame: bytes, begin: int) -> dict[str, _Extent]:
     """Return where the entries of a frame are in a file, in which it begins at `begin`.
 
     **Raises:** `ValueError` for what is no frame, or has changed.
@@ -195,16 +195,16 @@ def _places(frame: bytes, begin: int) -> dict[str, _Place]:
         or own != _checksum(frame[: _HEADER.size], frame[_HEADER.size :])
     ):
         raise ValueError("no frame")
-    places: dict[str, _Place] = {}
+    extents: dict[str, _Extent] = {}
     at = begin + _HEADER.size + head
     # A checksum is no proof of who wrote it: another program's entries are none.
     with contextlib.suppress(ValueError, TypeError, RecursionError):
         for name, size, arrays in json.loads(frame[_HEADER.size : _HEADER.size + head]):
             if not 0 <= size <= begin + len(frame) - at:
                 break
-            places[str(name)] = at, int(size), list(arrays)
+            extents[str(name)] = at, int(size), list(arrays)
             at += int(size)
-    return places
+    return extents
 
 
 def _checksum(header: bytes, content: bytes) -> int:
@@ -225,9 +225,9 @@ def _encode(entries: Mapping[str, Arrays]) -> bytes:
     return _HEADER.pack(MARK, len(head), size, _checksum(header, content)) + content
 
 
-def _decode(file: IO[bytes], place: _Place) -> dict[str, np.ndarray] | None:
+def _decode(file: IO[bytes], extent: _Extent) -> dict[str, np.ndarray] | None:
     """Read an entry; None for one of another program."""
-    begin, size, arrays = place
+    begin, size, arrays = extent
     entry: dict[str, np.ndarray] = {}
     with contextlib.suppress(ValueError, TypeError, OverflowError):
         file.seek(begin)
