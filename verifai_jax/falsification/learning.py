@@ -18,7 +18,6 @@ from jaxtyping import Array, Float, Int, Key
 
 from verifai_jax.evaluation.steering import Steering
 from verifai_jax.evaluation.verdicts import Verdicts
-from verifai_jax.falsification.marks import MarkBook
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Objective
 from verifai_jax.search import Search
@@ -27,6 +26,7 @@ from verifai_jax.search.proposals import Proposals
 if TYPE_CHECKING:
     import pandas as pd
 
+    from verifai_jax.falsification.marks import MarkBook
     from verifai_jax.falsification.surrogates import Surrogate
 
 MAX_WARM = 2048
@@ -73,7 +73,11 @@ class Learning:
         self.problem, self.search, self._key = problem, search, key
         guided = problem.guide is not None and search.learns
         self.steering = Steering(guide=guided, outcome=search.wants.outcomes)
-        self.marks = MarkBook(problem) if search.wants.marks else None
+        self.marks: MarkBook | None = None
+        if search.wants.marks:
+            from verifai_jax.falsification import marks
+
+            self.marks = marks.MarkBook(problem)
         self.surrogate: Surrogate | None = None
         self._objective = None if problem.rulebook is None else Objective(problem.rulebook)
         self.proposals: Any = None

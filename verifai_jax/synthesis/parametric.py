@@ -23,10 +23,10 @@ from jaxtyping import Array, Bool, Float, PyTree
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import in_precision
-from verifai_jax.core.shapes import pad_rows
+from verifai_jax.core.programs import pad_rows
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.evaluation.inputs import WithParameters
+from verifai_jax.evaluation.row import WithParameters
 from verifai_jax.evaluation.verdicts import trace_verdict
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
