@@ -9,7 +9,7 @@ import pytest
 import verifai_jax as vj
 from verifai_jax import search as searches
 from verifai_jax.falsification.no_rate import what_lies_between, why_no_rate
-from verifai_jax.falsification.rows import ORIGINS, origin_of
+from verifai_jax.falsification.origin import ORIGINS, origin_of
 
 OTHERS = {
     "first": "rows were given",

@@ -10,7 +10,7 @@ from typing import Any
 from verifai_jax.core.seals import is_intact
 from verifai_jax.core.sources import Sources
 from verifai_jax.core.text import one_line
-from verifai_jax.falsification.rows import ORIGINS
+from verifai_jax.falsification.origin import ORIGINS
 from verifai_jax.falsification.segments import SEGMENTS, list_segments
 from verifai_jax.falsification.table import FINISHED
 from verifai_jax.falsification.tail import TAIL

@@ -1,12 +1,4 @@
-"""Rows of the error table: made of the verdicts of a round, and where those of a run come from.
-
-    columns = rows_of(problem, verdicts)
-    origin_of(search, first=0)      # "prior", "first", "given", "sequence", "coverage", "learned"
-
-The origin is one value that says why there is no failure rate.
-"""
-
-from typing import Literal, get_args
+"""Rows of the error table, made of the verdicts of a round."""
 
 import numpy as np
 from jaxtyping import Bool
@@ -14,7 +6,6 @@ from jaxtyping import Bool
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
-from verifai_jax.search import Search
 
 STATUS_NAMES = np.array([status.name.lower() for status in Status], dtype=object)
 
@@ -61,20 +52,3 @@ def without_failure(verdicts: Verdicts, rows: Bool[np.ndarray, " n"]) -> Verdict
         return verdicts
     lift = np.where(rows, 1e-6 - np.max(verdicts.clauses, axis=1), 0.0)
     return verdicts._replace(clauses=verdicts.clauses + lift[:, None])
-
-
-Origin = Literal["prior", "first", "given", "sequence", "coverage", "learned"]
-"""Where rows come from: as the points of a search (`search/base.py`), and `"first"` for samples of
-the prior after rows that were given."""
-ORIGINS: tuple[Origin, ...] = get_args(Origin)
-
-
-def origin_of(search: Search, first: int) -> Origin:
-    """Return where the rows of a run come from.
-
-    **Arguments:**
-
-    - `search`: of the run.
-    - `first`: number of rows that were given before the search proposed any.
-    """
-    return "first" if first and search.samples_prior else search.origin

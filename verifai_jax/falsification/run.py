@@ -82,7 +82,7 @@ class Run(InNotebook):
       into the table. What is left is that of callbacks and checkpoints.
     - `version`: of verifai_jax.
     - `prior`: whether the rows are independent samples of the feature space.
-    - `origin`: where the rows come from, one of `rows.ORIGINS`, which says why they are no such
+    - `origin`: where the rows come from, one of `origin.ORIGINS`, which says why they are no such
       samples: `"first"` (rows that were given came before the samples), `"given"` (all rows were),
       `"sequence"` (the points of a sequence that spreads them), `"coverage"` and `"learned"` (a
       search that goes where coverage grows, or where failures are); empty in a record that does

@@ -25,7 +25,7 @@ from verifai_jax.core.text import one_line
 from verifai_jax.core.user_errors import explain_user_error, format_user_error
 from verifai_jax.evaluation.backends import Choice
 from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
-from verifai_jax.falsification.rows import origin_of
+from verifai_jax.falsification.origin import origin_of
 from verifai_jax.falsification.run import Run, write_record
 from verifai_jax.falsification.silent_mistakes import cut_short_note, nominal_note, notes_after
 from verifai_jax.falsification.summary import first_message
