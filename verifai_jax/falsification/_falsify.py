@@ -15,6 +15,7 @@ import numpy as np
 
 from verifai_jax import search as searches
 from verifai_jax.core.callbacks import Callback, check_callbacks
+from verifai_jax.core.checks import check_options
 from verifai_jax.core.compilation import tracing
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.precision import in_precision, reproducible_settings
@@ -41,7 +42,6 @@ from verifai_jax.falsification.validation import (
     check_first,
     check_gradient,
     check_guide,
-    check_options,
     check_rule,
     check_same_guide,
     check_same_space,

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax import search as searches
-from verifai_jax.core.checks import check_count, check_positive
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.locks import LOCK, write_lock
 from verifai_jax.core.text import format_error, one_line
@@ -97,23 +96,6 @@ def batch_size(
     """
     usual = 16 if diverse else usual_batch(search, budget, stop_after, whole)
     return min(usual if asked is None else asked, budget)
-
-
-def check_options(
-    budget: object, batch: object, seed: object, max_seconds: object, stop_after: object
-) -> None:
-    """Refuse numbers out of range.
-
-    **Raises:** `ValueError`.
-    """
-    for name, value in (("budget", budget), ("batch", batch), ("stop_after", stop_after)):
-        if name == "stop_after" and value is None:
-            continue
-        check_count(name, value)
-    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or not 0 <= seed < 2**63:
-        raise ValueError(f"seed must be an integer from 0 to 2**63 - 1; got {seed!r}")
-    if max_seconds is not None:
-        check_positive("max_seconds", max_seconds)
 
 
 def check_search(problem: object, search: object) -> Search:
