@@ -600,4 +600,6 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
 
 def as_made(run: Run) -> Run:
     """Return a run as the verb that made it does: one of `fuzz` has its coverage."""
-    return run if run.derived is None else late("verifai_jax.fuzzing.run", "as_fuzz_run")(run)
+    if run.derived is None:
+        return run
+    return late("verifai_jax.fuzzing.run", "as_fuzz_run")(run)

@@ -30,7 +30,6 @@ from verifai_jax.evaluation.row import WithParameters
 from verifai_jax.evaluation.verdicts import trace_verdict
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
-from verifai_jax.systems.base import as_system
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -242,7 +241,7 @@ class ArrayParameters:
         features = jax.eval_shape(self.problem.space.unflatten, jnp.zeros(self.problem.space.dim))
         key = jax.eval_shape(lambda: jax.random.key(0))
         start = self._restore(jnp.asarray(self.start, jnp.float32))
-        if as_system(self.system_of(start)).black_box:
+        if replace(self.problem, system=self.system_of(start)).black_box:
             raise ValueError(
                 "arrays of parameters are repaired by gradients, which a black box has not; make "
                 "the parameters features of the space, and name them"
