@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax import search as searches
-from verifai_jax.core.checks import check_count
+from verifai_jax.core.checks import check_count, check_options
 from verifai_jax.core.devices import describe_processor
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import reproducible_settings
@@ -40,7 +40,6 @@ from verifai_jax.falsification._falsify import falsify
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.validation import (
     adapt_search,
-    check_options,
     check_search,
     usual_batch,
 )
