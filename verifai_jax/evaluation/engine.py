@@ -22,7 +22,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
 
 from verifai_jax.core.compilation import Compilation, Effort, compile_soon, tracing
 from verifai_jax.core.devices import spread_over_devices
-from verifai_jax.core.fingerprint import fingerprint
+from verifai_jax.core.fingerprint import fingerprint, identity
 from verifai_jax.core.keys import IMPLEMENTATION, as_key, simulation_key
 from verifai_jax.core.lifting import CAPACITY, LiftedNumbers
 from verifai_jax.core.precision import in_precision
@@ -37,6 +37,7 @@ from verifai_jax.evaluation.row import Row, RowFunction
 from verifai_jax.evaluation.steering import NOTHING, Steering
 from verifai_jax.evaluation.verdicts import Verdicts, violations
 from verifai_jax.mtl.clauses import goals_of
+from verifai_jax.native.work import work_of
 from verifai_jax.problem.problem import Problem
 
 Mode = Literal["evaluate", "holds"]
@@ -181,6 +182,46 @@ class Engine:
         """Evaluate one row under `jax.vmap`, in a program that a caller compiles."""
         return self._function(row, key, temperature, shared, self._derivative)
 
+    def with_batch(self, batch: int) -> "Engine":
+        """Return an engine of other batches, which has traced what this one has."""
+        other = Engine(
+            self.problem, batch, self.gradient, self.devices, self.precision, self.goals is not None,
+            self.inputs, self.own_keys, self.alone, steering=self.steering,
+        )  # fmt: skip
+        other._packing, other._numbers = self._packing, self._numbers
+        other._traced, other._derivative = self._traced, self._derivative
+        if "_derivatives" in self.__dict__:
+            other.__dict__["_derivatives"] = self._derivatives
+        return other
+
+    def traced_row(self) -> tuple[Callable[..., Any], str | None]:
+        """Return the function of one row, which is traced already, and its identity.
+
+        It takes the row, its random key, a temperature, what all rows share, and `numbers`, and
+        returns what `unpack` takes apart.
+        """
+        with tracing(self.inputs.purpose), in_precision(self.precision):
+            if self.gradient:
+                computes, function = self._derivatives
+                return function, None if computes is None else identity(computes, self._derivative)
+            traced = self._trace("evaluate")
+            return as_traced(traced), fingerprint(traced.jaxpr, derivatives=False)
+
+    @property
+    def work(self) -> int:
+        """Operations on single numbers in a simulation, about."""
+        with tracing(self.inputs.purpose), in_precision(self.precision):
+            return work_of(self._trace("evaluate").jaxpr.jaxpr)
+
+    @property
+    def numbers(self) -> Float[np.ndarray, " numbers"]:
+        """The numbers that a traced program reads, once it is traced."""
+        return self._numbers["evaluate"].vector(self.precision)
+
+    def unpack(self, packed: dict[str, Any], count: int) -> Row:
+        """Return the first rows of what a program computed."""
+        return self._packing["evaluate"].unpack(packed, count)
+
     def draws(self) -> bool:
         """Return whether the system uses its random key; needs `own_keys` and `alone`.
 
@@ -303,7 +344,7 @@ class Engine:
 
     @cached_property
     def _derivatives(self) -> tuple[str | None, Callable[..., Any]]:
-        """The fingerprint of simulation and monitor, and the program of derivatives made of these.
+        """The fingerprint of simulation and monitor, and the derivatives of one row made of these.
 
         Only these are traced here. All else follows from them.
         """
@@ -338,8 +379,7 @@ class Engine:
             derivative = self._derivative if self.goals is None else self._derivative.of_several
             return packed(*derivative(objective, function.coordinates(row, shared)))
 
-        program = packed_row if self.alone else self._batched(packed_row)
-        return fingerprint(traced.jaxpr), program
+        return fingerprint(traced.jaxpr), packed_row
 
     def _kept_as(self, kind: str, computes: str | None, *values: object) -> str | None:
         """Return the name under which a program of batches is kept on disk, if it can be."""
@@ -355,7 +395,8 @@ class Engine:
 
     def _lower_gradient(self) -> jax.stages.Lowered:
         """Lower the program of derivatives, or recall it; see `core.remembered`."""
-        _, program = self._derivatives
+        _, one_row = self._derivatives
+        program = one_row if self.alone else self._batched(one_row)
         return self.differentiable(
             lambda: lower_or_recall(self._gradient_kept_as, partial(program), self._arguments)
         )

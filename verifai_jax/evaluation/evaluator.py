@@ -20,6 +20,7 @@ from verifai_jax.core.shapes import power_of_two
 from verifai_jax.evaluation.engine import Engine, engine_for
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.native_engine import NativeEngine, Wanted
 from verifai_jax.evaluation.raising import ALIKE, Raising
 from verifai_jax.evaluation.steering import NOTHING, Steering
 from verifai_jax.evaluation.verdicts import Verdicts
@@ -47,6 +48,8 @@ class Evaluator:
     - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
     - `keep_traces`: whether verdicts come with traces; in this process.
     - `given`: whether rows of features that somebody gave (`given_rows`) may be among the points.
+    - `engine`: `"native"`, or `"auto"` where it decides by `budget`, the simulations of the run,
+      whether rows are simulated by native code; see `evaluation.native_engine`.
     - `ends_raising`: whether a call raises `AlwaysRaises` where all of the first simulations raise.
     """
 
@@ -66,13 +69,15 @@ class Evaluator:
         keep_traces: bool = False,
         given: bool = False,
         ends_raising: bool = False,
+        engine: Wanted = "xla",
+        budget: int = 0,
     ) -> None:
         self._raising = Raising() if ends_raising else None
         self.problem, self.batch = problem, batch
         self.given = given and problem.space.width > 0
         # Points are float32 whatever the precision; what a person gives is not.
         self._dtype = np.dtype(precision if self.given else "float32")
-        self.engine: Engine | HostEngine | ExecutorEngine
+        self.engine: Engine | NativeEngine | HostEngine | ExecutorEngine
         if executor is not None:
             from verifai_jax.evaluation import executor_engine
 
@@ -88,9 +93,11 @@ class Evaluator:
             )  # fmt: skip
         else:
             steering = steering._replace(trace=keep_traces)
-            self.engine = engine_for(
+            self.engine = compiled = engine_for(
                 problem, batch, gradient, precision, clauses, steering, self.given
             )
+            if engine != "xla" and precision == "float32":
+                self.engine = NativeEngine(compiled, engine, budget)
         # Features of few points are those of a whole batch, bit for bit.
         self._padded_to = power_of_two(batch) if ends_raising else 1
         self.key: Key[Array, ""] = run_keys(seed)[1]
@@ -100,6 +107,11 @@ class Evaluator:
     def compile_seconds(self) -> float:
         """Seconds that the engine has spent compiling."""
         return self.engine.compile_seconds
+
+    @property
+    def simulated_by(self) -> Wanted:
+        """The engine of the rows: `"xla"`, or `"native"` from one of the first rows on."""
+        return self.engine.chosen if isinstance(self.engine, NativeEngine) else "xla"
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -143,7 +155,7 @@ class Evaluator:
         start = self.simulations if first is None else first
         u = self._with_values(u)
         count, parts = len(u), []
-        if not isinstance(self.engine, Engine | HostEngine) and count:
+        if not isinstance(self.engine, Engine | NativeEngine | HostEngine) and count:
             self.simulations = start + count
             verdicts = self.engine.evaluate(u, self.key, start, temperature)
             count_done(count)
@@ -181,7 +193,7 @@ class Evaluator:
 
         **Raises:** `TypeError` for an evaluator without an executor.
         """
-        if isinstance(self.engine, Engine | HostEngine):
+        if isinstance(self.engine, Engine | NativeEngine | HostEngine):
             raise TypeError("points are sent to workers only by an evaluator with an executor")
         return self.engine.submit(self._with_values(u), self.key, first)
 

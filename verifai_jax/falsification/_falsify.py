@@ -21,6 +21,7 @@ from verifai_jax.core.executors import Executor
 from verifai_jax.core.precision import in_precision, reproducible_settings
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.evaluation.backends import resolved
+from verifai_jax.evaluation.native_engine import Wanted
 from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
 from verifai_jax.falsification.model_changes import continued_with
@@ -37,8 +38,10 @@ from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.falsification.validation import (
     AUTO,
     adapt_search,
+    as_wanted,
     batch_size,
     can_be_slow,
+    check_engine,
     check_first,
     check_gradient,
     check_guide,
@@ -92,6 +95,7 @@ def falsify(
     target: str | None = None,
     executor: Executor | None = None,
     keep_going: bool = False,
+    engine: Wanted = "auto",
 ) -> Run:
     """Search the feature space for inputs under which the system breaks its property.
 
@@ -140,6 +144,11 @@ def falsify(
     - `keep_going`: whether to simulate on where all of the first simulations raise. When left out
       the run ends there with an error, after 16 that raise the same, or a first round of a system
       that simulates many at once: an error of the problem would cost the whole budget.
+    - `engine`: `"xla"`, or `"native"`: rows from the 513th on are simulated by vector code that
+      the machine's own C++ compiler makes of the problem, several times as fast. It agrees with
+      XLA up to rounding, and XLA decides what is near to zero. `"auto"` takes it where the budget
+      is worth the compilation, which the run records. What cannot be translated (other precisions,
+      unusual operations) is simulated by XLA, and the notes say why.
 
     Ctrl-C ends the run and returns what is finished. What is likely a mistake of the problem is in
     the run's `notes`, and above the progress bar.
@@ -154,6 +163,7 @@ def falsify(
     """
     started = time.perf_counter()
     check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
+    check_engine(engine)
     asking, search = without_suggestions(search)
     default = search == AUTO
     search = check_search(problem, "portfolio" if default else search)
@@ -188,7 +198,7 @@ def falsify(
         table = ErrorTable(tuple(problem.space.columns), place)
         rounds = Rounds(
             problem, search, size, seed, table, precision, place, confirm, executor, target, given,
-            suggests=asking is not None,
+            suggests=asking is not None, engine=engine, budget=budget,
         )  # fmt: skip
         if asking is not None:
             rounds.ask(replace(asking, search=search))
@@ -231,6 +241,7 @@ def simulate(
     progress: bool | None = None,
     target: str | None = None,
     executor: Executor | None = None,
+    engine: Wanted = "auto",
 ) -> Run:
     """Simulate given features, in their order: no search, a row of the table for each.
 
@@ -257,6 +268,7 @@ def simulate(
         problem, searches.PointList(points), len(points), first=given,
         batch=batch, seed=seed, folder=folder, precision=precision, backend=backend,
         confirm=False, progress=progress, target=target, executor=executor, keep_going=True,
+        engine=engine,
     )  # fmt: skip
 
 
@@ -376,6 +388,7 @@ def _resume(
     rounds = Rounds(
         problem, search, run.batch, run.seed, table, run.precision, run.folder, run.confirm,
         executor, run.target, rows_of_first(run.first, problem), suggests=asking is not None,
+        engine=as_wanted(run.engine), budget=run.budget,
     )  # fmt: skip
 
     if asking is not None:

@@ -25,6 +25,7 @@ from verifai_jax.core.stopwatch import Stopwatch
 from verifai_jax.evaluation.confirmer import Confirmer
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.native_engine import Wanted
 from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.checkpoint import write_checkpoint
@@ -74,6 +75,8 @@ class Rounds:
         target: str | None = None,
         first: Float[np.ndarray, "n row"] | None = None,
         suggests: bool = False,
+        engine: Wanted = "xla",
+        budget: int = 0,
     ) -> None:
         self.problem, self.batch, self.table = problem, batch, table
         self.precision, self.folder = precision, folder
@@ -94,6 +97,8 @@ class Rounds:
             steering=self.learning.steering,
             keep_traces=self.learning.surrogate is not None,
             given=suggests or self.first.shape[1] > problem.space.dim,
+            engine=engine,
+            budget=budget,
         )
         self._confirmer = None
         if confirm:
@@ -364,6 +369,11 @@ class Rounds:
     def evaluate(self) -> Evaluator:
         """The evaluator of rounds without derivatives."""
         return self._simulations.evaluate
+
+    @property
+    def simulated_by(self) -> Wanted:
+        """The engine of the rows, as far as it is decided."""
+        return self.evaluate.simulated_by
 
     @property
     def confirms(self) -> bool:

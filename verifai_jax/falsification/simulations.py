@@ -20,6 +20,7 @@ from verifai_jax.core.shapes import power_of_two
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.native_engine import Wanted
 from verifai_jax.evaluation.raising import ALIKE, ALWAYS, Raising
 from verifai_jax.evaluation.steering import Steering
 from verifai_jax.evaluation.verdicts import Verdicts
@@ -44,8 +45,8 @@ class Simulations:
     - `search`: what it wants decides what is computed in addition to the robustness.
     - `batch`: simulations of a round at most.
     - `seed`: of the run.
-    - `precision`, `journal`, `executor`, `target`, `steering`, `keep_traces`, `given`: as for
-      `Evaluator`.
+    - `precision`, `journal`, `executor`, `target`, `steering`, `keep_traces`, `given`,
+      `engine`, `budget`: as for `Evaluator`.
 
     `hopeless` is what all of the rows that were timed raised; None if one did not.
     """
@@ -64,6 +65,8 @@ class Simulations:
         steering: Steering,
         keep_traces: bool,
         given: bool = False,
+        engine: Wanted = "xla",
+        budget: int = 0,
     ) -> None:
         self.batch, self.keep_traces, self._journals = batch, keep_traces, True
         evaluator = partial(
@@ -74,6 +77,8 @@ class Simulations:
             executor=executor,
             target=target,
             steering=steering,
+            engine=engine,
+            budget=budget,
         )
         self.evaluate = evaluator(
             batch,

@@ -10,10 +10,11 @@ from jaxtyping import Float
 
 from verifai_jax import search as searches
 from verifai_jax.core.checks import check_count, check_positive
-from verifai_jax.core.errors import check_names
+from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.locks import LOCK, write_lock
 from verifai_jax.core.text import format_error, one_line
+from verifai_jax.evaluation.native_engine import ENGINES, Wanted
 from verifai_jax.falsification.run import RECORD, Run
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.features.given import Rows, check_columns, given_features, given_rows
@@ -113,6 +114,20 @@ def check_options(
         raise ValueError(f"seed must be an integer from 0 to 2**63 - 1; got {seed!r}")
     if max_seconds is not None:
         check_positive("max_seconds", max_seconds)
+
+
+def check_engine(engine: object) -> None:
+    """Refuse an unknown engine.
+
+    **Raises:** `UnknownNameError`.
+    """
+    if engine not in ENGINES:
+        raise unknown_name("engine", str(engine), ENGINES)
+
+
+def as_wanted(engine: str) -> Wanted:
+    """Return the engine of a record, which was checked when it was read."""
+    return cast(Wanted, engine)
 
 
 def check_search(problem: object, search: object) -> Search:

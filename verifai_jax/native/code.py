@@ -26,6 +26,7 @@ class Piece:
         self.each: list[str] = []
         self.after: list[str] = []
         self.defined: list[str] = []
+        self.known: dict[str, Element] = {}
 
 
 class Code:
@@ -62,6 +63,9 @@ class Code:
 
     def define(self, text: str, kind: str, uniform: bool) -> Element:
         """Add a line that computes a number, and return it."""
+        known = self.piece.known.get(text)
+        if known is not None and known.kind == kind and known.uniform == uniform:
+            return known
         self._count_line()
         if uniform:
             name = self.name("u")
@@ -72,7 +76,14 @@ class Code:
             self.kinds[name] = kind
             self.piece.defined.append(name)
             self.piece.each.append(f"{TYPES[kind][0]} {name} = {text};")
-        return Element(name, kind, uniform)
+        return self.piece.known.setdefault(text, Element(name, kind, uniform))
+
+    def fresh(self, kind: str, uniform: bool) -> Element:
+        """Return a number that the next line computes."""
+        name = self.name("w")
+        text = f"{TYPES[kind][1]}()" if uniform else f"{TYPES[kind][0]}()"
+        # With its own name, so that it is no number that is known already.
+        return self.define(f"{text} /* {name} */", kind, uniform)
 
     def keep(self, kind: str, uniform: bool) -> Element:
         """Return a number that `assign` changes."""
@@ -87,6 +98,7 @@ class Code:
 
     def assign(self, changed: list[Element], values: list[Element]) -> None:
         """Give several numbers of `keep` their values, all at once, at the end of a piece."""
+        last: list[str] = []
         for name, value in zip(changed, values, strict=True):
             self._count_line()
             if name.text == value.text:
@@ -94,8 +106,10 @@ class Code:
             if not name.uniform:
                 self.piece.each.append(f"{name.text}_[k] = {widened(value)};")
             else:
-                copy = self.define(value.text, value.kind, True)
-                self.piece.after.append(f"{name.text} = {copy.text};")
+                copy = self.fresh(value.kind, True)
+                self.piece.after.append(f"{copy.text} = {value.text};")
+                last.append(f"{name.text} = {copy.text};")
+        self.piece.after += last
 
     def memory(self, shape: tuple[int, ...], kind: str, uniform: bool = False) -> Memory:
         """Return a new array in memory."""

@@ -101,7 +101,10 @@ def is_uniform(value: Value) -> bool:
 
 
 def until_settled(
-    t: Translator, forms: list[Any], uniform: list[bool], emit: Callable[[Carry], list[Value] | None]
+    t: Translator,
+    forms: list[Any],
+    uniform: list[bool],
+    emit: Callable[[Carry], list[Value] | None],
 ) -> list[Value]:
     """Write a loop or branch, again as long as more of its values turn out to differ."""
     t.code.control("")
@@ -213,9 +216,7 @@ def _while(t: Translator, step: Any, inputs: list[Value]) -> list[Value]:
         else:
             mask = t.code.keep("b", False)
             t.code.assign([mask], [on])
-            t.code.control(
-                f"{{ I on = I(); REPEAT on |= {mask.text}_[k]; if (!any(on)) break; }}"
-            )
+            t.code.control(f"{{ I on = I(); REPEAT on |= {mask.text}_[k]; if (!any(on)) break; }}")
             results = t.closed(params["body_jaxpr"], [*shared, *carry.values])
             results = [
                 t.elementwise("select_n", {}, [_single(mask), old, new], kind_of(f.dtype), f.shape)
@@ -268,6 +269,4 @@ def _cond(t: Translator, step: Any, inputs: list[Value]) -> list[Value]:
 def _steps(branch: Any) -> int:
     """Count the steps of a program, those in it included."""
     program = getattr(branch, "jaxpr", branch)
-    return sum(
-        1 + sum(4 * _steps(inner) for inner in programs_in(step)) for step in program.eqns
-    )
+    return sum(1 + sum(4 * _steps(inner) for inner in programs_in(step)) for step in program.eqns)

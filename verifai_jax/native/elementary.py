@@ -119,8 +119,6 @@ def expression(name: str, params: dict[str, Any], kinds: list[str], out: str) ->
     if name in COMPARISONS:
         return f"truth({{}} {COMPARISONS[name]} {{}})", False
     if name in FUNCTIONS:
-        if kinds[0] in "iub" and name in ("max", "min", "clamp"):
-            return _of_wholes(name), True
         return FUNCTIONS[name], True
     if name == "div":
         return ("{} / {}", False) if out == "f" else ("quotient({}, {})", True)
@@ -142,13 +140,6 @@ def expression(name: str, params: dict[str, Any], kinds: list[str], out: str) ->
     if name.startswith("shift_"):
         return _shift(name, out), True
     raise Untranslatable(f"the operation {name}")
-
-
-def _of_wholes(name: str) -> str:
-    if name == "clamp":
-        low = "choose(truth({1} < {0}), {0}, {1})"
-        return f"choose(truth({low} > {{2}}), {{2}}, {low})"
-    return f"choose(truth({{0}} {'>' if name == 'max' else '<'} {{1}}), {{0}}, {{1}})"
 
 
 def _by_number(cases: int) -> str:

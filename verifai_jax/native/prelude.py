@@ -177,7 +177,7 @@ template <class T> INLINE T inverse_error(T x) {
 #define FROM_LIBRARY(name, call) \
   INLINE float name(float x) { return call(x); } \
   OUTLINE F name(F x) { EACH(call(x[l])) }
-FROM_LIBRARY(tangent, __builtin_tanf)
+FROM_LIBRARY(library_tangent, __builtin_tanf)
 FROM_LIBRARY(arcsine, __builtin_asinf)
 FROM_LIBRARY(arccosine, __builtin_acosf)
 FROM_LIBRARY(sine_h, __builtin_sinhf)
@@ -193,7 +193,7 @@ FROM_LIBRARY(library_cosine, __builtin_cosf)
 #define FROM_LIBRARY_2(name, call) \
   INLINE float name(float x, float y) { return call(x, y); } \
   OUTLINE F name(F x, F y) { EACH(call(x[l], y[l])) }
-FROM_LIBRARY_2(power, __builtin_powf)
+FROM_LIBRARY_2(library_power, __builtin_powf)
 FROM_LIBRARY_2(remainder_of, __builtin_fmodf)
 FROM_LIBRARY_2(next_number, __builtin_nextafterf)
 
@@ -233,6 +233,62 @@ template <class T> INLINE T sine(T x) {
   T s, c; sine_cosine(x, &s, &c); return __builtin_expect(beyond(x), 0) ? library_sine(x) : s; }
 template <class T> INLINE T cosine(T x) {
   T s, c; sine_cosine(x, &s, &c); return __builtin_expect(beyond(x), 0) ? library_cosine(x) : c; }
+template <class T> INLINE T tangent(T x) {
+  T s, c; sine_cosine(x, &s, &c);
+  return __builtin_expect(beyond(x), 0) ? library_tangent(x) : s / c; }
+
+/* Powers of positive numbers, in double precision. */
+typedef double D __attribute__((vector_size(4 * W)));
+typedef long long L __attribute__((vector_size(4 * W)));
+typedef float H __attribute__((vector_size(2 * W)));
+INLINE H half_power(H base, H exponent) {
+  D x = __builtin_convertvector(base, D), y = __builtin_convertvector(exponent, D);
+  L e = ((L)x >> 52) - 1023;
+  D m = (D)(((L)x & 0x000fffffffffffffLL) | 0x3ff0000000000000LL);
+  L big = m > 1.4142135623730951;
+  m = big ? m * 0.5 : m; e = big ? e + 1 : e;
+  /* A whole number as the mantissa of a large one: no instruction converts it everywhere. */
+  D n = (D)(e + 0x4338000000000000LL) - 6755399441055744.0;
+  D t = (m - 1.0) / (m + 1.0), s = t * t, p = s * (1.0 / 15) + 1.0 / 13;
+  p = p * s + 1.0 / 11; p = p * s + 1.0 / 9; p = p * s + 1.0 / 7; p = p * s + 1.0 / 5;
+  p = p * s + 1.0 / 3; p = p * s + 1.0;
+  D z = y * (2.0 * t * p + n * 0.6931471805599453);
+  z = z > 700.0 ? z - z + 700.0 : z; z = z < -700.0 ? z - z - 700.0 : z;
+  D shifted = z * 1.4426950408889634 + 6755399441055744.0;
+  D r = z - (shifted - 6755399441055744.0) * 0.6931471805599453;
+  D q = r * (1.0 / 362880) + 1.0 / 40320;
+  q = q * r + 1.0 / 5040; q = q * r + 1.0 / 720; q = q * r + 1.0 / 120; q = q * r + 1.0 / 24;
+  q = q * r + 1.0 / 6; q = q * r + 0.5; q = q * r + 1.0; q = q * r + 1.0;
+  q = q * (D)(((L)shifted - 0x4338000000000000LL + 1023) << 52);
+  return __builtin_convertvector(q, H); }
+INLINE float power(float x, float y) { return library_power(x, y); }
+OUTLINE F power(F x, F y) {
+  I plain = (x > 0.f) & finite(x) & finite(y);
+  I nothing = (x == 0.f) & (y > 0.f) & ((I)x == 0), missing = (x != x) & (y != 0.f);
+  if (any(~(plain | nothing | missing))) return library_power(x, y);
+  F one = wide(1.f), safe = plain ? x : one, r;
+  for (int h = 0; h < 2; h++) {
+    H a, b;
+    __builtin_memcpy(&a, (char *)&safe + h * sizeof(H), sizeof(H));
+    __builtin_memcpy(&b, (char *)&y + h * sizeof(H), sizeof(H));
+    a = half_power(a, b);
+    __builtin_memcpy((char *)&r + h * sizeof(H), &a, sizeof(H));
+  }
+  return nothing ? F() : missing ? x : r; }
+
+/* Elements of a table of n numbers, by a number for each simulation. */
+INLINE F looked_up(const float *from, int n, I at) {
+#if !defined(__clang__)
+  if (n <= W) { F r = F(); __builtin_memcpy(&r, from, 4 * n); return __builtin_shuffle(r, at); }
+#endif
+  F r; for (int l = 0; l < W; l++) r[l] = from[at[l]]; return r; }
+INLINE I looked_up(const int *from, int n, I at) {
+  I r; for (int l = 0; l < W; l++) r[l] = from[at[l]]; return r; }
+INLINE U looked_up(const unsigned *from, int n, I at) {
+  U r; for (int l = 0; l < W; l++) r[l] = from[at[l]]; return r; }
+#define FROM_MEMORY(V) INLINE V looked_up(const V (*from)[K], int k, I at) { \
+  V r; for (int l = 0; l < W; l++) r[l] = from[at[l]][k][l]; return r; }
+FROM_MEMORY(F) FROM_MEMORY(I) FROM_MEMORY(U)
 
 INLINE int quotient(int a, int b) { return b == 0 ? -1 : b == -1 ? (int)(0u - (unsigned)a) : a / b; }
 INLINE unsigned quotient(unsigned a, unsigned b) { return b == 0 ? ~0u : a / b; }

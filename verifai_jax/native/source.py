@@ -17,7 +17,7 @@ CACHE = 2**18
 """Bytes of a core's cache that the arrays of a block should fit into."""
 
 
-def translate(program: Any) -> tuple[str, int]:
+def translate(program: Any) -> str:
     """Translate a program of one simulation.
 
     **Arguments:**
@@ -25,7 +25,7 @@ def translate(program: Any) -> tuple[str, int]:
     - `program`: a closed `Jaxpr` of the row `[d]`, the words `[2]` of a random key, the number of
       the simulation, a temperature, and numbers `[n]` that all share; it returns a vector of bits.
 
-    **Returns:** the source, and how many numbers a simulation returns.
+    **Returns:** the source.
 
     **Raises:** `Untranslatable` for a program with a part that is unknown.
     """
@@ -52,9 +52,8 @@ def translate(program: Any) -> tuple[str, int]:
     lines, arena = t.code.body()
     vectors = next((k for k in (4, 2) if arena * k * 64 <= CACHE * (4 // k)), 1)
     body = "\n".join(lines)
-    return f"#define K {vectors}\n{PRELUDE}{_HEAD}\n" + "\n".join(t.code.globals) + (
-        _FUNCTION.replace("@arena", str(arena)).replace("@body", body)
-    ), count
+    function = _FUNCTION.replace("@arena", str(arena)).replace("@body", body)
+    return "\n".join([f"#define K {vectors}", PRELUDE, _HEAD, *t.code.globals, function])
 
 
 def one(element: Element) -> np.ndarray:

@@ -34,8 +34,8 @@ SINGLE = 32
 """Elements of an array up to which each is a variable of its own."""
 PRODUCTS = 512
 """Products up to which a matrix product is written out."""
-CHOSEN = 6
-"""Steps of a branch up to which both are taken, and one is chosen."""
+CHAIN = 16
+"""Elements of an array up to which one of them is found by comparing its number."""
 
 Rule = Callable[["Translator", Any, list[Value]], list[Value]]
 RULES: dict[str, Rule] = {}
@@ -128,7 +128,9 @@ class Translator:
         uniform = all(v.uniform for v in flat)
         result = self.code.memory(shape, kind, uniform)
         index = self.code.name("i")
-        some = [v if isinstance(v, Element) else Element(v.at(index), v.kind, v.uniform) for v in flat]
+        some = [
+            v if isinstance(v, Element) else Element(v.at(index), v.kind, v.uniform) for v in flat
+        ]
         text = self.text(name, params, some, kind)
         line = f"for (int {index} = 0; {index} < {size}; {index}++) {result.at(index)} = {text};"
         self.line(line, uniform)
@@ -145,6 +147,9 @@ class Translator:
             folded = elementary.fold(name, kind, [each.value for each in operands], params)
             if folded is not None:
                 return constant(folded, kind)
+        if name == "and" and kind == "b" and any(e.value is not None for e in operands):
+            known = next(i for i, e in enumerate(operands) if e.value is not None)
+            return operands[1 - known] if operands[known].value else operands[known]
         if name == "select_n" and operands[0].value is not None:
             return operands[1 + int(operands[0].value)]
         if name in ("copy", "copy_p", "stop_gradient", "optimization_barrier"):
@@ -161,9 +166,7 @@ class Translator:
         mixed = len({each.uniform for each in operands}) > 1
         if name == "select_n" and operands[0].kind == "b" and operands[0].uniform:
             mixed = len({each.uniform for each in operands[1:]}) > 1
-            texts[1:] = [
-                f"wide({e.text})" if mixed and e.uniform else e.text for e in operands[1:]
-            ]
+            texts[1:] = [f"wide({e.text})" if mixed and e.uniform else e.text for e in operands[1:]]
         elif alike and mixed:
             texts = [f"wide({e.text})" if e.uniform else e.text for e in operands]
         return template.format(*texts)
@@ -193,7 +196,9 @@ class Translator:
     @staticmethod
     def _is_key(value: Value) -> bool:
         return (
-            isinstance(value, np.ndarray) and value.size > 0 and not isinstance(value.flat[0], Element)
+            isinstance(value, np.ndarray)
+            and value.size > 0
+            and not isinstance(value.flat[0], Element)
         )
 
     def _of_keys(self, name: str, params: Any, inputs: list[Value], shape: Any) -> Value:
@@ -378,9 +383,7 @@ def _reduce(t: Translator, step: Any, inputs: list[Value]) -> list[Value]:
 def joined(t: Translator, name: str, parts: list[Element], kind: str) -> Element:
     """Join numbers by an operation, the halves of them each on their own."""
     while len(parts) > 1:
-        half = [
-            t.compute(name, {}, parts[i : i + 2], kind) for i in range(0, len(parts) - 1, 2)
-        ]
+        half = [t.compute(name, {}, parts[i : i + 2], kind) for i in range(0, len(parts) - 1, 2)]
         parts = half + parts[len(parts) // 2 * 2 :]
     return parts[0]
 
@@ -403,7 +406,10 @@ def _cumulative(t: Translator, step: Any, inputs: list[Value]) -> list[Value]:
 def _arg(t: Translator, step: Any, inputs: list[Value]) -> list[Value]:
     (axis,) = step.params["axes"]
     rows = np.moveaxis(elements(inputs[0]), axis, 0)
-    kind, better = kind_of(step.params["index_dtype"]), "gt" if "max" in step.primitive.name else "lt"
+    kind, better = (
+        kind_of(step.params["index_dtype"]),
+        "gt" if "max" in step.primitive.name else "lt",
+    )
     out = np.empty(rows.shape[1:], object)
     for place in np.ndindex(out.shape):
         best, at = rows[0][place], constant(0, kind)
@@ -513,7 +519,9 @@ def _bounded(t: Translator, index: Element, highest: int) -> Element:
     return t.compute("clamp", {}, [low, index, high], index.kind)
 
 
-def element_at(t: Translator, array: Value, strides: Sequence[int], index: Any, base: int) -> Element:
+def element_at(
+    t: Translator, array: Value, strides: Sequence[int], index: Any, base: int
+) -> Element:
     """Return the element of a flat array at `base` plus the product of numbers and strides."""
     fixed = base + sum(
         int(i.value) * s for i, s in zip(index, strides, strict=True) if i.value is not None
@@ -525,15 +533,32 @@ def element_at(t: Translator, array: Value, strides: Sequence[int], index: Any, 
     ]
     if not moving:
         return elements(array).ravel()[fixed]
+    if not all(i.uniform for i, _ in moving) and len(moving) == 1 and array.size <= CHAIN:
+        if not is_table(array):
+            return _chosen(t, elements(array).ravel()[fixed :: moving[0][1]], moving[0][0])
     memory = t.in_memory(array)
     place = " + ".join([str(fixed), *(f"{i.text} * {s}" for i, s in moving)])
     if all(i.uniform for i, _ in moving):
         return t.code.define(memory.at(f"({place})"), memory.kind, memory.uniform)
     vector = t.code.define(place, "i", False)
-    form = {"f": "F", "i": "I", "u": "U", "b": "I"}[memory.kind]
-    result = t.code.define(f"{form}()", memory.kind, False)
-    each = memory.at(f"{vector.text}[l]") + ("" if memory.uniform else "[l]")
-    t.line(f"for (int l = 0; l < W; l++) {result.text}[l] = {each};")
+    begin = f"{memory.name} + {memory.offset}" if memory.offset else memory.name
+    size = str(memory.size) if memory.uniform else "k"
+    return t.code.define(f"looked_up({begin}, {size}, {vector.text})", memory.kind, False)
+
+
+def is_table(value: Value) -> bool:
+    """Return whether a value consists of constants."""
+    if isinstance(value, Memory):
+        return value.uniform
+    return all(each.value is not None for each in value.ravel())
+
+
+def _chosen(t: Translator, options: Elements, index: Element) -> Element:
+    """Return one of a few elements, by a number for each simulation."""
+    result = options[0]
+    for i, option in enumerate(options[1:], 1):
+        here = t.compute("eq", {}, [index, constant(i, "i")], "b")
+        result = t.compute("select_n", {}, [here, result, option], option.kind)
     return result
 
 
@@ -625,6 +650,48 @@ def _gather(t: Translator, step: Any, inputs: list[Value]) -> list[Value]:
     return [out]
 
 
+_SCATTERED = {"add": "add", "mul": "mul", "min": "min", "max": "max", "sub": "sub", "": ""}
+
+
+@rule("scatter", "scatter-add", "scatter_add", "scatter-mul", "scatter_mul", "scatter-sub",
+      "scatter_min", "scatter_max", "scatter-min", "scatter-max")  # fmt: skip
+def _scatter(t: Translator, step: Any, inputs: list[Value]) -> list[Value]:
+    array, indices, updates = (elements(value) for value in inputs)
+    numbers, mode = step.params["dimension_numbers"], str(step.params["mode"])
+    kind = kind_of(step.outvars[0].aval.dtype)
+    joins = step.primitive.name.replace("-", "_").removeprefix("scatter").removeprefix("_")
+    if tuple(getattr(numbers, "operand_batching_dims", ())):
+        raise Untranslatable("a scatter in batches")
+    windows = numbers.update_window_dims
+    kept = [axis for axis in range(array.ndim) if axis not in numbers.inserted_window_dims]
+    out = np.array(array)
+    for place in np.ndindex(updates.shape):
+        batch = tuple(i for axis, i in enumerate(place) if axis not in windows)
+        offset = np.zeros(array.ndim, int)
+        offset[kept] = [place[axis] for axis in windows]
+        size = np.ones(array.ndim, int)
+        size[kept] = [updates.shape[axis] for axis in windows]
+        starts: list[Element] = [constant(0, "i")] * array.ndim
+        for axis, index in zip(numbers.scatter_dims_to_operand_dims, indices[batch], strict=True):
+            starts[axis] = index
+            if "CLIP" in mode:
+                starts[axis] = _bounded(t, index, array.shape[axis] - int(size[axis]))
+        for target in np.ndindex(array.shape):
+            begin = [int(a - o) for a, o in zip(target, offset, strict=True)]
+            fits = zip(begin, array.shape, size, strict=True)
+            if not all(0 <= b <= n - int(k) for b, n, k in fits):
+                continue
+            hits = constant(True, "b")
+            for start, b in zip(starts, begin, strict=True):
+                equal = t.compute("eq", {}, [start, constant(b, start.kind)], "b")
+                hits = t.compute("and", {}, [hits, equal], "b")
+            if hits.value is None or hits.value:
+                old, new = out[target], updates[place]
+                new = t.compute(_SCATTERED[joins], {}, [old, new], kind) if joins else new
+                out[target] = t.compute("select_n", {}, [hits, old, new], kind)
+    return [out]
+
+
 # Random numbers
 
 
@@ -697,8 +764,6 @@ def _encrypted(t: Translator, key: Any, x: Element, y: Element) -> tuple[Element
     operands = [*key, x, y]
     uniform = all(each.uniform for each in operands)
     texts = [e.text if uniform or not e.uniform else f"wide({e.text})" for e in operands]
-    zero = "0u" if uniform else "U()"
-    high, low = (t.code.define(zero, "u", uniform) for _ in range(2))
+    high, low = (t.code.fresh("u", uniform) for _ in range(2))
     t.line(f"threefry({', '.join(texts)}, &{high.text}, &{low.text});", uniform)
     return high, low
-

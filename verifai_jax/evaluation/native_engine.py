@@ -1,0 +1,325 @@
+"""Simulations by native code, where that is worth its compilation, and by XLA otherwise.
+
+    engine = NativeEngine(engine_for(problem, 32768), wanted="auto", budget=100_000)
+    engine.evaluate(u, key, first=0)                    # Verdicts, as of an `Engine`
+
+Which rows are native follows from the problem, the budget and the number of the row: those from
+`FIRST` on, where the budget is worth it. XLA simulates the rows before, while the native program is
+compiled, and all rows whose robustness is so near to zero that rounding may decide the verdict. A
+native program is used once it agreed with XLA on the rows that it met first.
+"""
+
+import re
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache, cached_property
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from verifai_jax.core.keys import IMPLEMENTATION, simulation_key
+from verifai_jax.core.precision import in_precision
+from verifai_jax.core.programs import Slot
+from verifai_jax.core.trace import Status
+from verifai_jax.evaluation.engine import Engine
+from verifai_jax.evaluation.verdicts import Verdicts, violations
+from verifai_jax.native.library import (
+    Library,
+    Unavailable,
+    approve,
+    is_approved,
+    library_name,
+    load,
+)
+from verifai_jax.native.source import translate
+from verifai_jax.native.values import Untranslatable
+
+Wanted = Literal["auto", "xla", "native"]
+"""Engines of a run, as a person asks for them."""
+ENGINES: tuple[Wanted, ...] = ("auto", "xla", "native")
+WORTH = 1.5e9
+"""Operations of a run from which on a native program is worth it by default. XLA's programs do some
+1.5e10 a second on two cores and a compiler takes a second, once for all runs of a machine; so ten
+such runs pay for it. A run whose operations are fewer takes a tenth of a second."""
+FIRST = 512
+"""Rows of a run that XLA simulates, so that the first result waits for no second compiler; and rows
+that it simulates at a time where it only decides what is near to zero."""
+SLACK = 4e-7
+"""Robustness below which rounding may decide a verdict, relative to the greatest number of the
+formula: three units in the last place of single precision."""
+AGREES = 1e-3
+"""Relative difference of two robustness values from which on they differ by more than rounding."""
+
+
+class NativeEngine:
+    """Evaluates batches of a problem like the engine that it is given.
+
+    **Arguments:**
+
+    - `engine`: of XLA, in single precision, over points of the unit cube.
+    - `wanted`: `"native"`, or `"auto"` for the rule of the module's docstring.
+    - `budget`: simulations of the run.
+    """
+
+    def __init__(self, engine: Engine, wanted: Wanted, budget: int) -> None:
+        self.engine, self._wanted, self._budget = engine, wanted, budget
+        self._why = ""
+        self._waited = 0.0
+        self._met: tuple[Any, Verdicts] | None = None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Decisions of the engine that a user may not expect."""
+        why = (f"simulated by XLA, not natively: {self._why}",) if self._why else ()
+        return (*self._begun.notes, *why)
+
+    @property
+    def compile_seconds(self) -> float:
+        """Seconds spent compiling."""
+        return self._begun.compile_seconds + self._waited
+
+    @property
+    def _begun(self) -> Engine:
+        """The engine of XLA that is being compiled, or would be: nothing is traced to know."""
+        return self.__dict__.get("_xla", self.engine)
+
+    @property
+    def chosen(self) -> Wanted:
+        """The engine that simulates the rows from `FIRST` on, as far as it is known by now."""
+        if "_is_worth" not in self.__dict__:
+            return self._wanted
+        return "native" if self._is_worth and not self._why else "xla"
+
+    def begin_compiling(self) -> None:
+        """Trace now and compile in the background."""
+        self._xla.begin_compiling()
+
+    def compile(self) -> None:
+        """Compile now what the first rows need."""
+        self._xla.compile()
+
+    def evaluate(
+        self,
+        rows: Float[np.ndarray, "n d"],
+        key: Key[Array, ""],
+        first: int = 0,
+        temperature: Float[np.ndarray, " n"] | float = 1.0,
+    ) -> Verdicts:
+        """Simulate rows; see `Engine.evaluate`."""
+        if not self._is_worth:
+            return self.engine.evaluate(rows, key, first, temperature)
+        before = min(max(FIRST - first, 0), len(rows))
+        parts = []
+        if before:
+            parts.append(self._by_xla(rows, key, first, temperature, slice(0, before)))
+            warm = temperature[:before] if isinstance(temperature, np.ndarray) else temperature
+            self._met = (rows[:before], key, first, warm), parts[0]
+        self._program.begin()
+        if before < len(rows):
+            rest = slice(before, len(rows))
+            parts.append(self._by_native(rows, key, first, temperature, rest))
+        return Verdicts.concatenate(parts)
+
+    @cached_property
+    def _is_worth(self) -> bool:
+        """Whether the work of the run is worth a native program."""
+        if jax.default_backend() != "cpu":
+            self._why = f"runs on the {jax.default_backend()}"
+            return False
+        if self._wanted == "native":
+            return True
+        return self._budget * self.engine.work >= WORTH
+
+    @cached_property
+    def _xla(self) -> Engine:
+        """The engine of XLA: of the whole batch where it does all, or of few rows."""
+        if not self._is_worth or self.engine.batch <= FIRST:
+            return self.engine
+        return self.engine.problem.programs.get(SMALL, self.engine, self._small)
+
+    def _small(self) -> Engine:
+        return self.engine.with_batch(FIRST)
+
+    @cached_property
+    def _program(self) -> "_Program":
+        return self.engine.problem.programs.get(
+            PROGRAMS, self.engine, lambda: _Program(self.engine)
+        )
+
+    def _by_xla(self, rows: Any, key: Any, first: int, temperature: Any, which: slice) -> Verdicts:
+        size, parts = self._xla.batch, []
+        for begin in range(which.start, which.stop, size):
+            some = slice(begin, min(begin + size, which.stop))
+            warm = temperature[some] if isinstance(temperature, np.ndarray) else temperature
+            parts.append(self._xla.evaluate(rows[some], key, first + begin, warm))
+        return Verdicts.concatenate(parts)
+
+    def _by_native(
+        self, rows: Any, key: Any, first: int, temperature: Any, which: slice
+    ) -> Verdicts:
+        started = time.perf_counter()
+        try:
+            self._program.ready()
+        except Unavailable as error:
+            self._why = str(error)
+        finally:
+            self._waited += time.perf_counter() - started
+        if self._why:
+            return self._by_xla(rows, key, first, temperature, which)
+        if not self._program.approved:
+            if self._met is None:
+                some = slice(which.start, min(which.start + FIRST, which.stop))
+                warm = temperature[some] if isinstance(temperature, np.ndarray) else temperature
+                theirs = self._by_xla(rows, key, first, temperature, some)
+                self._met = (rows[some], key, first + some.start, warm), theirs
+            arguments, theirs = self._met
+            if not self._program.compare(self._program(*arguments), theirs, self._slack):
+                self._why = self._program.refused
+                return self._by_xla(rows, key, first, temperature, which)
+        warm = temperature[which] if isinstance(temperature, np.ndarray) else temperature
+        result = self._program(rows[which], key, first + which.start, warm)
+        return self._with_decided(result, rows, key, first, temperature, which)
+
+    def _with_decided(
+        self, result: Verdicts, rows: Any, key: Any, first: int, temperature: Any, which: slice
+    ) -> Verdicts:
+        """Return the result with the rows of XLA where they are near to zero."""
+        near = np.flatnonzero(
+            (result.status == Status.OK) & np.any(np.abs(result.rho) <= self._slack, axis=1)
+        )
+        if not len(near):
+            return result
+        for window in np.unique(near // FIRST):
+            begin = which.start + int(window) * FIRST
+            some = slice(begin, min(begin + FIRST, which.stop))
+            theirs = self._by_xla(rows, key, first, temperature, some)
+            at = near[near // FIRST == window]
+            here = at - int(window) * FIRST
+            jax.tree.map(lambda a, b, at=at, here=here: _put(a, at, b[here]), result, theirs)
+        return result
+
+    @cached_property
+    def _slack(self) -> Float[np.ndarray, " formulas"]:
+        """Robustness of each formula below which rounding may decide the verdict."""
+        return np.array(
+            [
+                SLACK * max([1.0, *map(float, re.findall(r"\d+\.?\d*(?:[eE][-+]?\d+)?", str(f)))])
+                for f in self.engine.problem.formulas.values()
+            ]
+        )
+
+
+def _put(array: np.ndarray, at: np.ndarray, values: np.ndarray) -> None:
+    array[at] = values
+
+
+class _Program:
+    """The native program of an engine, which is compiled once for the problem."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self.approved = False
+        self.refused = ""
+        self._future: Future[tuple[str, Library]] | None = None
+
+    @cached_property
+    def traced(self) -> tuple[Any, str | None]:
+        """The program of a row, its random key by its number; and its identity."""
+        function, computes = self.engine.traced_row()
+        row, *_, numbers = self.engine._arguments
+
+        def of_row(row: Any, words: Any, number: Any, temperature: Any, numbers: Any) -> Any:
+            key = simulation_key(jax.random.wrap_key_data(words, impl=IMPLEMENTATION), number)
+            packed = function(row, key, temperature, (), numbers)
+            if set(packed) != {"uint32"}:
+                raise Unavailable("it returns numbers of eight bytes")
+            return packed["uint32"]
+
+        with in_precision(self.engine.precision):
+            forms = (
+                self.engine.inputs.row_form,
+                jax.ShapeDtypeStruct((2,), jnp.uint32),
+                jax.ShapeDtypeStruct((), jnp.int32),
+                jax.ShapeDtypeStruct((), jnp.float32),
+                numbers,
+            )
+            return jax.make_jaxpr(of_row)(*forms), computes
+
+    def begin(self) -> None:
+        """Begin to compile, where that has not begun."""
+        if self._future is None:
+            self._future = _pool().submit(self._load)
+
+    def ready(self) -> Library:
+        """Return the library, once it is compiled.
+
+        **Raises:** `Unavailable` where there is none.
+        """
+        if self.refused:
+            raise Unavailable(self.refused)
+        self.begin()
+        assert self._future is not None
+        name, library = self._future.result()
+        return library
+
+    def _load(self) -> tuple[str, Library]:
+        try:
+            program, computes = self.traced
+            name = library_name(computes)
+            agrees = is_approved(name)
+            if agrees is False:
+                raise Unavailable("its results differ from those of XLA by more than rounding")
+            (form,) = program.out_avals
+            with in_precision(self.engine.precision):
+                library = load(name, form.shape[0], lambda: translate(program))
+            self.approved = bool(agrees)
+            return name, library
+        except Untranslatable as error:
+            raise Unavailable(f"it has {error}, which is not translated") from error
+
+    def __call__(self, rows: Any, key: Key[Array, ""], first: int, temperature: Any) -> Verdicts:
+        """Simulate rows."""
+        library = self.ready()
+        temperatures = np.broadcast_to(np.asarray(temperature, np.float32), (len(rows),))
+        words = np.asarray(jax.random.key_data(key))
+        threads = len(self.engine.devices)
+        packed = library(rows, words, first, temperatures, self.engine.numbers, threads)
+        rho, status, features, more = self.engine.unpack({"uint32": packed}, len(rows))
+        # What is exactly zero is decided by XLA.
+        broken = violations(rho, status, lambda: np.ones(rho.shape, bool))
+        return Verdicts(rho, status, broken, features, **more)
+
+    def compare(self, ours: Verdicts, theirs: Verdicts, slack: np.ndarray) -> bool:
+        """Compare the first rows with those of XLA, and note whether they agree."""
+        assert self._future is not None
+        name, _ = self._future.result()
+        count = len(theirs.status)
+        mine = ours.rho[:count]
+        proper = np.repeat((theirs.status == Status.OK)[:, None], mine.shape[1], axis=1)
+        clear = proper & (np.abs(theirs.rho) > slack)
+        far = np.abs(mine - theirs.rho) > AGREES * (1 + np.abs(theirs.rho))
+        agrees = bool(
+            np.array_equal(ours.status[:count], theirs.status)
+            and np.array_equal((mine < 0) & clear, (theirs.rho < 0) & clear)
+            # A simulation may be chaotic, and a few of them go their own ways.
+            and np.sum(far & proper & (theirs.rho >= 0)) <= 0.02 * max(np.sum(proper), 1)
+        )
+        approve(name, agrees)
+        self.approved = agrees
+        if not agrees:
+            self.refused = "its results differ from those of XLA by more than rounding"
+        return agrees
+
+
+PROGRAMS: Slot[Engine, _Program] = Slot("native programs")
+"""Native programs by the engine of XLA that they stand for."""
+SMALL: Slot[Engine, Engine] = Slot("engines of few rows")
+"""Engines that decide what is near to zero, by the engine of whole batches."""
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, "native compiler")
