@@ -185,8 +185,8 @@ class Engine:
     def with_batch(self, batch: int) -> "Engine":
         """Return an engine of other batches, which has traced what this one has."""
         other = Engine(
-            self.problem, batch, self.gradient, self.devices, self.precision, self.goals is not None,
-            self.inputs, self.own_keys, self.alone, steering=self.steering,
+            self.problem, batch, self.gradient, self.devices, self.precision,
+            self.goals is not None, self.inputs, self.own_keys, self.alone, steering=self.steering,
         )  # fmt: skip
         other._packing, other._numbers = self._packing, self._numbers
         other._traced, other._derivative = self._traced, self._derivative

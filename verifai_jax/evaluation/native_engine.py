@@ -13,7 +13,7 @@ import re
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache, cached_property
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +39,10 @@ from verifai_jax.native.values import Untranslatable
 
 Wanted = Literal["auto", "xla", "native"]
 """Engines of a run, as a person asks for them."""
+Rows: TypeAlias = Float[np.ndarray, "n row"]
+RunKey: TypeAlias = Key[Array, ""]
+Temperature: TypeAlias = Float[np.ndarray, " n"] | float
+"""Temperatures of the smooth robustness, or one for all."""
 ENGINES: tuple[Wanted, ...] = ("auto", "xla", "native")
 WORTH = 1.5e9
 """Operations of a run from which on a native program is worth it by default. XLA's programs do some
@@ -149,7 +153,9 @@ class NativeEngine:
             PROGRAMS, self.engine, lambda: _Program(self.engine)
         )
 
-    def _by_xla(self, rows: Any, key: Any, first: int, temperature: Any, which: slice) -> Verdicts:
+    def _by_xla(
+        self, rows: Rows, key: RunKey, first: int, temperature: Temperature, which: slice
+    ) -> Verdicts:
         size, parts = self._xla.batch, []
         for begin in range(which.start, which.stop, size):
             some = slice(begin, min(begin + size, which.stop))
@@ -158,7 +164,7 @@ class NativeEngine:
         return Verdicts.concatenate(parts)
 
     def _by_native(
-        self, rows: Any, key: Any, first: int, temperature: Any, which: slice
+        self, rows: Rows, key: RunKey, first: int, temperature: Temperature, which: slice
     ) -> Verdicts:
         started = time.perf_counter()
         try:
@@ -184,7 +190,13 @@ class NativeEngine:
         return self._with_decided(result, rows, key, first, temperature, which)
 
     def _with_decided(
-        self, result: Verdicts, rows: Any, key: Any, first: int, temperature: Any, which: slice
+        self,
+        result: Verdicts,
+        rows: Rows,
+        key: Key[Array, ""],
+        first: int,
+        temperature: Temperature,
+        which: slice,
     ) -> Verdicts:
         """Return the result with the rows of XLA where they are near to zero."""
         near = np.flatnonzero(
@@ -229,9 +241,11 @@ class _Program:
     def traced(self) -> tuple[Any, str | None]:
         """The program of a row, its random key by its number; and its identity."""
         function, computes = self.engine.traced_row()
-        row, *_, numbers = self.engine._arguments
+        *_, numbers = self.engine._arguments
 
-        def of_row(row: Any, words: Any, number: Any, temperature: Any, numbers: Any) -> Any:
+        def of_row(
+            row: Array, words: Array, number: Array, temperature: Array, numbers: Array
+        ) -> Array:
             key = simulation_key(jax.random.wrap_key_data(words, impl=IMPLEMENTATION), number)
             packed = function(row, key, temperature, (), numbers)
             if set(packed) != {"uint32"}:
@@ -262,8 +276,7 @@ class _Program:
             raise Unavailable(self.refused)
         self.begin()
         assert self._future is not None
-        name, library = self._future.result()
-        return library
+        return self._future.result()[1]
 
     def _load(self) -> tuple[str, Library]:
         try:
@@ -280,7 +293,7 @@ class _Program:
         except Untranslatable as error:
             raise Unavailable(f"it has {error}, which is not translated") from error
 
-    def __call__(self, rows: Any, key: Key[Array, ""], first: int, temperature: Any) -> Verdicts:
+    def __call__(self, rows: Rows, key: RunKey, first: int, temperature: Temperature) -> Verdicts:
         """Simulate rows."""
         library = self.ready()
         temperatures = np.broadcast_to(np.asarray(temperature, np.float32), (len(rows),))

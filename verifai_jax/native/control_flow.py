@@ -1,16 +1,17 @@
 """Loops and branches of a translated program."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import TypeAlias
 
+import jax
 import numpy as np
 
 from verifai_jax.core.steps import programs_in
-from verifai_jax.native.translation import Translator, pairs, rule, words_of
+from verifai_jax.native.translation import SINGLE, Translator, pairs, rule, words_of
 from verifai_jax.native.values import (
     KEY,
-    DTYPES,
     Element,
+    Equation,
     Memory,
     Untranslatable,
     Value,
@@ -19,8 +20,8 @@ from verifai_jax.native.values import (
     kind_of,
 )
 
-SINGLE = 32
-"""Elements of a carried array up to which each is a variable of its own."""
+Forms: TypeAlias = list[jax.core.ShapedArray]
+"""Shapes and types of the values of a loop."""
 CHOSEN = 6
 """Steps of the branches up to which all of them are taken, and one is chosen."""
 
@@ -28,7 +29,7 @@ CHOSEN = 6
 class Carry:
     """The values that a loop or a branch changes: variables, or arrays in memory."""
 
-    def __init__(self, t: Translator, forms: list[Any], uniform: list[bool]) -> None:
+    def __init__(self, t: Translator, forms: Forms, uniform: list[bool]) -> None:
         self.t, self.forms, self.uniform = t, forms, uniform
         self.values: list[Value] = []
         self._next: list[Memory | None] = []
@@ -102,7 +103,7 @@ def is_uniform(value: Value) -> bool:
 
 def until_settled(
     t: Translator,
-    forms: list[Any],
+    forms: Forms,
     uniform: list[bool],
     emit: Callable[[Carry], list[Value] | None],
 ) -> list[Value]:
@@ -118,7 +119,7 @@ def until_settled(
 
 
 @rule("scan")
-def _scan(t: Translator, step: Any, inputs: list[Value]) -> list[Value]:
+def _scan(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     params = step.params
     consts, count, length = params["num_consts"], params["num_carry"], params["length"]
     program = params["jaxpr"]
@@ -198,7 +199,7 @@ def _single(element: Element) -> np.ndarray:
 
 
 @rule("while")
-def _while(t: Translator, step: Any, inputs: list[Value]) -> list[Value]:
+def _while(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     params = step.params
     before, inside = params["cond_nconsts"], params["body_nconsts"]
     asked, shared = inputs[:before], inputs[before : before + inside]
@@ -232,7 +233,7 @@ def _while(t: Translator, step: Any, inputs: list[Value]) -> list[Value]:
 
 
 @rule("cond")
-def _cond(t: Translator, step: Any, inputs: list[Value]) -> list[Value]:
+def _cond(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     branches, (which, *operands) = step.params["branches"], inputs
     forms = [each.aval for each in step.outvars]
     index = elements(which).item()
@@ -266,7 +267,7 @@ def _cond(t: Translator, step: Any, inputs: list[Value]) -> list[Value]:
     return until_settled(t, forms, [True] * len(forms), emit)
 
 
-def _steps(branch: Any) -> int:
+def _steps(branch: object) -> int:
     """Count the steps of a program, those in it included."""
     program = getattr(branch, "jaxpr", branch)
     return sum(1 + sum(4 * _steps(inner) for inner in programs_in(step)) for step in program.eqns)

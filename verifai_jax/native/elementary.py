@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from verifai_jax.native.values import Untranslatable
+from verifai_jax.native.values import Params, Untranslatable
 
 OPERATORS = {
     "add": "{} + {}",
@@ -91,7 +91,7 @@ _FOLDED: dict[str, Callable[..., Any]] = {
 }
 
 
-def fold(name: str, kind: str, values: list[Any], params: dict[str, Any]) -> Any:
+def fold(name: str, kind: str, values: list[np.generic]) -> Any:
     """Return the result of an operation on whole numbers or truth values; None where unknown."""
     if name == "convert_element_type":
         return values[0] if isinstance(values[0], (np.integer, np.bool_)) or kind == "f" else None
@@ -103,7 +103,7 @@ def fold(name: str, kind: str, values: list[Any], params: dict[str, Any]) -> Any
         return _FOLDED[name](*values)
 
 
-def expression(name: str, params: dict[str, Any], kinds: list[str], out: str) -> tuple[str, bool]:
+def expression(name: str, params: Params, kinds: list[str], out: str) -> tuple[str, bool]:
     """Return the template of an operation, and whether its operands must be alike.
 
     **Arguments:**

@@ -4,8 +4,8 @@
     library = load(name, lambda: translate(program))    # or `Unavailable`, which says why
     library(rows, key, first, temperatures, numbers)    # [n, count] of bits
 
-The machine's own C++ compiler makes them. A file is only loaded if its content has the checksum that
-its name says, from a folder that nobody else can write to.
+The machine's own C++ compiler makes them. A file is only loaded if its content has the checksum
+that its name says, from a folder that nobody else can write to.
 """
 
 import ctypes
@@ -34,7 +34,7 @@ FLAGS = (
     "-std=c++11", "-shared", "-fPIC", "-O2", "-march=native", "-ffp-contract=fast", "-w",
     "-fno-math-errno", "-fno-trapping-math", "-fno-exceptions", "-fno-rtti",
 )  # fmt: skip
-"""Not `-ffast-math`, which takes NaN for a number. Contraction to fused operations is what XLA does."""
+"""Not `-ffast-math`, which takes NaN for a number. XLA contracts to fused operations, too."""
 MAX_SECONDS = 60.0
 """Seconds that a compiler may take; the programs of the shipped problems take up to two."""
 PARTS = 4
@@ -190,7 +190,7 @@ def _compile(folder: Path, name: str, source: str) -> Path:
                 stdin=subprocess.DEVNULL,
             )  # fmt: skip
         except subprocess.TimeoutExpired:
-            raise Unavailable(f"{compiler} took more than {MAX_SECONDS:.0f} s") from None
+            raise Unavailable(f"{compiler} took more than {MAX_SECONDS:z.0f} s") from None
         if done.returncode != 0 or not made.is_file():
             said = done.stderr.decode(errors="replace").strip().splitlines() or ["it said nothing"]
             raise Unavailable(f"{compiler} failed: {said[0][:200]}")

@@ -290,7 +290,8 @@ INLINE U looked_up(const unsigned *from, int n, I at) {
   V r; for (int l = 0; l < W; l++) r[l] = from[at[l]][k][l]; return r; }
 FROM_MEMORY(F) FROM_MEMORY(I) FROM_MEMORY(U)
 
-INLINE int quotient(int a, int b) { return b == 0 ? -1 : b == -1 ? (int)(0u - (unsigned)a) : a / b; }
+INLINE int quotient(int a, int b) {
+  return b == 0 ? -1 : b == -1 ? (int)(0u - (unsigned)a) : a / b; }
 INLINE unsigned quotient(unsigned a, unsigned b) { return b == 0 ? ~0u : a / b; }
 INLINE int residue(int a, int b) { return b == 0 ? a : b == -1 ? 0 : a % b; }
 INLINE unsigned residue(unsigned a, unsigned b) { return b == 0 ? a : a % b; }

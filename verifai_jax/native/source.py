@@ -3,21 +3,30 @@
 source = translate(program)                         # a closed program of one simulation
 """
 
-from typing import Any
-
 import numpy as np
 
 from verifai_jax.core.steps import without_unused
+from verifai_jax.native import arrays as arrays
 from verifai_jax.native import control_flow as control_flow
+from verifai_jax.native import indexing as indexing
+from verifai_jax.native import randomness as randomness
+from verifai_jax.native import sums as sums
 from verifai_jax.native.prelude import PRELUDE
 from verifai_jax.native.translation import Translator
-from verifai_jax.native.values import Element, Memory, Untranslatable, elements, kind_of
+from verifai_jax.native.values import (
+    ClosedProgram,
+    Element,
+    Memory,
+    Untranslatable,
+    elements,
+    kind_of,
+)
 
 CACHE = 2**18
 """Bytes of a core's cache that the arrays of a block should fit into."""
 
 
-def translate(program: Any) -> str:
+def translate(program: ClosedProgram) -> str:
     """Translate a program of one simulation.
 
     **Arguments:**
@@ -31,7 +40,7 @@ def translate(program: Any) -> str:
     """
     used = without_unused(program.jaxpr, [True] * len(program.jaxpr.outvars))
     t = Translator()
-    rows, key, _, _, numbers = used.invars
+    rows, _, _, _, numbers = used.invars
     if [kind_of(each.aval.dtype) for each in used.invars] != ["f", "u", "i", "f", "f"]:
         raise Untranslatable("a program of other inputs")
     d = rows.aval.shape[0]

@@ -7,9 +7,11 @@
 What only moves elements, as a transposition does, is then a step of NumPy and no code at all.
 """
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
+import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
 
@@ -61,7 +63,17 @@ class Memory(NamedTuple):
         return int(np.prod(self.shape, dtype=np.int64))
 
 
-Elements: TypeAlias = np.ndarray
+Equation: TypeAlias = jax.extend.core.JaxprEqn
+"""A step of a program."""
+Program: TypeAlias = jax.extend.core.Jaxpr
+"""A program of JAX, without its constants."""
+ClosedProgram: TypeAlias = Any
+"""A program with its constants; the class is another one in newer versions of JAX."""
+Params: TypeAlias = Mapping[str, Any]
+"""Parameters of a step."""
+Number: TypeAlias = np.generic | float
+"""A number of Python or NumPy."""
+Elements: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.object_]]
 """An object array of elements; those of random keys are pairs of elements."""
 Value: TypeAlias = Elements | Memory
 
@@ -71,7 +83,7 @@ KEY = "key"
 """Kind of random keys, whose elements are pairs."""
 
 
-def kind_of(dtype: Any) -> str:
+def kind_of(dtype: object) -> str:
     """Return the kind of a type of JAX.
 
     **Raises:** `Untranslatable` for types other than those of 32 bits, truth values, and keys.
@@ -89,9 +101,9 @@ def kind_of(dtype: Any) -> str:
 DTYPES = {"f": np.float32, "i": np.int32, "u": np.uint32, "b": np.bool_}
 
 
-def constant(value: Any, kind: str) -> Element:
+def constant(number: Number, kind: str) -> Element:
     """Return the element of a number."""
-    value = DTYPES[kind](value)
+    value: Any = DTYPES[kind](number)
     if kind == "b":
         return Element("-1" if value else "0", kind, True, value)
     if kind == "i":
@@ -121,7 +133,7 @@ def elements(value: Value) -> Elements:
     return out.reshape(value.shape)
 
 
-def filled(shape: tuple[int, ...], element: Any) -> Elements:
+def filled(shape: tuple[int, ...], element: Element | tuple[Element, Element]) -> Elements:
     """Return an array of one element, in all places."""
     out = np.empty(shape, object)
     flat = out.reshape(-1)

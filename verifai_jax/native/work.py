@@ -1,13 +1,12 @@
 """The work of a program, counted: which decides whether a native one is worth its compilation."""
 
-from typing import Any
-
 import numpy as np
 
 from verifai_jax.core.steps import programs_in
+from verifai_jax.native.values import Program
 
 
-def work_of(program: Any) -> int:
+def work_of(program: Program) -> int:
     """Count the operations on single numbers of a `Jaxpr`: those of loops as often as they run.
 
     Of a loop that ends by its own condition one round is counted, of branches all.
@@ -18,5 +17,5 @@ def work_of(program: Any) -> int:
         if inside:
             count += inside * int(step.params.get("length", 1))
         else:
-            count += sum(int(np.prod(each.aval.shape)) for each in step.outvars)
+            count += sum(int(np.prod(np.shape(each.aval))) for each in step.outvars)
     return count
