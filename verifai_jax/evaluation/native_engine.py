@@ -69,7 +69,8 @@ class NativeEngine:
     """
 
     def __init__(self, engine: Engine, wanted: Wanted, budget: int) -> None:
-        self.engine, self._wanted, self._budget = engine, wanted, budget
+        self.engine, self._budget = engine, budget
+        self._wanted: Wanted = wanted
         self._why = ""
         self._waited = 0.0
         self._met: tuple[Any, Verdicts] | None = None
@@ -240,7 +241,7 @@ class _Program:
     @cached_property
     def traced(self) -> tuple[Any, str | None]:
         """The program of a row, its random key by its number; and its identity."""
-        function, computes = self.engine.traced_row()
+        function = self.engine.traced_row()
         *_, numbers = self.engine._arguments
 
         def of_row(
@@ -260,7 +261,8 @@ class _Program:
                 jax.ShapeDtypeStruct((), jnp.float32),
                 numbers,
             )
-            return jax.make_jaxpr(of_row)(*forms), computes
+            program = self.engine.differentiable(lambda: jax.make_jaxpr(of_row)(*forms))
+            return program, self.engine.row_identity
 
     def begin(self) -> None:
         """Begin to compile, where that has not begun."""
@@ -300,7 +302,8 @@ class _Program:
         words = np.asarray(jax.random.key_data(key))
         threads = len(self.engine.devices)
         packed = library(rows, words, first, temperatures, self.engine.numbers, threads)
-        rho, status, features, more = self.engine.unpack({"uint32": packed}, len(rows))
+        unpacked: Any = self.engine.unpack({"uint32": packed}, len(rows))
+        rho, status, features, more = unpacked
         # What is exactly zero is decided by XLA.
         broken = violations(rho, status, lambda: np.ones(rho.shape, bool))
         return Verdicts(rho, status, broken, features, **more)

@@ -92,7 +92,9 @@ class Simulations:
         self._differentiate: Evaluator | None = None
         if search.wants.clauses:
             most = min(batch, MOST_DIFFERENTIATED)
-            self._differentiate = evaluator(most, gradient=True, clauses=True)
+            # Of few rows, which are not worth a native program unless it is asked for.
+            wanted = "native" if engine == "native" else "xla"
+            self._differentiate = evaluator(most, gradient=True, clauses=True, engine=wanted)
         self._measured: Verdicts | None = None
         self.hopeless: str | None = None
 

@@ -14,6 +14,7 @@ from verifai_jax.native.values import (
     Params,
     Untranslatable,
     Value,
+    constant,
     elements,
     filled,
     kind_of,
@@ -87,7 +88,8 @@ def _stack(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
 def _split(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     array, axis = elements(inputs[0]), step.params["axis"]
     if step.primitive.name == "unstack":
-        return list(np.moveaxis(array, axis, 0))
+        rows = np.split(array, array.shape[axis], axis)
+        return [row.squeeze(axis) for row in rows]
     return np.split(array, np.cumsum(step.params["sizes"])[:-1], axis)
 
 
@@ -117,3 +119,9 @@ def _iota(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
 @rule("split_key", "create_token")
 def _unknown(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     raise Untranslatable(f"the operation {step.primitive.name}")
+
+
+@rule("empty", "empty2")
+def _empty(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
+    form = step.outvars[0].aval
+    return [filled(form.shape, constant(0, kind_of(form.dtype)))]

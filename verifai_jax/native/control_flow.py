@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import TypeAlias
 
-import jax
 import numpy as np
 
 from verifai_jax.core.steps import programs_in
@@ -12,7 +11,9 @@ from verifai_jax.native.values import (
     KEY,
     Element,
     Equation,
+    Form,
     Memory,
+    Program,
     Untranslatable,
     Value,
     constant,
@@ -20,7 +21,7 @@ from verifai_jax.native.values import (
     kind_of,
 )
 
-Forms: TypeAlias = list[jax.core.ShapedArray]
+Forms: TypeAlias = list[Form]
 """Shapes and types of the values of a loop."""
 CHOSEN = 6
 """Steps of the branches up to which all of them are taken, and one is chosen."""
@@ -267,7 +268,7 @@ def _cond(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     return until_settled(t, forms, [True] * len(forms), emit)
 
 
-def _steps(branch: object) -> int:
+def _steps(branch: Program) -> int:
     """Count the steps of a program, those in it included."""
     program = getattr(branch, "jaxpr", branch)
     return sum(1 + sum(4 * _steps(inner) for inner in programs_in(step)) for step in program.eqns)

@@ -41,9 +41,9 @@ def element_at(
     if not moving:
         return elements(array).ravel()[fixed]
     if len(moving) == 1 and not moving[0][0].uniform and array.size <= CHAIN:
-        index, stride = moving[0]
+        one, stride = moving[0]
         if not is_table(array):
-            return _chosen(t, elements(array).ravel()[fixed::stride], index)
+            return _chosen(t, elements(array).ravel()[fixed::stride], one)
     memory = t.in_memory(array)
     place = " + ".join([str(fixed), *(f"{i.text} * {s}" for i, s in moving)])
     if all(i.uniform for i, _ in moving):
@@ -103,7 +103,7 @@ def _dynamic_update_slice(t: Translator, step: Equation, inputs: list[Value]) ->
         _bounded(t, elements(v).item(), n - size)
         for v, n, size in zip(inputs[2:], array.shape, update.shape, strict=True)
     ]
-    out = np.array(array)
+    out: Elements = np.array(array)
     for place in np.ndindex(array.shape):
         for inside in np.ndindex(update.shape):
             hits = constant(True, "b")
@@ -172,7 +172,7 @@ def _scatter(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
         raise Untranslatable("a scatter in batches")
     windows = numbers.update_window_dims
     kept = [axis for axis in range(array.ndim) if axis not in numbers.inserted_window_dims]
-    out = np.array(array)
+    out: Elements = np.array(array)
     for place in np.ndindex(updates.shape):
         batch = tuple(i for axis, i in enumerate(place) if axis not in windows)
         offset = np.zeros(array.ndim, int)

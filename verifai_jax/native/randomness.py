@@ -65,7 +65,8 @@ def _bits(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
 @rule("threefry2x32")
 def _threefry(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     shape = step.outvars[0].aval.shape
-    a, b, x, y = (np.broadcast_to(elements(v), shape) for v in inputs)
+    four: Elements = [np.broadcast_to(elements(v), shape) for v in inputs]
+    a, b, x, y = four
     out = np.empty(shape, object)
     for place in np.ndindex(shape):
         out[place] = _encrypted(t, (a[place], b[place]), x[place], y[place])

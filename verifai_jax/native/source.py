@@ -14,9 +14,9 @@ from verifai_jax.native import sums as sums
 from verifai_jax.native.prelude import PRELUDE
 from verifai_jax.native.translation import Translator
 from verifai_jax.native.values import (
-    ClosedProgram,
     Element,
     Memory,
+    Program,
     Untranslatable,
     elements,
     kind_of,
@@ -26,7 +26,7 @@ CACHE = 2**18
 """Bytes of a core's cache that the arrays of a block should fit into."""
 
 
-def translate(program: ClosedProgram) -> str:
+def translate(program: Program) -> str:
     """Translate a program of one simulation.
 
     **Arguments:**

@@ -68,7 +68,7 @@ def _cumulative(t: Translator, step: Equation, inputs: list[Value]) -> list[Valu
     order = range(len(rows))[:: -1 if step.params["reverse"] else 1]
     for before, i in itertools.pairwise(order):
         for place in np.ndindex(rows.shape[1:]):
-            pair = [rows[before][place], rows[i][place]]
+            pair = [rows[(before, *place)], rows[(i, *place)]]
             rows[(i, *place)] = t.compute(name, {}, pair, kind)
     return [np.moveaxis(rows, 0, axis)]
 
@@ -83,9 +83,9 @@ def _arg(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     )
     out = np.empty(rows.shape[1:], object)
     for place in np.ndindex(out.shape):
-        best, at = rows[0][place], constant(0, kind)
+        best, at = rows[(0, *place)], constant(0, kind)
         for i in range(1, len(rows)):
-            other = rows[i][place]
+            other = rows[(i, *place)]
             wins = t.compute(better, {}, [other, best], "b")
             if other.kind == "f":
                 # The first NaN wins.

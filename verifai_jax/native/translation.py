@@ -21,6 +21,7 @@ from verifai_jax.native.values import (
     Element,
     Elements,
     Equation,
+    Form,
     Memory,
     Params,
     Program,
@@ -80,7 +81,7 @@ class Translator:
             values.update(zip(step.outvars, results, strict=True))
         return [read(each) for each in program.outvars]
 
-    def closed(self, program: object, inputs: Sequence[Value]) -> list[Value]:
+    def closed(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
         """Translate a program with its constants, or one without."""
         inner = getattr(program, "jaxpr", program)
         return self.program(inner, getattr(program, "consts", ()), inputs)
@@ -93,12 +94,12 @@ class Translator:
         out = step.outvars[0].aval
         return [self.elementwise(name, step.params, inputs, kind_of(out.dtype), out.shape)]
 
-    def constant(self, value: ArrayLike, form: jax.core.ShapedArray | None = None) -> Value:
+    def constant(self, value: ArrayLike, form: Form | None = None) -> Value:
         """Return a constant of a program."""
         kind = kind_of(jax.numpy.result_type(value) if form is None else form.dtype)
         if kind == KEY:
             raise Untranslatable("a random key that is a constant")
-        array = np.asarray(value, DTYPES[kind])
+        array: Elements = np.asarray(value, DTYPES[kind])
         if array.size <= SINGLE:
             out = np.empty(array.shape, object)
             for place in np.ndindex(array.shape):
@@ -115,7 +116,7 @@ class Translator:
         if kind == KEY or any(self._is_key(value) for value in inputs):
             return self._of_keys(name, params, inputs, shape)
         size = int(np.prod(shape, dtype=np.int64))
-        flat = [self._operand(value, size) for value in inputs]
+        flat: list[Elements] = [self._operand(value, size) for value in inputs]
         if all(isinstance(value, Element) for value in flat):
             return filled(shape, self.compute(name, params, flat, kind))
         if size <= SINGLE:

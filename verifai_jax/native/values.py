@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
-import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
 
@@ -63,17 +62,17 @@ class Memory(NamedTuple):
         return int(np.prod(self.shape, dtype=np.int64))
 
 
-Equation: TypeAlias = jax.extend.core.JaxprEqn
+Equation: TypeAlias = Any
 """A step of a program."""
-Program: TypeAlias = jax.extend.core.Jaxpr
-"""A program of JAX, without its constants."""
-ClosedProgram: TypeAlias = Any
-"""A program with its constants; the class is another one in newer versions of JAX."""
+Program: TypeAlias = Any
+"""A program of JAX, with or without its constants; newer versions have one class of both."""
+Form: TypeAlias = Any
+"""Shape and type of a value, or the type."""
 Params: TypeAlias = Mapping[str, Any]
 """Parameters of a step."""
 Number: TypeAlias = np.generic | float
 """A number of Python or NumPy."""
-Elements: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.object_]]
+Elements: TypeAlias = Any
 """An object array of elements; those of random keys are pairs of elements."""
 Value: TypeAlias = Elements | Memory
 
@@ -83,7 +82,7 @@ KEY = "key"
 """Kind of random keys, whose elements are pairs."""
 
 
-def kind_of(dtype: object) -> str:
+def kind_of(dtype: Form) -> str:
     """Return the kind of a type of JAX.
 
     **Raises:** `Untranslatable` for types other than those of 32 bits, truth values, and keys.
