@@ -229,7 +229,7 @@ class Engine:
         return self._packing["evaluate"].unpack(packed, count)
 
     def draws(self) -> bool:
-        """Return whether the system uses its random key; needs `own_keys` and `alone`.
+        """Return whether the system uses its random key, in an engine without derivatives.
 
         Traces the program, and raises what that raises.
         """

@@ -8,7 +8,7 @@ evaluator takes the engine that suits the problem, compiled or on the host, or s
 workers of an executor. Each simulation has a random key of its own, by its number.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Array, Float, Key
@@ -28,6 +28,13 @@ from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
+
+
+NOT_NATIVE = (
+    "simulated without native code, which is made of systems that JAX traces, in single precision "
+    "and in this process"
+)
+"""Note of a run for which native code was asked for in vain."""
 
 
 class Evaluator:
@@ -96,8 +103,11 @@ class Evaluator:
             self.engine = compiled = engine_for(
                 problem, batch, gradient, precision, clauses, steering, self.given
             )
-            if engine != "xla" and precision == "float32":
+            if engine != "xla" and precision == "float32" and not keep_traces:
                 self.engine = NativeEngine(compiled, engine, budget)
+        self._not_native = ()
+        if engine == "native" and not isinstance(self.engine, NativeEngine):
+            self._not_native = (NOT_NATIVE,)
         # Features of few points are those of a whole batch, bit for bit.
         self._padded_to = power_of_two(batch) if ends_raising else 1
         self.key: Key[Array, ""] = run_keys(seed)[1]
@@ -109,14 +119,16 @@ class Evaluator:
         return self.engine.compile_seconds
 
     @property
-    def simulated_by(self) -> Wanted:
-        """The engine of the rows: `"xla"`, or `"native"` from one of the first rows on."""
-        return self.engine.chosen if isinstance(self.engine, NativeEngine) else "xla"
+    def simulated_by(self) -> Literal["auto", "xla", "native", "host"]:
+        """The engine of the rows, `"auto"` before it is decided; `"host"` for black boxes."""
+        if isinstance(self.engine, NativeEngine):
+            return self.engine.chosen
+        return "host" if self.problem.black_box else "xla"
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Decisions of the engine that a user may not expect."""
-        return self.engine.notes
+        return (*self.engine.notes, *self._not_native)
 
     def begin_compiling(self) -> None:
         """Trace now and compile in the background."""

@@ -21,7 +21,6 @@ from verifai_jax.core.executors import Executor
 from verifai_jax.core.precision import in_precision, reproducible_settings
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.evaluation.backends import resolved
-from verifai_jax.evaluation.native_engine import Wanted
 from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
 from verifai_jax.falsification.model_changes import continued_with
@@ -95,7 +94,7 @@ def falsify(
     target: str | None = None,
     executor: Executor | None = None,
     keep_going: bool = False,
-    engine: Wanted = "auto",
+    engine: str = "auto",
 ) -> Run:
     """Search the feature space for inputs under which the system breaks its property.
 
@@ -198,7 +197,7 @@ def falsify(
         table = ErrorTable(tuple(problem.space.columns), place)
         rounds = Rounds(
             problem, search, size, seed, table, precision, place, confirm, executor, target, given,
-            suggests=asking is not None, engine=engine, budget=budget,
+            suggests=asking is not None, engine=as_wanted(engine), budget=budget,
         )  # fmt: skip
         if asking is not None:
             rounds.ask(replace(asking, search=search))
@@ -241,7 +240,7 @@ def simulate(
     progress: bool | None = None,
     target: str | None = None,
     executor: Executor | None = None,
-    engine: Wanted = "auto",
+    engine: str = "auto",
 ) -> Run:
     """Simulate given features, in their order: no search, a row of the table for each.
 

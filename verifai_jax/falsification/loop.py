@@ -371,7 +371,7 @@ class Rounds:
         return self._simulations.evaluate
 
     @property
-    def simulated_by(self) -> Wanted:
+    def simulated_by(self) -> str:
         """The engine of the rows, as far as it is decided."""
         return self.evaluate.simulated_by
 

@@ -168,7 +168,7 @@ _FORMS: dict[str, Callable[[Any], bool]] = {
     "acceptance": lambda value: value is None or _is_number(value),
     "precision": lambda value: value in ("float32", "float64"),
     "backend": lambda value: value is None or _is_text(value),
-    "engine": lambda value: value in ("auto", "xla", "native"),
+    "engine": lambda value: value in ("auto", "xla", "native", "host"),
     "notes": _is_texts,
     "lasting_notes": _is_texts,
     "confirm": _is_flag,

@@ -126,7 +126,7 @@ def check_engine(engine: object) -> None:
 
 
 def as_wanted(engine: str) -> Wanted:
-    """Return the engine of a record, which was checked when it was read."""
+    """Return an engine that was checked, with its type."""
     return cast(Wanted, engine)
 
 

@@ -125,3 +125,8 @@ def _unknown(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
 def _empty(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     form = step.outvars[0].aval
     return [filled(form.shape, constant(0, kind_of(form.dtype)))]
+
+
+@moved("tile")
+def _tile(params: Params, array: Elements) -> Elements:
+    return np.tile(array, params["reps"])

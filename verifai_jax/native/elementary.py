@@ -116,6 +116,13 @@ def expression(name: str, params: Params, kinds: list[str], out: str) -> tuple[s
     """
     if name in OPERATORS:
         return OPERATORS[name], False
+    if name in ("lt_to", "le_to"):
+        sign = "<" if name == "lt_to" else "<="
+        return (
+            f"truth(in_order({{}}) {sign} in_order({{}}))"
+            if kinds[0] == "f"
+            else f"truth({{}} {sign} {{}})"
+        ), False
     if name in COMPARISONS:
         return f"truth({{}} {COMPARISONS[name]} {{}})", False
     if name in FUNCTIONS:
@@ -151,7 +158,7 @@ def _by_number(cases: int) -> str:
 
 def _power(y: int) -> str:
     if y == 0:
-        return "{0} * 0.f + 1.f"
+        return "filled({0}, 1.f)"
 
     def product(n: int) -> str:
         if n == 1:

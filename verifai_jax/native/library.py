@@ -64,7 +64,7 @@ class Library:
         self._run = loaded.run
         pointer, whole = ctypes.c_void_p, ctypes.c_long
         self._run.argtypes = [
-            pointer, pointer, ctypes.c_int, pointer, pointer, whole, whole, pointer,
+            pointer, pointer, ctypes.c_int, pointer, pointer, whole, whole, whole, pointer,
         ]  # fmt: skip
 
     def __call__(
@@ -80,14 +80,13 @@ class Library:
         rows = np.ascontiguousarray(rows, np.float32)
         key, numbers = np.ascontiguousarray(key, np.uint32), np.ascontiguousarray(numbers)
         temperatures = np.ascontiguousarray(temperatures, np.float32)
-        out = np.empty((len(rows), self.count), np.uint32)
+        out = np.empty((self.count, len(rows)), np.uint32)
         pointers = [a.ctypes.data for a in (rows, key, temperatures, numbers, out)]
 
         def run(begin: int) -> int:
             end = min(begin + size, len(rows))
-            return self._run(
-                pointers[0], pointers[1], first, pointers[2], pointers[3], begin, end, pointers[4]
-            )
+            given, inputs = pointers[:2], pointers[2:4]
+            return self._run(*given, first, *inputs, begin, end, len(rows), pointers[4])
 
         blocks = -(-len(rows) // self._width)
         size = -(-blocks // (threads * PARTS if threads > 1 else 1)) * self._width
@@ -95,7 +94,7 @@ class Library:
         each = map(run, begins) if len(begins) < 2 else _threads().map(run, begins)
         if any(each):
             raise MemoryError("there is no memory for the arrays of a native program")
-        return out
+        return out.T
 
 
 @cache

@@ -84,6 +84,9 @@ template <class T> INLINE T with_sign(T x, T s) {
   return real_bits((to_bits(x) & 0x7fffffffu) | (to_bits(s) & 0x80000000u)); }
 template <class T> INLINE auto finite(T x) -> decltype(truth(x == x)) {
   return truth((to_bits(x) & 0x7f800000u) != 0x7f800000u); }
+/* Whole numbers in the order of real ones, in which -0 is below 0 and NaN above all. */
+template <class T> INLINE auto in_order(T x) -> decltype(whole_bits(x)) {
+  auto bits = whole_bits(x); return choose(truth(bits < 0), bits ^ 0x7fffffff, bits); }
 template <class T> INLINE T sign_of(T x) {
   T one = with_sign(filled(x, 1.f), x);
   return choose(truth(x == 0.f) | truth(x != x), x, one); }

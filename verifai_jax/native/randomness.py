@@ -74,14 +74,14 @@ def _threefry(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]
 
 
 def _counted(t: Translator, keys: Elements, shape: Sequence[int]) -> Elements:
-    if not jax.config.read("jax_threefry_partitionable"):
+    if not getattr(jax.config, "jax_threefry_partitionable", False):
         raise Untranslatable("random keys with jax_threefry_partitionable=False")
     count = int(np.prod(shape, dtype=np.int64))
     out = np.empty((*keys.shape, count), object)
     for place in np.ndindex(keys.shape):
         for i in range(count):
             out[(*place, i)] = _encrypted(t, keys[place], constant(0, "u"), constant(i, "u"))
-    return out.reshape(*keys.shape, *shape)
+    return out.reshape((*keys.shape, *shape))
 
 
 def _encrypted(

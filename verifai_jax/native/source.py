@@ -54,10 +54,9 @@ def translate(program: Program) -> str:
     shared = Memory("numbers", "f", True, numbers.aval.shape)
     results = t.program(used, program.consts, [row, words, one(number), one(temperature), shared])
     (packed,) = results
-    (count,) = packed.shape
     for i, each in enumerate(elements(packed)):
         text = f"wide({each.text})" if each.uniform else each.text
-        t.line(f"give({text}, out + {i}, {count}, at + k * W, end);")
+        t.line(f"give({text}, out + {i} * total, at + k * W, end);")
     lines, arena = t.code.body()
     vectors = next((k for k in (4, 2) if arena * k * 64 <= CACHE * (4 // k)), 1)
     body = "\n".join(lines)
@@ -85,16 +84,17 @@ INLINE F column(const float *from, long step, long at, long end) {
   return r;
 }
 INLINE I lanes() { I r; for (int l = 0; l < W; l++) r[l] = l; return r; }
-INLINE void give(U bits, unsigned *to, long step, long at, long end) {
-  for (int l = 0; l < W; l++) if (at + l < end) to[(at + l) * step] = bits[l];
+INLINE void give(U bits, unsigned *to, long at, long end) {
+  if (__builtin_expect(at + W <= end, 1)) __builtin_memcpy(to + at, &bits, sizeof(U));
+  else for (int l = 0; at + l < end; l++) to[at + l] = bits[l];
 }
 """
 
 _FUNCTION = r"""
 extern "C" int width() { return K * W; }
-/* Rows `begin` to `end`; 0, or 1 where there is no memory. */
+/* Rows `begin` to `end` of a total; each result in a row of its own. 1: there is no memory. */
 extern "C" int run(const float *rows, const unsigned *key, int first, const float *temperatures,
-                   const float *numbers, long begin, long end, unsigned *out) {
+                   const float *numbers, long begin, long end, long total, unsigned *out) {
   F *arena = 0;
   if (@arena && posix_memalign((void **)&arena, 64, (long)K * @arena * sizeof(F))) return 1;
 #if defined(__x86_64__)

@@ -116,7 +116,7 @@ class Translator:
         if kind == KEY or any(self._is_key(value) for value in inputs):
             return self._of_keys(name, params, inputs, shape)
         size = int(np.prod(shape, dtype=np.int64))
-        flat: list[Elements] = [self._operand(value, size) for value in inputs]
+        flat: list[Elements] = [self._operand(value, shape) for value in inputs]
         if all(isinstance(value, Element) for value in flat):
             return filled(shape, self.compute(name, params, flat, kind))
         if size <= SINGLE:
@@ -187,13 +187,13 @@ class Translator:
             self.code.store(memory.at(i), each, memory.uniform)
         return memory
 
-    def _operand(self, value: Value, size: int) -> "Element | Value":
-        if isinstance(value, Memory):
-            return elements(value).item() if value.shape == () else value
-        one = same(value)
-        if one is not None and (value.size == 1 or value.size == size):
-            return one
-        return value
+    def _operand(self, value: Value, shape: tuple[int, ...]) -> "Element | Value":
+        """Return a value in this shape, or the one element that is in all places of it."""
+        if isinstance(value, Memory) and value.shape == shape and shape:
+            return value
+        array = elements(value)
+        one = same(array)
+        return np.broadcast_to(array, shape) if one is None else one
 
     @staticmethod
     def _is_key(value: Value) -> bool:
