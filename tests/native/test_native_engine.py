@@ -97,12 +97,12 @@ def test_nan_and_infinities_are_those_of_xla():
     """States that overflow, and a function that is not defined everywhere."""
     system = vj.ode(
         lambda time, state, control, features: state * state * 4,
-        lambda features, key: jnp.sqrt(features["x0"]) * 3,
+        lambda features, key: jnp.sqrt(features["x0"]) * 0.1,
         dt=0.1,
         duration=3.0,
-        signals=lambda time, state, control, features: {"angle": state, "log": jnp.log(state - 1)},
+        signals=lambda time, state, control, features: {"angle": state, "log": jnp.log(state)},
     )
-    problem = problem_of(system, "always (angle < 9) | eventually (log > 1)")
+    problem = problem_of(system, "always (angle < 9) | eventually (log > 1)", {"x0": vj.Box(-1, 1)})
     ours, theirs, _ = evaluated(problem, points(problem))
     assert len(set(theirs.status)) > 1
     assert np.array_equal(ours.status, theirs.status)
@@ -112,7 +112,7 @@ def test_nan_and_infinities_are_those_of_xla():
 def test_a_system_that_draws_draws_the_same():
     def simulate(features, key):
         noise = jax.random.normal(key, (20,)) * 0.1
-        last, angle = jax.lax.scan(lambda x, n: (0.9 * x + n,) * 2, features["x0"], noise)
+        _, angle = jax.lax.scan(lambda x, n: (0.9 * x + n,) * 2, features["x0"], noise)
         return vj.Trace({"angle": angle}, dt=0.1)
 
     space = {"x0": vj.Box(-0.4, 0.4), "gain": vj.Normal(1.0, 0.1)}
@@ -142,7 +142,9 @@ def test_the_same_table_resumed_or_not(ending):
     assert part.engine == whole.engine == "native"
     again = vj.resume(part, budget=2100, progress=False)
     assert again.engine == "native"
-    assert whole.table.all.equals(again.table.all)
+    # Which rows are examined depends on the earlier budget, whatever the engine.
+    rows, others = (run.table.all.drop(columns="verdict") for run in (whole, again))
+    assert rows.equals(others)
     other = vj.falsify(ending, "uniform", 2100, **{**options, "engine": "xla"})
     assert other.engine == "xla"
     assert (other.table.all["violated"] == whole.table.all["violated"]).all()
@@ -172,15 +174,16 @@ def test_given_features_are_simulated_natively(ending):
 
 
 def test_an_unknown_engine(ending):
-    with pytest.raises(UnknownNameError, match=r"no engine 'fast'.*auto, xla, native"):
+    with pytest.raises(UnknownNameError, match=r"unknown engine 'fast'.*auto, xla, native"):
         vj.falsify(ending, "uniform", 10, engine="fast")
 
 
 def sorted_problem():
     """What is not translated."""
-    system = lambda features, key: vj.Trace(
-        {"angle": jnp.sort(features["x0"] * jnp.arange(3.0))[:1]}, dt=0.1
-    )
+
+    def system(features, key):
+        return vj.Trace({"angle": jnp.sort(features["x0"] * jnp.arange(3.0))[:1]}, dt=0.1)
+
     return problem_of(system, "angle > -1.5", {"x0": SPACE["x0"]})
 
 

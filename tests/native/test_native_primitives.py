@@ -234,7 +234,8 @@ def test_elements_by_number():
             table[i], table[:7][i], row[i], long[i], long.at[i].set(0.0), row.at[i].add(2.0),
             lax.dynamic_slice(row, (i,), (2,)), lax.dynamic_update_slice(row, row[:2], (i,)),
             table.at[i].get(mode="fill", fill_value=5.0), numbers[i], row.reshape(2, 2)[:, i],
-            jnp.round(jnp.interp(row[0], jnp.arange(7.0), table[:7]), 3), lax.dynamic_index_in_dim(table, i),
+            jnp.round(jnp.interp(row[0], jnp.arange(7.0), table[:7]), 3),
+            lax.dynamic_index_in_dim(table, i),
         )  # fmt: skip
 
     check(function, 4, "elements", 64, np.nan_to_num(rows_of(4), posinf=3, neginf=-3))

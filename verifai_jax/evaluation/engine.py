@@ -208,7 +208,7 @@ class Engine:
         """A hash of all that the function of one row computes; None where it has none."""
         if not self.gradient:
             return fingerprint(self._trace("evaluate").jaxpr, derivatives=False)
-        computes, _ = self._derivatives
+        computes, *_ = self._derivatives
         return None if computes is None else identity(computes, self._derivative)
 
     @property
