@@ -37,7 +37,7 @@ from verifai_jax.evaluation.row import Row, RowFunction
 from verifai_jax.evaluation.steering import NOTHING, Steering
 from verifai_jax.evaluation.verdicts import Verdicts, violations
 from verifai_jax.mtl.clauses import goals_of
-from verifai_jax.native.work import work_of
+from verifai_jax.native_code.work import work_of
 from verifai_jax.problem.problem import Problem
 
 Mode = Literal["evaluate", "holds"]

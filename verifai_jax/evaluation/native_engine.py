@@ -26,7 +26,7 @@ from verifai_jax.core.programs import Slot
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.verdicts import Verdicts, violations
-from verifai_jax.native.library import (
+from verifai_jax.native_code.library import (
     Library,
     Unavailable,
     approve,
@@ -34,8 +34,8 @@ from verifai_jax.native.library import (
     library_name,
     load,
 )
-from verifai_jax.native.source import translate
-from verifai_jax.native.values import Untranslatable
+from verifai_jax.native_code.source import translate
+from verifai_jax.native_code.values import Untranslatable
 
 Wanted = Literal["auto", "xla", "native"]
 """Engines of a run, as a person asks for them."""
@@ -44,10 +44,10 @@ RunKey: TypeAlias = Key[Array, ""]
 Temperature: TypeAlias = Float[np.ndarray, " n"] | float
 """Temperatures of the smooth robustness, or one for all."""
 ENGINES: tuple[Wanted, ...] = ("auto", "xla", "native")
-WORTH = 1.5e9
-"""Operations of a run from which on a native program is worth it by default. XLA's programs do some
-1.5e10 a second on two cores and a compiler takes a second, once for all runs of a machine; so ten
-such runs pay for it. A run whose operations are fewer takes a tenth of a second."""
+WORTH = 3e9
+"""Operations of a run from which on a native program is worth it by default. XLA's programs do 1.3
+to 4.5e10 a second on two cores (seven problems), and translator and compiler take 1.3 s, once for
+all runs of a machine: a dozen such runs, of a tenth of a second each, pay for it."""
 FIRST = 512
 """Rows of a run that XLA simulates, so that the first result waits for no second compiler; and rows
 that it simulates at a time where it only decides what is near to zero."""
@@ -73,13 +73,23 @@ class NativeEngine:
         self._wanted: Wanted = wanted
         self._why = ""
         self._waited = 0.0
-        self._met: tuple[Any, Verdicts] | None = None
+        self._met: list[tuple[Any, Verdicts]] = []
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Decisions of the engine that a user may not expect."""
         why = (f"simulated by XLA, not natively: {self._why}",) if self._why else ()
         return (*self._begun.notes, *why)
+
+    @property
+    def precision(self) -> str:
+        """Precision of the simulations."""
+        return self.engine.precision
+
+    @property
+    def padded(self) -> int:
+        """Rows of the program of XLA."""
+        return self._begun.padded
 
     @property
     def compile_seconds(self) -> float:
@@ -121,7 +131,8 @@ class NativeEngine:
         if before:
             some = rows[:before], key, first, _cut(temperature, slice(before))
             parts.append(self._by_xla(*some))
-            self._met = some, parts[0]
+            if not self._program.approved:
+                self._met.append((some, parts[0]))
         self._program.begin()
         if before < len(rows):
             rest = _cut(temperature, slice(before, None))
@@ -130,7 +141,7 @@ class NativeEngine:
 
     @cached_property
     def _is_worth(self) -> bool:
-        """Whether the work of the run is worth a native program."""
+        """True where the work of the run is worth a native program."""
         if jax.default_backend() != "cpu":
             self._why = f"runs on the {jax.default_backend()}"
             return False
@@ -170,12 +181,13 @@ class NativeEngine:
             self._why = str(error)
         self._waited += time.perf_counter() - started
         if not self._why and not self._program.approved:
-            if self._met is None:
+            if not self._met:
                 some = rows[:FIRST], key, first, _cut(temperature, slice(FIRST))
-                self._met = some, self._by_xla(*some)
-            arguments, theirs = self._met
-            self._program.compare(self._program(*arguments), theirs, self._slack)
-            self._why = self._program.refused
+                self._met.append((some, self._by_xla(*some)))
+            ours = Verdicts.concatenate([self._program(*some) for some, _ in self._met])
+            theirs = Verdicts.concatenate([verdicts for _, verdicts in self._met])
+            self._program.compare(ours, theirs, self._slack)
+            self._why, self._met = self._program.refused, []
         if self._why:
             return self._by_xla(rows, key, first, temperature)
         result = self._program(rows, key, first, temperature)
@@ -230,7 +242,7 @@ class _Program:
 
     @cached_property
     def draws(self) -> bool:
-        """Whether the system uses its random key, as far as that is known."""
+        """True where the system uses its random key, or may do so."""
         return self.engine.gradient or self.engine.draws()
 
     @cached_property
@@ -307,15 +319,14 @@ class _Program:
         """Compare rows with those of XLA, and note whether they agree."""
         assert self._future is not None
         name, _ = self._future.result()
-        count = len(theirs.status)
-        mine = ours.rho[:count]
+        mine = ours.rho
         proper = np.repeat((theirs.status == Status.OK)[:, None], mine.shape[1], axis=1)
         clear = proper & (np.abs(theirs.rho) > slack)
         far = np.abs(mine - theirs.rho) > AGREES * (1 + np.abs(theirs.rho))
         pairs = ((ours.gradient, theirs.gradient), (ours.clause_gradients, theirs.clause_gradients))
         agrees = bool(
-            np.array_equal(ours.status[:count], theirs.status)
-            and all(_alike(a[:count], b) for a, b in pairs if a is not None and b is not None)
+            np.array_equal(ours.status, theirs.status)
+            and all(_alike(a, b) for a, b in pairs if a is not None and b is not None)
             and np.array_equal((mine < 0) & clear, (theirs.rho < 0) & clear)
             # A simulation may be chaotic, and a few of them go their own ways.
             and np.sum(far & proper & (theirs.rho >= 0)) <= 0.02 * max(np.sum(proper), 1)

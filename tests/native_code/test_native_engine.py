@@ -14,7 +14,7 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.evaluation import native_engine
 from verifai_jax.evaluation.engine import engine_for
 from verifai_jax.evaluation.native_engine import FIRST, NativeEngine
-from verifai_jax.native import library
+from verifai_jax.native_code import library
 
 pytestmark = pytest.mark.thorough
 

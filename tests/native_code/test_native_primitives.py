@@ -8,9 +8,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from jax import lax
 
-from verifai_jax.native.library import Unavailable, library_name, load
-from verifai_jax.native.source import translate
-from verifai_jax.native.values import Untranslatable
+from verifai_jax.native_code.library import Unavailable, library_name, load
+from verifai_jax.native_code.source import translate
+from verifai_jax.native_code.values import Untranslatable
 
 pytestmark = pytest.mark.thorough
 

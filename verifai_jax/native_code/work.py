@@ -3,7 +3,7 @@
 import numpy as np
 
 from verifai_jax.core.steps import programs_in
-from verifai_jax.native.values import Program
+from verifai_jax.native_code.values import Program
 
 
 def work_of(program: Program) -> int:

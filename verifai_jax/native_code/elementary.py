@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from verifai_jax.native.values import Params, Untranslatable
+from verifai_jax.native_code.values import Params, Untranslatable
 
 OPERATORS = {
     "add": "{} + {}",

@@ -13,9 +13,9 @@ import jax.extend.core
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from verifai_jax.native import elementary
-from verifai_jax.native.code import Code
-from verifai_jax.native.values import (
+from verifai_jax.native_code import elementary
+from verifai_jax.native_code.code import Code
+from verifai_jax.native_code.values import (
     DTYPES,
     KEY,
     Element,

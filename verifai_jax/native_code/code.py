@@ -9,7 +9,7 @@ import re
 
 import numpy as np
 
-from verifai_jax.native.values import TYPES, Element, Memory, Untranslatable, constant
+from verifai_jax.native_code.values import TYPES, Element, Memory, Untranslatable, constant
 
 MAX_LINES = 30_000
 """Lines of a program at most; a compiler takes seconds for so many."""

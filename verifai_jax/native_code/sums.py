@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from verifai_jax.native.translation import Translator, rule
-from verifai_jax.native.values import (
+from verifai_jax.native_code.translation import Translator, rule
+from verifai_jax.native_code.values import (
     Element,
     Equation,
     Memory,

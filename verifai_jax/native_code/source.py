@@ -6,14 +6,14 @@ source = translate(program)                         # a closed program of one si
 import numpy as np
 
 from verifai_jax.core.steps import without_unused
-from verifai_jax.native import arrays as arrays
-from verifai_jax.native import control_flow as control_flow
-from verifai_jax.native import indexing as indexing
-from verifai_jax.native import randomness as randomness
-from verifai_jax.native import sums as sums
-from verifai_jax.native.prelude import PRELUDE
-from verifai_jax.native.translation import Translator
-from verifai_jax.native.values import (
+from verifai_jax.native_code import arrays as arrays
+from verifai_jax.native_code import control_flow as control_flow
+from verifai_jax.native_code import indexing as indexing
+from verifai_jax.native_code import randomness as randomness
+from verifai_jax.native_code import sums as sums
+from verifai_jax.native_code.prelude import PRELUDE
+from verifai_jax.native_code.translation import Translator
+from verifai_jax.native_code.values import (
     Element,
     Memory,
     Program,

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
-from verifai_jax.native.translation import Translator, pairs, rule, words_of
-from verifai_jax.native.values import (
+from verifai_jax.native_code.translation import Translator, pairs, rule, words_of
+from verifai_jax.native_code.values import (
     Element,
     Elements,
     Equation,
