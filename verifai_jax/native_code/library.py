@@ -27,6 +27,7 @@ from jaxtyping import Float, UInt32
 from verifai_jax.core.cores import available_cores
 from verifai_jax.core.devices import cache_folder
 from verifai_jax.core.remembered import remembered_as
+from verifai_jax.native_code.source import PRELUDE
 
 COMPILERS = ("c++", "g++", "clang++")
 """Names under which a compiler is looked for."""
@@ -117,7 +118,7 @@ def library_name(fingerprint: str | None) -> str:
     if cache_folder() is None:
         raise Unavailable("the cache of compiled programs is switched off")
     about = compiler.stat()
-    which = (str(compiler), about.st_size, about.st_mtime_ns, _processor(), FLAGS)
+    which = (str(compiler), about.st_size, about.st_mtime_ns, _processor(), FLAGS, PRELUDE)
     name = remembered_as("native", fingerprint, which)
     if name is None:
         raise Unavailable("a part of the program cannot be identified")

@@ -3,6 +3,8 @@
 source = translate(program)                         # a closed program of one simulation
 """
 
+from pathlib import Path
+
 import numpy as np
 
 from verifai_jax.core.steps import without_unused
@@ -11,7 +13,6 @@ from verifai_jax.native_code import control_flow as control_flow
 from verifai_jax.native_code import indexing as indexing
 from verifai_jax.native_code import randomness as randomness
 from verifai_jax.native_code import sums as sums
-from verifai_jax.native_code.prelude import PRELUDE
 from verifai_jax.native_code.translation import Translator
 from verifai_jax.native_code.values import (
     Element,
@@ -22,6 +23,8 @@ from verifai_jax.native_code.values import (
     kind_of,
 )
 
+PRELUDE = Path(__file__).with_name("prelude.hpp").read_text()
+"""The beginning of every program."""
 CACHE = 2**18
 """Bytes of a core's cache that the arrays of a block should fit into."""
 

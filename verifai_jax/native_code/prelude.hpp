@@ -1,10 +1,5 @@
-"""The beginning of every translated program: vector types, and mathematics on them.
-
-Functions are templates over a vector `F` of 4, 8 or 16 floats and a single `float`. All of it obeys
-IEEE 754, so that NaN and infinities arise and spread as they do in XLA's programs.
-"""
-
-PRELUDE = r"""
+/* The beginning of every translated program: vector types, and mathematics on them.
+   All of it obeys IEEE 754, so that NaN and infinities arise and spread as in XLA's programs. */
 #if defined(__AVX512F__)
 #define W 16
 #elif defined(__AVX__)
@@ -313,4 +308,3 @@ template <class T> INLINE void threefry(T a, T b, T x, T y, T *high, T *low) {
     x = x + keys[(i + 1) % 3]; y = y + keys[(i + 2) % 3] + (unsigned)(i + 1);
   }
   *high = x; *low = y; }
-"""
