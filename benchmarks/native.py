@@ -52,7 +52,7 @@ SYSTEMS = {
     "quadrotor": (quadrotor, 8192),
     "balance": ("specs.cartpole", 8192),
     "ice": ("specs.lane_keeping", 8192),
-    "planned": ("specs.sway", 8192),
+    "open_loop": ("specs.sway", 8192),
     "at1": ("specs.arch.automatic_transmission", 2048),
     "sc": ("specs.arch.steam_condenser", 1024),
     "cc1": ("specs.arch.chasing_cars", 1024),

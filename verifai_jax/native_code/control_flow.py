@@ -66,6 +66,10 @@ class Carry:
             assert isinstance(mine, Memory)
             if isinstance(other, Memory) and other.name == mine.name and not other.offset:
                 continue
+            if isinstance(other, Memory) and not memory.uniform:
+                _store(self.t, memory, other)
+                moved.append((mine, memory))
+                continue
             for i, each in enumerate(elements(other).ravel()):
                 if memory.uniform:
                     code.piece.after.append(f"{memory.at(i)} = {each.text};")

@@ -87,7 +87,7 @@ def _strides(shape: Sequence[int]) -> list[int]:
 def _window(t: Translator, array: Value, starts: list[Element], sizes: Sequence[int]) -> Elements:
     strides = _strides(array.shape)
     out = np.empty(sizes, object)
-    if any(start.value is None for start in starts):
+    if array.size > CHAIN and any(start.value is None for start in starts):
         array = t.in_memory(array)
     for place in np.ndindex(out.shape):
         base = sum(i * s for i, s in zip(place, strides, strict=True))
@@ -131,7 +131,7 @@ def _gather(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     kept = [axis for axis in range(len(array.shape)) if axis not in numbers.collapsed_slice_dims]
     out = np.empty(shape, object)
     rows: dict[tuple[int, ...], tuple[list[Element], Element]] = {}
-    if not all(each.value is not None for each in indices.ravel()):
+    if array.size > CHAIN and any(each.value is None for each in indices.ravel()):
         array = t.in_memory(array)
     for place in np.ndindex(shape):
         batch = tuple(i for axis, i in enumerate(place) if axis not in numbers.offset_dims)

@@ -57,10 +57,9 @@ INLINE int filled(float, int x) { return x; }
 INLINE F filled(F, float x) { return wide(x); }
 INLINE float filled(float, float x) { return x; }
 template <class T> INLINE auto to_whole(T x) -> decltype(truncated(x)) {
-  auto inside = truth(x >= -2147483648.f) & truth(x < 2147483648.f);
-  auto r = truncated(choose(inside, x, filled(x, 0.f)));
-  r = choose(truth(x >= 2147483648.f), filled(x, 2147483647), r);
-  return choose(truth(x < -2147483648.f), filled(x, -2147483647 - 1), r);
+  /* What is too small is the smallest number already, on x86; elsewhere all of it is as here. */
+  auto r = choose(truth(x >= 2147483648.f), filled(x, 2147483647), truncated(x));
+  return choose(truth(x != x), filled(x, 0), r);
 }
 INLINE U to_natural(F x) { U r; for (int l = 0; l < W; l++)
   r[l] = x[l] > 0 ? (x[l] < 4294967296.f ? (unsigned)x[l] : 4294967295u) : 0u; return r; }
@@ -99,6 +98,10 @@ template <class T> INLINE T rounded_away(T x) {
   T a = absolute(x), r = rounded_down(a);
   r = choose(truth(a - r >= 0.5f), r + 1.f, r);
   return choose(truth(a < 8388608.f), with_sign(r, x), x); }
+/* x / y with the reciprocal of y: rounded as the division is, but for numbers near the largest. */
+INLINE F divided(F x, F y, F reciprocal) {
+  F q = x * reciprocal, better = q + (x - q * y) * reciprocal;
+  return choose(better == better, better, q); }
 INLINE float root(float x) { return __builtin_sqrtf(x); }
 INLINE F root(F x) {
   F r; float *to = (float *)&r; const float *from = (const float *)&x;

@@ -1,13 +1,15 @@
 """Sums, products and the like over the elements of arrays, and matrix products."""
 
 import itertools
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
-from verifai_jax.native_code.translation import Translator, rule
+from verifai_jax.native_code.translation import SINGLE, Translator, rule
 from verifai_jax.native_code.values import (
     Element,
+    Elements,
     Equation,
     Memory,
     Untranslatable,
@@ -18,6 +20,8 @@ from verifai_jax.native_code.values import (
     kind_of,
 )
 
+SIDE_BY_SIDE = 4
+"""Sums that a loop makes at the same time, since each addition waits for the one before."""
 PRODUCTS = 512
 """Products up to which a matrix product is written out: more make a compiler slow."""
 
@@ -34,9 +38,18 @@ _JOINED = {
 
 @rule(*_JOINED)
 def _reduce(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
-    array, axes = elements(inputs[0]), tuple(step.params["axes"])
+    value, axes = inputs[0], tuple(sorted(step.params["axes"]))
     name, form = _JOINED[step.primitive.name], step.outvars[0].aval
     kind = kind_of(form.dtype)
+    if isinstance(value, Memory) and value.size > SINGLE >= math.prod(form.shape):
+        ndim = len(value.shape)
+        count = value.size // max(math.prod(form.shape), 1)
+        many = count > SIDE_BY_SIDE
+        if many and axes == tuple(range(ndim - len(axes), ndim)):
+            return [_in_loops(t, name, value, form.shape, count, count, 1)]
+        if many and axes == tuple(range(len(axes))):
+            return [_in_loops(t, name, value, form.shape, count, 1, value.size // count)]
+    array = elements(value)
     rest = [axis for axis in range(array.ndim) if axis not in axes]
     rows = array.transpose(*rest, *axes).reshape(*form.shape, -1)
     out = np.empty(form.shape, object)
@@ -49,6 +62,28 @@ def _reduce(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
             parts = [constant(neutral[name], kind)]
         out[place] = joined(t, name, parts, kind)
     return [out]
+
+
+def _in_loops(
+    t: Translator, name: str, value: Memory, shape: tuple[int, ...], count: int, one: int, by: int
+) -> Elements:
+    """Join `count` elements that are `by` apart, from each of those that are `one` apart."""
+    out = np.empty(math.prod(shape), object)
+    for number in range(len(out)):
+        first = number * one
+        parts = [t.code.fresh(value.kind, value.uniform) for _ in range(SIDE_BY_SIDE)]
+        i = t.code.name("i")
+        lines = []
+        for j, part in enumerate(parts):
+            lines.append(f"{part.text} = {value.at(first + j * by)};")
+        lines.append(f"for (int {i} = {SIDE_BY_SIDE}; {i} < {count}; {i} += {SIDE_BY_SIDE}) {{")
+        for j, part in enumerate(parts):
+            at = Element(value.at(f"{first} + ({i} + {j}) * {by}"), value.kind, value.uniform)
+            line = f"{part.text} = {t.text(name, {}, [part, at], value.kind)};"
+            lines.append(line if j == 0 else f"if ({i} + {j} < {count}) {line}")
+        t.line(" ".join([*lines, "}"]), value.uniform)
+        out[number] = joined(t, name, parts, value.kind)
+    return out.reshape(shape)
 
 
 def joined(t: Translator, name: str, parts: list[Element], kind: str) -> Element:

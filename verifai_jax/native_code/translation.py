@@ -6,6 +6,7 @@ What moves elements of arrays is done here; only what computes with them becomes
 are single variables, large ones lie in memory and are computed in loops.
 """
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 
 import jax
@@ -34,6 +35,8 @@ from verifai_jax.native_code.values import (
     same,
 )
 
+LONG = 300
+"""Characters of an expression up to which it is computed where it is used."""
 SINGLE = 32
 """Elements of an array up to which each is a variable of its own."""
 
@@ -58,6 +61,7 @@ class Translator:
 
     def __init__(self) -> None:
         self.code = Code()
+        self._once = False
 
     def program(
         self, program: Program, constants: Sequence[Array], inputs: Sequence[Value]
@@ -76,8 +80,13 @@ class Translator:
                 return self.constant(each.val, each.aval)
             return values[each]
 
+        used = Counter(each for step in program.eqns for each in map(id, step.invars))
+        used.update(map(id, program.outvars))
         for step in program.eqns:
-            results = self.step(step, [read(each) for each in step.invars])
+            operands = [read(each) for each in step.invars]
+            # What several steps use is stored; the others are computed where they are used.
+            self._once = all(used[id(each)] <= 1 for each in step.outvars)
+            results = self.step(step, operands)
             values.update(zip(step.outvars, results, strict=True))
         return [read(each) for each in program.outvars]
 
@@ -126,17 +135,22 @@ class Translator:
                 some = [v if isinstance(v, Element) else v[i] for v in arrays]
                 out[i] = self.compute(name, params, some, kind)
             return out.reshape(shape)
-        flat = [v if isinstance(v, Element) else self.in_memory(v) for v in flat]
+        flat = [v if isinstance(v, Element) else self.flat(v) for v in flat]
         uniform = all(v.uniform for v in flat)
-        result = self.code.memory(shape, kind, uniform)
-        index = self.code.name("i")
-        some = [
-            v if isinstance(v, Element) else Element(v.at(index), v.kind, v.uniform) for v in flat
-        ]
-        text = self.text(name, params, some, kind)
-        line = f"for (int {index} = 0; {index} < {size}; {index}++) {result.at(index)} = {text};"
-        self.line(line, uniform)
-        return result
+
+        def formula(index: str) -> str:
+            some = [
+                v if isinstance(v, Element) else Element(v.at(index), v.kind, v.uniform)
+                for v in flat
+            ]
+            return self.text(name, params, some, kind)
+
+        lazy = Memory("", kind, uniform, shape, formula=formula)
+        return lazy if self._once and len(formula("")) <= LONG else self.in_memory(lazy)
+
+    def flat(self, value: Value) -> Memory:
+        """Return a value as an array whose elements have a C expression by their index."""
+        return value if isinstance(value, Memory) else self.in_memory(value)
 
     def line(self, text: str, uniform: bool = False) -> None:
         """Add a line of code."""
@@ -176,7 +190,7 @@ class Translator:
     def in_memory(self, value: Value) -> Memory:
         """Return a value as an array in memory, its elements one after another."""
         if isinstance(value, Memory):
-            return value
+            return value if value.formula is None else self._stored(value)
         flat = value.ravel()
         kind = flat[0].kind
         if all(each.value is not None for each in flat):
@@ -186,6 +200,14 @@ class Translator:
         for i, each in enumerate(flat):
             self.code.store(memory.at(i), each, memory.uniform)
         return memory
+
+    def _stored(self, value: Memory) -> Memory:
+        """Compute an array into memory."""
+        result = self.code.memory(value.shape, value.kind, value.uniform)
+        i = self.code.name("i")
+        head = f"for (int {i} = 0; {i} < {value.size}; {i}++)"
+        self.line(f"{head} {result.at(i)} = {value.at(i)};", value.uniform)
+        return result
 
     def _operand(self, value: Value, shape: tuple[int, ...]) -> "Element | Value":
         """Return a value in this shape, or the one element that is in all places of it."""

@@ -7,7 +7,7 @@
 What only moves elements, as a transposition does, is then a step of NumPy and no code at all.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -42,6 +42,8 @@ class Memory(NamedTuple):
     - `shape`: of the array.
     - `offset`: C expression of the place of its first element; empty for 0.
     - `values`: of a constant; None for others.
+    - `formula`: C expression of an element by its index, of an array that is not stored but
+      computed where it is used; None for others.
     """
 
     name: str
@@ -50,9 +52,12 @@ class Memory(NamedTuple):
     shape: tuple[int, ...]
     offset: str = ""
     values: np.ndarray | None = None
+    formula: Callable[[str], str] | None = None
 
     def at(self, index: int | str) -> str:
         """Return the C expression of an element, whose index may be one too."""
+        if self.formula is not None:
+            return f"({self.formula(f'({index})')})"
         index = f"{self.offset} + {index}" if self.offset else f"{index}"
         return f"{self.name}[{index}]" if self.uniform else f"{self.name}[{index}][k]"
 
