@@ -296,7 +296,8 @@ class _Program:
                 raise Unavailable("its results differ from those of XLA by more than rounding")
             (form,) = program.out_avals
             with in_precision(self.engine.precision):
-                library = load(name, form.shape[0], lambda: translate(program))
+                source = lambda: translate(program)  # noqa: E731
+                library = load(name, form.shape[0], source, quickly=self.engine.gradient)
             self.approved = bool(agrees)
             return name, library
         except Untranslatable as error:

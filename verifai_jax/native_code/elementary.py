@@ -64,7 +64,7 @@ FUNCTIONS = {
     "pow": "power({}, {})",
     "nextafter": "next_number({}, {})",
     "is_finite": "finite({})",
-    "clamp": "lesser(greater({1}, {0}), {2})",
+    "clamp": "lesser({2}, greater({0}, {1}))",
 }
 """Functions of the prelude, whose operands are all vectors or all single numbers."""
 

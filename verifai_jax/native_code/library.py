@@ -36,9 +36,9 @@ FLAGS = (
     "-fno-math-errno", "-fno-trapping-math", "-fno-exceptions", "-fno-rtti",
 )  # fmt: skip
 """Not `-ffast-math`, which takes NaN for a number. XLA contracts to fused operations, too."""
-LONG = 1500
-"""Lines of a program from which on it is compiled with -O1: in half the time, and a twentieth
-slower (a reverse sweep of a cart-pole); shorter ones gain a seventh to a third by -O2."""
+LONG = 8000
+"""Lines of a program from which on it is compiled with -O1: in half the time, and slower by a
+twentieth (a reverse sweep) to a third (a rollout)."""
 MAX_SECONDS = 60.0
 """Seconds that a compiler may take; the programs of the shipped problems take up to two."""
 PARTS = 4
@@ -125,8 +125,15 @@ def library_name(fingerprint: str | None) -> str:
     return name
 
 
-def load(name: str, count: int, translate: Callable[[], str]) -> Library:
+def load(name: str, count: int, translate: Callable[[], str], quickly: bool = False) -> Library:
     """Return the library of this name, compiled where there is none.
+
+    **Arguments:**
+
+    - `name`: as `library_name` gives it.
+    - `count`: numbers that a simulation returns.
+    - `translate`: makes the source.
+    - `quickly`: whether to compile in half the time, for reverse sweeps.
 
     **Raises:** `Unavailable` where it cannot be compiled, kept or loaded.
     """
@@ -134,7 +141,7 @@ def load(name: str, count: int, translate: Callable[[], str]) -> Library:
         folder = _folder()
         path = next(filter(_is_whole, sorted(folder.glob(f"{name}-*.so"))), None)
         if path is None:
-            path = _compile(folder, name, translate())
+            path = _compile(folder, name, translate(), quickly)
         return Library(path, count)
     except OSError as error:
         raise Unavailable(f"the cache of compiled programs cannot be used: {error}") from error
@@ -180,13 +187,13 @@ def _checksum(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()[:32]
 
 
-def _compile(folder: Path, name: str, source: str) -> Path:
+def _compile(folder: Path, name: str, source: str, quickly: bool) -> Path:
     compiler = _compiler()
     assert compiler is not None
     with tempfile.TemporaryDirectory(dir=folder) as place:
         code, made = Path(place) / "program.cpp", Path(place) / "program.so"
         code.write_text(source)
-        effort = "-O1" if source.count("\n") > LONG else "-O2"
+        effort = "-O1" if quickly or source.count("\n") > LONG else "-O2"
         command = [str(compiler), effort, *FLAGS, str(code), "-o", str(made), "-lm"]
         try:
             done = subprocess.run(

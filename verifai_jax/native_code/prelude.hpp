@@ -44,7 +44,11 @@ INLINE F choose(I p, F a, F b) { return p ? a : b; }
 INLINE I choose(I p, I a, I b) { return p ? a : b; }
 INLINE U choose(I p, U a, U b) { return p ? a : b; }
 template <class T> INLINE T choose(int p, T a, T b) { return p ? a : b; }
+#if defined(__AVX512F__)
+INLINE bool any(I p) { return __builtin_ia32_ptestmd512(p, p, (unsigned short)-1) != 0; }
+#else
 INLINE bool any(I p) { int r = 0; for (int l = 0; l < W; l++) r |= p[l]; return r != 0; }
+#endif
 
 INLINE F to_real(I x) { return __builtin_convertvector(x, F); }
 INLINE F to_real(U x) { return __builtin_convertvector(x, F); }
@@ -98,6 +102,17 @@ template <class T> INLINE T rounded_away(T x) {
   T a = absolute(x), r = rounded_down(a);
   r = choose(truth(a - r >= 0.5f), r + 1.f, r);
   return choose(truth(a < 8388608.f), with_sign(r, x), x); }
+/* x / y of ordinary numbers; where an instruction estimates reciprocals it is refined instead, which
+   takes a third of the time. */
+#if defined(__AVX512F__)
+INLINE F ordinary_ratio(F x, F y) {
+  F r = __builtin_ia32_rcp14ps512_mask(y, F(), (unsigned short)-1);
+  r = r + r * (1.f - y * r);
+  F q = x * r; return q + (x - q * y) * r; }
+#else
+INLINE F ordinary_ratio(F x, F y) { return x / y; }
+#endif
+INLINE float ordinary_ratio(float x, float y) { return x / y; }
 /* x / y with the reciprocal of y: rounded as the division is, but for numbers near the largest. */
 INLINE F divided(F x, F y, F reciprocal) {
   F q = x * reciprocal, better = q + (x - q * y) * reciprocal;
@@ -153,15 +168,15 @@ template <class T> INLINE T exponential1(T x) {
   return choose(truth(absolute(x) < 0.35f), p, choose(truth(x > 88.f) , exponential(x),
     e * e - 1.f)); }
 template <class T> INLINE T hyperbolic(T x) {
-  T c = lesser(greater(x, filled(x, -7.90531110763549805f)), filled(x, 7.90531110763549805f));
+  T end = filled(x, 7.90531110763549805f), c = choose(truth(x > end), end, x);
+  c = choose(truth(c < -end), -end, c);
   T s = c * c, p = filled(x, -2.76076847742355e-16f), q = filled(x, 1.19825839466702e-06f);
   p = p * s + 2.00018790482477e-13f; p = p * s - 8.60467152213735e-11f;
   p = p * s + 5.12229709037114e-08f; p = p * s + 1.48572235717979e-05f;
   p = p * s + 6.37261928875436e-04f; p = p * s + 4.89352455891786e-03f;
   q = q * s + 1.18534705686654e-04f; q = q * s + 2.26843463243900e-03f;
   q = q * s + 4.89352518554385e-03f;
-  T y = choose(truth(absolute(x) < 0.0004f), x, c * p / q);
-  return choose(truth(absolute(x) >= 20.f), with_sign(filled(x, 1.f), x), y); }
+  return choose(truth(absolute(x) < 0.0004f), x, ordinary_ratio(c * p, q)); }
 template <class T> INLINE T inverse_error(T x) {
   T w = -logarithm1(-x * x), a = w - 2.5f, b = root(w) - 3.f;
   T p = filled(x, 2.81022636e-08f), q = filled(x, -0.000200214257f);
@@ -203,7 +218,9 @@ template <class T> INLINE T arctangent(T x) {
   auto far = truth(a > 2.414213562373095f), middle = truth(a > 0.4142135623730950f);
   T y = choose(far, filled(x, 1.5707963267948966f),
     choose(middle, filled(x, 0.7853981633974483f), filled(x, 0.f)));
-  T z = choose(far, -1.f / a, choose(middle, (a - 1.f) / (a + 1.f), a)), s = z * z;
+  T one = filled(x, 1.f), z = choose(far, -one, choose(middle, a - 1.f, a));
+  z = z / choose(far, a, choose(middle, a + 1.f, one));
+  T s = z * z;
   T p = s * 8.05374449538e-2f - 1.38776856032e-1f;
   p = p * s + 1.99777106478e-1f; p = p * s - 3.33329491539e-1f;
   return with_sign(y + (p * s * z + z), x); }

@@ -172,6 +172,9 @@ class Translator:
             return operands[0]
         if name == "convert_element_type" and operands[0].kind == kind:
             return operands[0]
+        if name in ("max", "min") and operands[1].value is not None:
+            # A constant that comes first is no NaN, which the compiler then need not look for.
+            operands = operands[::-1]
         text = self.text(name, params, operands, kind)
         return self.code.define(text, kind, all(each.uniform for each in operands))
 
