@@ -93,8 +93,9 @@ def compared(problem, batch, rounds, gradient):
     far = np.nanquantile(np.abs(ours.rho - theirs.rho), 0.999)
     more = ""
     if gradient:
-        size = np.abs(theirs.gradient).max(1, keepdims=True) + 1e-6
-        far_off = np.nanquantile(np.abs(ours.gradient - theirs.gradient) / size, 0.99)
+        mine, other = np.asarray(ours.gradient), np.asarray(theirs.gradient)
+        size = np.abs(other).max(1, keepdims=True) + 1e-6
+        far_off = np.nanquantile(np.abs(mine - other) / size, 0.99)
         more = f", gradients within {far_off:z.0e} in 99 %"
     print(
         f"  {what:<9}native {speeds[0]:>11,.0f}/s  xla {speeds[1]:>11,.0f}/s  "
@@ -145,7 +146,7 @@ def by_hand(rounds, n=131_072):
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("systems", nargs="*", choices=[*SYSTEMS, []], help="all when left out")
     parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args()

@@ -97,14 +97,14 @@ def _split(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
 def _pad(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     array, filler = elements(inputs[0]), elements(inputs[1]).item()
     out = filled(step.outvars[0].aval.shape, filler)
-    places = []
+    cells = []
     for size, total, (low, _, inside) in zip(
         array.shape, out.shape, step.params["padding_config"], strict=True
     ):
         at = low + np.arange(size) * (inside + 1)
-        places.append((at, (at >= 0) & (at < total)))
-    kept = array[np.ix_(*[np.flatnonzero(good) for _, good in places])] if places else array
-    out[np.ix_(*[at[good] for at, good in places])] = kept
+        cells.append((at, (at >= 0) & (at < total)))
+    kept = array[np.ix_(*[np.flatnonzero(good) for _, good in cells])] if cells else array
+    out[np.ix_(*[at[good] for at, good in cells])] = kept
     return [out]
 
 

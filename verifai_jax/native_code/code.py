@@ -13,7 +13,7 @@ import numpy as np
 from verifai_jax.native_code.values import TYPES, Element, Memory, Untranslatable, constant
 
 MAX_LINES = 30_000
-"""Lines of a program at most; a compiler takes seconds for so many."""
+"""The maximum number of lines of a program; a compiler takes seconds for that many."""
 STACK = 4096
 """Numbers of a simulation in arrays on the stack at most; others are in the thread's memory."""
 _DIVISION = re.compile(r"F (v\d+) = (\S+) / (v\d+);")

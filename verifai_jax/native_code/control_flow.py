@@ -48,8 +48,8 @@ class Carry:
 
     def _variables(self, shape: tuple[int, ...], kind: str, uniform: bool) -> np.ndarray:
         out = np.empty(shape, object)
-        for place in np.ndindex(shape):
-            out[place] = self.t.code.keep(kind, uniform)
+        for cell in np.ndindex(shape):
+            out[cell] = self.t.code.keep(kind, uniform)
         return out
 
     def assign(self, values: list[Value]) -> None:

@@ -1,7 +1,8 @@
 """Operations on single numbers: the C expression of each primitive of JAX.
 
-A template has a place for each operand. Those of `OPERATORS` are C operators, which mix a vector
-and a single number; those of `FUNCTIONS` are functions of the prelude, whose operands are alike.
+A template has a pair of braces for each operand. Those of `OPERATORS` are C operators, which mix a
+vector and a single number; those of `FUNCTIONS` are functions of the prelude, whose operands are
+alike.
 """
 
 from collections.abc import Callable

@@ -45,10 +45,10 @@ def element_at(
         if not is_table(array):
             return _chosen(t, elements(array).ravel()[fixed::stride], one)
     memory = t.in_memory(array)
-    place = " + ".join([str(fixed), *(f"{i.text} * {s}" for i, s in moving)])
+    cell = " + ".join([str(fixed), *(f"{i.text} * {s}" for i, s in moving)])
     if all(i.uniform for i, _ in moving):
-        return t.code.define(memory.at(f"({place})"), memory.kind, memory.uniform)
-    vector = t.code.define(place, "i", False)
+        return t.code.define(memory.at(f"({cell})"), memory.kind, memory.uniform)
+    vector = t.code.define(cell, "i", False)
     begin = f"{memory.name} + {memory.offset}" if memory.offset else memory.name
     size = str(memory.size) if memory.uniform else "k"
     return t.code.define(f"looked_up({begin}, {size}, {vector.text})", memory.kind, False)
@@ -89,9 +89,9 @@ def _window(t: Translator, array: Value, starts: list[Element], sizes: Sequence[
     out = np.empty(sizes, object)
     if array.size > CHAIN and any(start.value is None for start in starts):
         array = t.in_memory(array)
-    for place in np.ndindex(out.shape):
-        base = sum(i * s for i, s in zip(place, strides, strict=True))
-        out[place] = element_at(t, array, strides, starts, base)
+    for cell in np.ndindex(out.shape):
+        base = sum(i * s for i, s in zip(cell, strides, strict=True))
+        out[cell] = element_at(t, array, strides, starts, base)
     return out
 
 
@@ -104,17 +104,17 @@ def _dynamic_update_slice(t: Translator, step: Equation, inputs: list[Value]) ->
         for v, n, size in zip(inputs[2:], array.shape, update.shape, strict=True)
     ]
     out: Elements = np.array(array)
-    for place in np.ndindex(array.shape):
+    for cell in np.ndindex(array.shape):
         for inside in np.ndindex(update.shape):
             hits = constant(True, "b")
-            for start, here, i in zip(starts, place, inside, strict=True):
+            for start, here, i in zip(starts, cell, inside, strict=True):
                 if here < i:
                     hits = constant(False, "b")
                     break
                 equal = t.compute("eq", {}, [start, constant(here - i, start.kind)], "b")
                 hits = t.compute("and", {}, [hits, equal], "b")
             if hits.value is None or hits.value:
-                out[place] = t.compute("select_n", {}, [hits, out[place], update[inside]], kind)
+                out[cell] = t.compute("select_n", {}, [hits, out[cell], update[inside]], kind)
     return [out]
 
 
@@ -133,9 +133,9 @@ def _gather(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     rows: dict[tuple[int, ...], tuple[list[Element], Element]] = {}
     if array.size > CHAIN and any(each.value is None for each in indices.ravel()):
         array = t.in_memory(array)
-    for place in np.ndindex(shape):
-        batch = tuple(i for axis, i in enumerate(place) if axis not in numbers.offset_dims)
-        offset = [place[axis] for axis in numbers.offset_dims]
+    for cell in np.ndindex(shape):
+        batch = tuple(i for axis, i in enumerate(cell) if axis not in numbers.offset_dims)
+        offset = [cell[axis] for axis in numbers.offset_dims]
         if batch not in rows:
             starts: list[Element] = [constant(0, "i")] * len(array.shape)
             inside = constant(True, "b")
@@ -154,7 +154,7 @@ def _gather(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
             if filler is None:
                 filler = {"f": np.nan, "i": -(2**31), "u": 2**32 - 1, "b": True}[kind]
             value = t.compute("select_n", {}, [inside, constant(filler, kind), value], kind)
-        out[place] = value
+        out[cell] = value
     return [out]
 
 
@@ -173,10 +173,10 @@ def _scatter(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     windows = numbers.update_window_dims
     kept = [axis for axis in range(array.ndim) if axis not in numbers.inserted_window_dims]
     out: Elements = np.array(array)
-    for place in np.ndindex(updates.shape):
-        batch = tuple(i for axis, i in enumerate(place) if axis not in windows)
+    for cell in np.ndindex(updates.shape):
+        batch = tuple(i for axis, i in enumerate(cell) if axis not in windows)
         offset = np.zeros(array.ndim, int)
-        offset[kept] = [place[axis] for axis in windows]
+        offset[kept] = [cell[axis] for axis in windows]
         size = np.ones(array.ndim, int)
         size[kept] = [updates.shape[axis] for axis in windows]
         starts: list[Element] = [constant(0, "i")] * array.ndim
@@ -194,7 +194,7 @@ def _scatter(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
                 equal = t.compute("eq", {}, [start, constant(b, start.kind)], "b")
                 hits = t.compute("and", {}, [hits, equal], "b")
             if hits.value is None or hits.value:
-                old, new = out[target], updates[place]
+                old, new = out[target], updates[cell]
                 new = t.compute(_SCATTERED[joins], {}, [old, new], kind) if joins else new
                 out[target] = t.compute("select_n", {}, [hits, old, new], kind)
     return [out]

@@ -190,14 +190,14 @@ def _checksum(data: bytes) -> str:
 def _compile(folder: Path, name: str, source: str, quickly: bool) -> Path:
     compiler = _compiler()
     assert compiler is not None
-    with tempfile.TemporaryDirectory(dir=folder) as place:
-        code, made = Path(place) / "program.cpp", Path(place) / "program.so"
+    with tempfile.TemporaryDirectory(dir=folder) as cell:
+        code, made = Path(cell) / "program.cpp", Path(cell) / "program.so"
         code.write_text(source)
         effort = "-O1" if quickly or source.count("\n") > LONG else "-O2"
         command = [str(compiler), effort, *FLAGS, str(code), "-o", str(made), "-lm"]
         try:
             done = subprocess.run(
-                command, capture_output=True, timeout=MAX_SECONDS, check=False, cwd=place,
+                command, capture_output=True, timeout=MAX_SECONDS, check=False, cwd=cell,
                 stdin=subprocess.DEVNULL,
             )  # fmt: skip
         except subprocess.TimeoutExpired:

@@ -41,8 +41,8 @@ def _fold_in(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     keys, data = elements(inputs[0]), inputs[1]
     words = elements(t.elementwise("convert_element_type", {}, [data], "u", data.shape))
     out = np.empty(keys.shape, object)
-    for place in np.ndindex(keys.shape):
-        out[place] = _encrypted(t, keys[place], constant(0, "u"), words[place])
+    for cell in np.ndindex(keys.shape):
+        out[cell] = _encrypted(t, keys[cell], constant(0, "u"), words[cell])
     return [out]
 
 
@@ -57,8 +57,8 @@ def _bits(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
         raise Untranslatable("random bits of another width than 32")
     keys = _counted(t, elements(inputs[0]), step.params["shape"])
     out = np.empty(keys.shape, object)
-    for place in np.ndindex(keys.shape):
-        out[place] = t.compute("xor", {}, list(keys[place]), "u")
+    for cell in np.ndindex(keys.shape):
+        out[cell] = t.compute("xor", {}, list(keys[cell]), "u")
     return [out]
 
 
@@ -68,8 +68,8 @@ def _threefry(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]
     four: Elements = [np.broadcast_to(elements(v), shape) for v in inputs]
     a, b, x, y = four
     out = np.empty(shape, object)
-    for place in np.ndindex(shape):
-        out[place] = _encrypted(t, (a[place], b[place]), x[place], y[place])
+    for cell in np.ndindex(shape):
+        out[cell] = _encrypted(t, (a[cell], b[cell]), x[cell], y[cell])
     return [words_of(out, 0), words_of(out, 1)]
 
 
@@ -78,9 +78,9 @@ def _counted(t: Translator, keys: Elements, shape: Sequence[int]) -> Elements:
         raise Untranslatable("random keys with jax_threefry_partitionable=False")
     count = int(np.prod(shape, dtype=np.int64))
     out = np.empty((*keys.shape, count), object)
-    for place in np.ndindex(keys.shape):
+    for cell in np.ndindex(keys.shape):
         for i in range(count):
-            out[(*place, i)] = _encrypted(t, keys[place], constant(0, "u"), constant(i, "u"))
+            out[(*cell, i)] = _encrypted(t, keys[cell], constant(0, "u"), constant(i, "u"))
     return out.reshape((*keys.shape, *shape))
 
 

@@ -54,13 +54,13 @@ def _reduce(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     rows = array.transpose(*rest, *axes).reshape(*form.shape, -1)
     out = np.empty(form.shape, object)
     neutral = {"add": 0, "mul": 1, "and": True, "or": False, "xor": False}
-    for place in np.ndindex(form.shape):
-        parts = list(rows[place])
+    for cell in np.ndindex(form.shape):
+        parts = list(rows[cell])
         if not parts:
             if name not in neutral:
                 raise Untranslatable(f"{step.primitive.name} of nothing")
             parts = [constant(neutral[name], kind)]
-        out[place] = joined(t, name, parts, kind)
+        out[cell] = joined(t, name, parts, kind)
     return [out]
 
 
@@ -102,9 +102,9 @@ def _cumulative(t: Translator, step: Equation, inputs: list[Value]) -> list[Valu
     rows = np.moveaxis(elements(inputs[0]), axis, 0).copy()
     order = range(len(rows))[:: -1 if step.params["reverse"] else 1]
     for before, i in itertools.pairwise(order):
-        for place in np.ndindex(rows.shape[1:]):
-            pair = [rows[(before, *place)], rows[(i, *place)]]
-            rows[(i, *place)] = t.compute(name, {}, pair, kind)
+        for cell in np.ndindex(rows.shape[1:]):
+            pair = [rows[(before, *cell)], rows[(i, *cell)]]
+            rows[(i, *cell)] = t.compute(name, {}, pair, kind)
     return [np.moveaxis(rows, 0, axis)]
 
 
@@ -117,10 +117,10 @@ def _arg(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
         "gt" if "max" in step.primitive.name else "lt",
     )
     out = np.empty(rows.shape[1:], object)
-    for place in np.ndindex(out.shape):
-        best, at = rows[(0, *place)], constant(0, kind)
+    for cell in np.ndindex(out.shape):
+        best, at = rows[(0, *cell)], constant(0, kind)
         for i in range(1, len(rows)):
-            other = rows[(i, *place)]
+            other = rows[(i, *cell)]
             wins = t.compute(better, {}, [other, best], "b")
             if other.kind == "f":
                 # The first NaN wins.
@@ -131,7 +131,7 @@ def _arg(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
                 wins = t.compute("and", {}, [wins, good], "b")
             best = t.compute("select_n", {}, [wins, best, other], other.kind)
             at = t.compute("select_n", {}, [wins, at, constant(i, kind)], kind)
-        out[place] = at
+        out[cell] = at
     return [out]
 
 
@@ -211,8 +211,8 @@ def _large_dot(
             lines.append(f"x{j} += {other} * y;")
         lines.append("}")
         for j in range(size):
-            place = at(f"{o} + {j}", i) if swapped else at(i, f"{o} + {j}")
-            lines.append(f"{out.at(f'({place})')} = x{j};")
+            cell = at(f"{o} + {j}", i) if swapped else at(i, f"{o} + {j}")
+            lines.append(f"{out.at(f'({cell})')} = x{j};")
         lines.append("}")
     lines.append("}")
     t.line(" ".join(lines), uniform)

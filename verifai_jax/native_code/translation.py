@@ -111,8 +111,8 @@ class Translator:
         array: Elements = np.asarray(value, DTYPES[kind])
         if array.size <= SINGLE:
             out = np.empty(array.shape, object)
-            for place in np.ndindex(array.shape):
-                out[place] = constant(array[place], kind)
+            for cell in np.ndindex(array.shape):
+                out[cell] = constant(array[cell], kind)
             return out
         if np.all(array == array.ravel()[0]):
             return filled(array.shape, constant(array.ravel()[0], kind))
@@ -213,7 +213,7 @@ class Translator:
         return result
 
     def _operand(self, value: Value, shape: tuple[int, ...]) -> "Element | Value":
-        """Return a value in this shape, or the one element that is in all places of it."""
+        """Return a value in this shape, or its element if all are the same."""
         if isinstance(value, Memory) and value.shape == shape and shape:
             return value
         array = elements(value)
@@ -244,16 +244,16 @@ class Translator:
 def words_of(keys: Elements, word: int) -> Elements:
     """Return the first or the second word of each random key."""
     out = np.empty(keys.shape, object)
-    for place in np.ndindex(keys.shape):
-        out[place] = keys[place][word]
+    for cell in np.ndindex(keys.shape):
+        out[cell] = keys[cell][word]
     return out
 
 
 def pairs(high: Elements, low: Elements) -> Elements:
     """Return the random keys of these words."""
     out = np.empty(high.shape, object)
-    for place in np.ndindex(high.shape):
-        out[place] = (high[place], low[place])
+    for cell in np.ndindex(high.shape):
+        out[cell] = (high[cell], low[cell])
     return out
 
 

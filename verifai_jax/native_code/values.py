@@ -40,7 +40,7 @@ class Memory(NamedTuple):
     - `name`: of the C array.
     - `kind`, `uniform`: as of an element.
     - `shape`: of the array.
-    - `offset`: C expression of the place of its first element; empty for 0.
+    - `offset`: C expression of the index of its first element; empty for 0.
     - `values`: of a constant; None for others.
     - `formula`: C expression of an element by its index, of an array that is not stored but
       computed where it is used; None for others.
@@ -138,7 +138,7 @@ def elements(value: Value) -> Elements:
 
 
 def filled(shape: tuple[int, ...], element: Element | tuple[Element, Element]) -> Elements:
-    """Return an array of one element, in all places."""
+    """Return an array whose elements are all the same one."""
     out = np.empty(shape, object)
     flat = out.reshape(-1)
     for i in range(flat.size):
@@ -147,7 +147,7 @@ def filled(shape: tuple[int, ...], element: Element | tuple[Element, Element]) -
 
 
 def same(value: Elements) -> Any:
-    """Return the element that is in all places of an array; None where they differ."""
+    """Return the element that all elements of an array are; None if they differ."""
     flat = value.ravel()
     first = flat[0] if flat.size else None
     return first if all(each is first for each in flat) else None
