@@ -5,7 +5,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from verifai_jax.core.steps import programs_in
+from verifai_jax.core.fingerprint import programs_in
 from verifai_jax.native_code.translation import SINGLE, Translator, pairs, rule, words_of
 from verifai_jax.native_code.values import (
     KEY,

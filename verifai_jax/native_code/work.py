@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from verifai_jax.core.steps import programs_in
+from verifai_jax.core.fingerprint import programs_in
 from verifai_jax.native_code.values import Program
 
 
