@@ -12,6 +12,7 @@ from verifai_jax.cli.arguments import (
     BACKEND,
     BATCH,
     CLUSTER,
+    ENGINE,
     EVEN_IF_CHANGED,
     KEEP_GOING,
     MAX_SECONDS,
@@ -77,6 +78,7 @@ _PARTS = (
 @EVEN_IF_CHANGED
 @PRECISION
 @BACKEND
+@ENGINE
 @CLUSTER
 @click.option(
     "--shard",
