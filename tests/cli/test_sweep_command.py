@@ -11,6 +11,7 @@ from drifting import quick_certificates
 
 from verifai_jax.cli.main import main
 from verifai_jax.core.cache import Cache
+from verifai_jax.core.cache import Cache
 from verifai_jax.core.targets import TargetError, definitions, load_target
 from verifai_jax.sweeps import Study
 from verifai_jax.sweeps import _sweep as driver
@@ -96,8 +97,6 @@ class _Stopping:
         self.after = after
 
     def __call__(self, path):
-        from verifai_jax.core.cache import Cache
-
         cache, put = Cache(path), Cache.put
 
         def stopped(work):
@@ -107,6 +106,16 @@ class _Stopping:
 
         cache.put = stopped
         return cache
+
+
+def test_an_interruption_outside_of_the_work_prints_the_command_too(call, monkeypatch):
+    def interrupted(study, *, folder, **_):
+        with Cache(folder):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(driver, "sweep", interrupted)
+    output = call("specs/drift.py:safe", *SMALL, "--folder", "part", code=130)
+    assert "  resume       verifai-jax sweep --resume part\n" in output
 
 
 def test_errors_in_one_line(call, tmp_path):
