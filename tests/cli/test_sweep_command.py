@@ -11,7 +11,6 @@ from drifting import quick_certificates
 
 from verifai_jax.cli.main import main
 from verifai_jax.core.cache import Cache
-from verifai_jax.core.cache import Cache
 from verifai_jax.core.targets import TargetError, definitions, load_target
 from verifai_jax.sweeps import Study
 from verifai_jax.sweeps import _sweep as driver
