@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from verifai_jax.cli.json_output import command, give_result
-from verifai_jax.core.whole_files import replacing
+from verifai_jax.core.atomic_files import replacing
 
 FILES = {
     "README.md": "README.md.txt",

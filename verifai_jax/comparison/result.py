@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from jaxtyping import Array, Key
 
 from verifai_jax.core.keys import run_keys, simulation_key
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 from verifai_jax.features import FeatureSpace
@@ -32,7 +32,7 @@ class Compared:
     - `discordant`: the pairs in which only one fails, a row each with the features; `worse` is true
       where it is the candidate. Its index is the number of the pair, of which
       `Comparison.random_key` is the key.
-    - `pairs`: features of all pairs, and `worse` and `better`; None where they were not kept.
+    - `pairs`: features of all pairs, and `worse` and `better`; None if they were not kept.
     """
 
     name: str
@@ -54,8 +54,8 @@ class Compared:
         **Raises:** `ValueError` where there is no such pair.
         """
         rows = self.pairs.assign(violated=self.pairs["worse"]).drop(columns=["worse", "better"])
-        samples = late("verifai_jax.analysis.data.samples", "Samples")
-        return late("verifai_jax.analysis", "rules")(
+        samples = lazy_import("verifai_jax.analysis.data.samples", "Samples")
+        return lazy_import("verifai_jax.analysis", "rules")(
             samples.of(rows, "all", list(self.space.columns), self.space), **options
         )
 
@@ -134,7 +134,7 @@ class Comparison(InNotebook):
 
         **Returns:** the path.
         """
-        return late("verifai_jax.reports", "write_report")(self, path, **options)
+        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
 
     def __str__(self) -> str:
         confidence = self.candidates[0].rates.confidence

@@ -14,8 +14,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.callbacks import Values
-from verifai_jax.core.whole_files import replacing
 
 STEP = "step"
 """Column of the step in a CSV file."""

@@ -26,13 +26,13 @@ GROUPS = 6
 """Groups that failures are divided into at first, at most."""
 HANDED_OUT = 3
 """Simulations of each likeliest failure that are kept for its row and its cause."""
-FEWEST, MOST = 8, 50
+MIN_TIMES, MAX_TIMES = 8, 50
 """Simulations of a point."""
 POINTS = 70
 """Points that are simulated so often, about."""
 OUTWARD = np.array([1.0, 1.15, 1.3, 1.5, 1.8])
 """Factors by which a centre is moved outwards."""
-PLACES = (0.5, 0.25, 0.75)
+FRACTIONS = (0.5, 0.25, 0.75)
 """Places of a path that are simulated, the middle first."""
 AS_OFTEN = 0.7
 """Share of the failures of an end that has to remain all along a path."""
@@ -53,10 +53,10 @@ def divide_by_chance(
     limit_state.budget -= HANDED_OUT * GROUPS
     x = samples.x[samples.failing]
     z = samples.failures[rng.choice(len(x), FOLLOWED, p=x / x.sum())]
-    group = _groups(z, min(GROUPS, max(1, limit_state.left * GROUPS // (FEWEST * POINTS))))
+    group = _groups(z, min(GROUPS, max(1, limit_state.left * GROUPS // (MIN_TIMES * POINTS))))
     middles = [_centre(z, np.flatnonzero(group == k)) for k in range(group.max() + 1)]
     tried = np.concatenate([factor * z[middles] for factor in OUTWARD])
-    times = int(np.clip(limit_state.left // POINTS, FEWEST, MOST))
+    times = int(np.clip(limit_state.left // POINTS, MIN_TIMES, MAX_TIMES))
     region = np.arange(len(middles))
     failing = np.full(len(tried), 0)
     try:
@@ -88,9 +88,9 @@ def divide_by_chance(
     )
 
 
-def _groups(z: Float[np.ndarray, "n d"], most: int) -> Int[np.ndarray, " n"]:
+def _groups(z: Float[np.ndarray, "n d"], max_groups: int) -> Int[np.ndarray, " n"]:
     # As far from one another as can be, so that a small region has a group of its own.
-    start = z[farthest_first(0, lambda row: np.linalg.norm(z - z[row], axis=1), most)]
+    start = z[farthest_first(0, lambda row: np.linalg.norm(z - z[row], axis=1), max_groups)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # About a group that has become empty.
         group = kmeans2(z, start, minit="matrix")[1]
@@ -145,13 +145,13 @@ def _connected(
     j: int,
 ) -> bool:
     """Return whether one of two paths fails all along about as often as its ends."""
-    least = int(min(failing[i], failing[j]))
-    ways = ([path(ends[[i]], ends[[j]], at) for at in PLACES] for path in (straight, arc))
+    lower = int(min(failing[i], failing[j]))
+    ways = ([path(ends[[i]], ends[[j]], at) for at in FRACTIONS] for path in (straight, arc))
     return any(
-        all(_as_often(_count(limit_state, z, times)[0], least, times) for z in way) for way in ways
+        all(_as_often(_count(limit_state, z, times)[0], lower, times) for z in way) for way in ways
     )
 
 
-def _as_often(count: int, least: int, times: int) -> bool:
+def _as_often(count: int, lower: int, times: int) -> bool:
     """Return whether a point may fail about as often as the end that fails less often."""
-    return count >= AS_OFTEN * least or bool(binom.cdf(count, times, least / times) > SURELY_LESS)
+    return count >= AS_OFTEN * lower or bool(binom.cdf(count, times, lower / times) > SURELY_LESS)

@@ -23,11 +23,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.checks import check_count, is_number
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.sources import made_here, sources_of
 from verifai_jax.core.text import one_line
-from verifai_jax.core.whole_files import replacing
 from verifai_jax.rl.task.task import Action, Continuous, Discrete
 
 Layer = tuple[Float[Array | np.ndarray, "... _ _"], Float[Array | np.ndarray, "... _"]]

@@ -87,7 +87,7 @@ class Trainer:
                 f"got {forms[1]}"
             )
         object.__setattr__(self, "algorithms", dict(given))
-        object.__setattr__(self, "steps", _whole_number(self.steps, STEPS))
+        object.__setattr__(self, "steps", _integer(self.steps, STEPS))
         if self.steps < 1:
             raise StudyError(f"steps must be at least 1; got {self.steps}")
 
@@ -130,7 +130,7 @@ class Trainer:
             if name in values and name not in _layers(algorithm)
         }
         if WIDTH in values:
-            width = _whole_number(values[WIDTH], WIDTH)
+            width = _integer(values[WIDTH], WIDTH)
             for name in _layers(algorithm):
                 changes[name] = (width,) * len(getattr(algorithm, name))
         task, fields = self.task, _fields(self.task)
@@ -139,7 +139,7 @@ class Trainer:
             task = dataclasses.replace(task, **swept)  # pyright: ignore[reportArgumentType]
         if changes:
             algorithm = dataclasses.replace(algorithm, **changes)  # pyright: ignore[reportArgumentType]
-        steps = _whole_number(values.get(STEPS, self.steps), STEPS)
+        steps = _integer(values.get(STEPS, self.steps), STEPS)
         return Configuration(task, algorithm, steps, seed)
 
     def algorithm_name(self, values: Mapping[str, Any]) -> str:
@@ -231,7 +231,7 @@ class Trainer:
                 {ALGORITHM: algorithm, name: None}
             ):
                 continue
-            for value, place in probe_values(domain):
+            for value, part in probe_values(domain):
                 refused = None
                 # A value that only some of the others exclude becomes an error of its row.
                 for others in candidates:
@@ -244,7 +244,7 @@ class Trainer:
                         refused = None
                         break
                 if refused is not None:
-                    raise StudyError(f"{name}: {refused}, {place} of {domain!r}") from refused
+                    raise StudyError(f"{name}: {refused}, {part} of {domain!r}") from refused
         for others in candidates:
             try:
                 self.configuration({**others, ALGORITHM: algorithm}).check()
@@ -286,7 +286,7 @@ def _cast(present: object, value: object, name: str) -> object:
             raise ValueError(f"{name} must be True or False; got {value!r}")
         return bool(value)
     if isinstance(present, int):
-        return _whole_number(value, name)
+        return _integer(value, name)
     if isinstance(present, float | np.ndarray | np.generic | jax.Array) and np.ndim(present) == 0:
         if isinstance(value, bool | str) or not isinstance(value, int | float):
             raise ValueError(f"{name} must be a number; got {value!r}")
@@ -296,7 +296,7 @@ def _cast(present: object, value: object, name: str) -> object:
     raise ValueError(f"{name} is no single value and cannot be swept; it is {present!r}")
 
 
-def _whole_number(value: object, name: str) -> int:
+def _integer(value: object, name: str) -> int:
     if not is_number(value) or int(value) != value:
         raise ValueError(f"{name} must be a whole number (DiscreteBox, Categorical); got {value!r}")
     return int(value)

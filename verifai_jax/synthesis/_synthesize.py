@@ -31,7 +31,7 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.max_min import max_min_step
 from verifai_jax.synthesis.adversary import attack
-from verifai_jax.synthesis.fewest_failures import FewestFailures
+from verifai_jax.synthesis.failure_counts import FailureCounts
 from verifai_jax.synthesis.held_out import HeldOut, draw, held_out
 from verifai_jax.synthesis.optimize import (
     Archive,
@@ -108,7 +108,7 @@ def synthesize(
     - `batch`: simulations at once.
     - `max_seconds`: wall-clock seconds, of which a fifth is kept for the check.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-    - the others as in `falsify`.
+    - all other arguments: as in `falsify`.
 
     **Returns:** a `Synthesis`; after Ctrl-C what is finished, without the check.
 
@@ -129,7 +129,7 @@ def synthesize(
         region = region_of(loop, 1.0)  # Samples are of the whole prior.
     work = _Synthesis(loop, search, limits, margin, environments, seed, region)
     if aim == "probability":
-        work.fewest = FewestFailures(loop, margin, limits, seed)
+        work.counts = FailureCounts(loop, margin, limits, seed)
     try:
         work.run()
         stopped = work.stopped
@@ -149,8 +149,8 @@ def synthesize(
         and (loop.environment is not None or depends_on_key(problem))
     ):
         checked = _check(loop, best.theta, held_out, margin, seed, checking)
-    if checked is not None and checked.least is not None:
-        robustness = min(robustness, checked.least)
+    if checked is not None and checked.lowest is not None:
+        robustness = min(robustness, checked.lowest)
     return Synthesis(
         problem=problem,
         parameters=loop.values(best.theta),
@@ -167,7 +167,7 @@ def synthesize(
         stopped=stopped,
         seed=seed,
         varied="" if region is None else region.describe(),
-        counted=None if work.fewest is None else (work.fewest.failing, work.fewest.samples),
+        counted=None if work.counts is None else (work.counts.failing, work.counts.samples),
         sources=sources.settled(begun).to_json(),
     )
 
@@ -203,14 +203,14 @@ class _Synthesis:
         self.loop, self.search, self.limits, self.seed = loop, search, limits, seed
         self.margin = margin
         # One shape for all attacks: a twentieth of what one may cost.
-        self.batch = min(128, usual_batch(search, max(256, limits.most // 4)))
+        self.batch = min(128, usual_batch(search, max(256, limits.maximum // 4)))
         self.archive = Archive()
         self.rng = np.random.default_rng((seed, 2))
         self.scale = 1.0
         self.stopped = "budget"
         self.attacked: list[Choice] = []
         self.attacks: dict[bytes, int] = {}
-        self.fewest: FewestFailures | None = None
+        self.counts: FailureCounts | None = None
         self.final: list[Choice] = []
         self.rho: Any = None  # Of the best, in each environment of the set.
         self.environments: Any = np.zeros((1, 0), np.float32)
@@ -225,8 +225,8 @@ class _Synthesis:
             self.environments = region.project(self.environments)
 
     def run(self) -> None:
-        if self.fewest is not None:
-            self.fewest.run()
+        if self.counts is not None:
+            self.counts.run()
             self.stopped = self.limits.stopped_by
             return
         whole = self.limits
@@ -242,8 +242,8 @@ class _Synthesis:
         """Choose parameters and attack them in turn."""
         total = self.limits.left
         alone = self.loop.environment is None
-        most = EXPLORED if alone else 1000 * len(self.environments)
-        first = self.limits.slice(min(most, int((0.5 if alone else 0.15) * total)))
+        maximum = EXPLORED if alone else 1000 * len(self.environments)
+        first = self.limits.slice(min(maximum, int((0.5 if alone else 0.15) * total)))
         explore(
             self.loop, self.environments, self.archive, first,
             merit=value_merit, batch=CANDIDATES, rng=self.rng,
@@ -279,7 +279,7 @@ class _Synthesis:
             self.attacked.append(choice._replace(value=worst))
             if not result.violating.any():
                 # What a handful of simulations does not find says nothing.
-                thorough = len(result.rho) >= min(ATTACK // 2, max(32, self.limits.most // 20))
+                thorough = len(result.rho) >= min(ATTACK // 2, max(32, self.limits.maximum // 20))
                 self.stopped = "converged" if thorough else self.limits.stopped_by
                 return
             self.extend(result.select(ADDED))
@@ -331,8 +331,8 @@ class _Synthesis:
     @property
     def best(self) -> Choice:
         """The choice of parameters with the greatest least robustness in all attacks."""
-        if (fewest := self.fewest) is not None:
-            return Choice(fewest.theta, fewest.value, len(fewest.environments))
+        if (counts := self.counts) is not None:
+            return Choice(counts.theta, counts.value, len(counts.environments))
         if self.attacked:
             known: dict[bytes, Choice] = {}
             for choice in self.attacked:
@@ -351,8 +351,8 @@ class _Synthesis:
 
     def conclude(self) -> None:
         """Evaluate the attacked and the best other choices over the whole set."""
-        if (fewest := self.fewest) is not None:
-            self.environments, self.rho, self.final = fewest.environments, fewest.rho, fewest.final
+        if (counts := self.counts) is not None:
+            self.environments, self.rho, self.final = counts.environments, counts.rho, counts.final
             return
         if self.loop.environment is None:
             return
@@ -361,7 +361,7 @@ class _Synthesis:
         thetas: dict[bytes, Any] = {}
         for choice in pool.best(len(pool.choices), value_merit):
             thetas.setdefault(choice.theta.tobytes(), choice)
-        affordable = max(0, self.limits.most - self.loop.simulations) // len(self.environments)
+        affordable = max(0, self.limits.maximum - self.loop.simulations) // len(self.environments)
         chosen = list(thetas.values())[: min(CANDIDATES, affordable)]
         if not chosen:
             return

@@ -1,6 +1,6 @@
 """Parameters with which the fewest samples of the prior fail: the least failure probability.
 
-    search = FewestFailures(loop, margin, limits, seed, start)
+    search = FailureCounts(loop, margin, limits, seed, start)
     search.run()
     search.theta, search.failing, search.samples
 
@@ -25,13 +25,13 @@ POPULATION, ELITE = 16, 5
 """Candidates of a round, and those that the next ones are drawn around."""
 FINALISTS = 8
 """Candidates that are compared in fresh samples."""
-FEWEST = 16
+MIN_SAMPLES = 16
 """Samples at least."""
 STD = 0.01, 0.3
 """Least and greatest standard deviation of a round, in unit coordinates."""
 
 
-class FewestFailures:
+class FailureCounts:
     """The search, whose best candidate can be read at any time.
 
     **Arguments:**
@@ -64,15 +64,15 @@ class FewestFailures:
         self.theta = np.full(loop.dim, 0.5) if start is None else start
         self.failing = self.samples = 0
         self.rho: Float[np.ndarray, " n"] = np.zeros(0)
-        self.value, self._least = -np.inf, np.inf
+        self.value, self._lowest = -np.inf, np.inf
         self.environments: Float[np.ndarray, "n d"] = np.zeros((0, loop.environment.dim))
         self.final: list[Choice] = []
 
     def run(self) -> None:
         """Search within the budget."""
         rng = np.random.default_rng((self.seed, 5))
-        first = self.limits.slice(max(FEWEST, int(SHARE * self.limits.left)))
-        samples = self._draw(max(FEWEST, first.left // CANDIDATES), 6)
+        first = self.limits.slice(max(MIN_SAMPLES, int(SHARE * self.limits.left)))
+        samples = self._draw(max(MIN_SAMPLES, first.left // CANDIDATES), 6)
         p = self.loop.dim
         # One in each of as many slices of every coordinate: a Latin hypercube.
         cells = np.argsort(rng.random((2 * POPULATION, p)), axis=0)
@@ -92,7 +92,7 @@ class FewestFailures:
         best = np.unique(thetas[np.argsort(scores, kind="stable")[:FINALISTS]], axis=0)
         if self.start is not None and len(best):
             best = np.unique(np.concatenate([best, self.start[None]]), axis=0)
-        if len(best) and (count := self.limits.left // len(best)) >= FEWEST:
+        if len(best) and (count := self.limits.left // len(best)) >= MIN_SAMPLES:
             self._evaluate(best, self._draw(count, 7), last=True)
 
     def _draw(self, count: int, number: int) -> Float[np.ndarray, "n d"]:
@@ -122,12 +122,12 @@ class FewestFailures:
         if last and self.start is not None:
             far = np.linalg.norm(thetas - self.start, axis=1)
             order = np.where(share == share.min(), far, np.inf)
-        place = int(np.argmin(order))
-        if last or score[place] < self._least:
-            self._least = float(score[place])
-            self.theta, self.failing = thetas[place], int(bad[place].sum())
-            self.samples, self.environments = int(happens[place].sum()), samples
-            self.rho, self.value = pairs.rho[place], float(values[place])
+        index = int(np.argmin(order))
+        if last or score[index] < self._lowest:
+            self._lowest = float(score[index])
+            self.theta, self.failing = thetas[index], int(bad[index].sum())
+            self.samples, self.environments = int(happens[index].sum()), samples
+            self.rho, self.value = pairs.rho[index], float(values[index])
             self.final = [
                 Choice(theta, float(value), len(samples))
                 for theta, value in zip(thetas, values, strict=True)
