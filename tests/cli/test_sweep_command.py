@@ -107,6 +107,17 @@ class _Stopping:
         return cache
 
 
+def test_an_interruption_outside_of_the_work_prints_the_command_too(call, monkeypatch):
+    def interrupted(study, *, folder, **_):
+        folder.mkdir(exist_ok=True)
+        Cache(folder).note("command", {})
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(driver, "sweep", interrupted)
+    output = call("specs/drift.py:safe", *SMALL, "--folder", "part", code=130)
+    assert "  resume       verifai-jax sweep --resume part\n" in output
+
+
 def test_errors_in_one_line(call, tmp_path):
     for arguments, told in (
         (("specs/drift.py:sfae",), "Error: unknown study in specs/drift.py 'sfae'; did you mean"),

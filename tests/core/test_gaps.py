@@ -154,6 +154,7 @@ def test_small_integers_do_not_wrap():
         assert trace.clock().tolist() == [-128, 0, 127]
         assert np.asarray(resample(trace, 1.0, "hold")["x"]).shape == (256,)
         assert trace["x"].dtype == float
+        assert Trace({"x": np.ones(2, np.longdouble)}, dt=1.0)["x"].dtype == np.float64
         assert Trace({"x": np.zeros(2)}, dt=np.array(0.5)).dt == 0.5
 
 

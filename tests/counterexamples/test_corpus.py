@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 import verifai_jax as vj
+from verifai_jax.checking import Check
 from verifai_jax.cli.main import main
 from verifai_jax.counterexamples import SavedCounterexample, save_counterexamples
 from verifai_jax.counterexamples.corpus import renamed
@@ -142,6 +144,25 @@ def test_bad_files_are_named_and_do_not_stop_the_others(tmp_path):
     never = vj.falsify(problem(spec="always x < 99"), "uniform", 8, batch=8)
     with pytest.raises(ValueError, match="claims no counterexample in 8 simulations"):
         never.save_counterexamples(tmp_path)
+
+
+@pytest.mark.slow
+def test_a_full_disk_is_one_error_that_names_the_file_and_hides_no_failure(
+    run, tmp_path, monkeypatch
+):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(
+        OSError, match=r"\.json cannot be written \(No space left on device\); give"
+    ):
+        run.save_counterexamples(tmp_path / "corpus", max_count=1)
+    assert list((tmp_path / "corpus").iterdir()) == []
+    outcome = Check(budget=64).run(problem(), corpus=tmp_path / "corpus")
+    assert outcome.failed
+    assert "simulations violate the property" in str(outcome)
+    assert "not saved    " in str(outcome)
 
 
 @pytest.mark.slow

@@ -247,6 +247,12 @@ def test_certificates_show_what_came_again():
     assert len(wavering.counterexamples["rho"]) == wavering.attack_failures == 0
     assert wavering.failures > 0
     assert wavering.worst_robustness == 1.0
+    taken_out = (
+        f"worst robustness 1, leaving out {wavering.fragile} failures that did not fail again"
+    )
+    assert wavering.fragile > 1
+    assert taken_out in str(certificates)
+    assert steady.fragile == 0
     assert len(steady.counterexamples["rho"]) == steady.failures + steady.attack_failures > 0
     (note,) = certificates.notes
     assert note.startswith("policy 0: the system has memory or chance of its own")

@@ -62,3 +62,43 @@ def test_a_black_box_with_a_seed_is_one_that_draws():
     found = vj.modes(vj.Problem("box", SPACE, box, FORMULAS), budget=6000, progress=False)
     assert 1 <= len(found) <= 3
     assert all(mode.replay().violated for mode in found)
+
+
+@pytest.mark.thorough
+def test_with_chance_of_its_own_modes_say_how_often_a_point_fails_within_the_budget():
+    rng, count = np.random.default_rng(0), [0]
+
+    def wavering(features):
+        count[0] += 1
+        far = abs(features["x"]) + 0.5 * rng.standard_normal()
+        return vj.Trace({"a": np.array([far])}, dt=1.0)
+
+    problem = vj.Problem("box", SPACE, vj.blackbox(wavering), "a < 2.5")
+    found = vj.modes(problem, budget=8000, progress=False)
+    assert {mode.name.split()[1] for mode in found} == {">", "<="}
+    assert found.simulations <= count[0] <= 8000
+    for mode in found:
+        assert 0.4 < mode.share < 0.6
+        assert 0.1 < mode.chance < 0.9
+        assert "its likeliest failure fails in " in mode.cause
+    assert "so each point fails with a probability" in str(found)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("budget", [1000, 2600])
+def test_what_fails_now_and_then_is_one_mode_with_its_probability(budget):
+    count = [0]
+
+    def seventh(features):
+        count[0] += 1
+        return vj.Trace({"a": np.array([0.0 if count[0] % 7 else 5.0])}, dt=1.0)
+
+    problem = vj.Problem("counter", {"x": vj.Normal(0.0, 1.0)}, vj.blackbox(seventh), "a < 4")
+    found = vj.modes(problem, budget=budget, progress=False)
+    assert found.simulations <= count[0] <= budget
+    assert found.probability == pytest.approx(1 / 7, abs=0.05)
+    [mode] = found
+    assert mode.chance == pytest.approx(1 / 7, abs=0.15)
+    if mode.row is None:
+        with pytest.raises(ValueError, match="does not fail when it is simulated again every time"):
+            mode.explain()

@@ -5,7 +5,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from checked_types import unchecked
 
+import verifai_jax as vj
 from verifai_jax.falsification import segments
 from verifai_jax.falsification.table import FINISHED, ErrorTable, TableError
 from verifai_jax.falsification.tail import TAIL
@@ -320,3 +322,26 @@ def test_reserved_and_missing_names(tmp_path):
         ErrorTable(("rho",))
     with pytest.raises(FileNotFoundError, match="no error table in"):
         ErrorTable.load(tmp_path, ("x",))
+
+
+@pytest.mark.thorough
+def test_numbers_of_numpy_are_as_good_as_pythons(tmp_path):
+    def simulator(features):
+        return vj.Trace({"a": np.array([features["x"]])}, dt=1.0)
+
+    problem = vj.Problem("t", {"x": vj.Box(0.0, 1.0)}, vj.blackbox(simulator), "a < 0.5")
+    numbers = {"budget": np.int64(32), "batch": np.int32(8), "seed": np.uint8(3)}
+    run = vj.falsify(
+        problem, "uniform", folder=tmp_path / "run", max_seconds=np.float32(60),
+        progress=False, **numbers,
+    )  # fmt: skip
+    assert vj.load(tmp_path / "run", problem).budget == run.simulations == 32
+    row = np.int64(run.table.counterexamples.index[0])
+    assert vj.confirm(run, row).confirmed
+    assert run.replay(row).violated
+    with unchecked():
+        for no_row in ([0], True, "0"):
+            with pytest.raises(TypeError, match="a row must be the number of a row of the table"):
+                vj.confirm(run, no_row)
+            with pytest.raises(TypeError, match="a row must be the number of a row of the table"):
+                run.replay(no_row)

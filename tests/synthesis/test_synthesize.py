@@ -8,11 +8,12 @@ import pandas as pd
 import pytest
 from checked_types import unchecked
 from click.testing import CliRunner
+from scipy.stats import norm
 
 import verifai_jax as vj
 from specs.tuning import decay, first_order
 from verifai_jax.cli.synthesize import synthesize as command
-from verifai_jax.synthesis import synthesize
+from verifai_jax.synthesis import repair, synthesize
 from verifai_jax.synthesis.parametric import FeatureParameters
 
 W, X0, LIMIT, FORCE, SECONDS = 1.0, 0.5, 1.0, 1.8, 4.0
@@ -244,6 +245,7 @@ def test_parameters_of_every_kind_can_be_held():
         ({"budgt": 5}, "did you mean 'budget'"),
         ({"budget": 0}, "budget must be an integer of at least 1; got 0"),
         ({"margin": -1.0}, "margin must be a robustness of at least 0; got -1.0"),
+        ({"aim": "probabilty"}, "did you mean 'probability'"),
         ({"environments": 0}, "environments must be an integer of at least 1; got 0"),
         ({"held_out": -1}, "held_out must be an integer of at least 0; got -1"),
         ({"parameters": "k", "attack": "halten"}, "did you mean 'halton'"),
@@ -274,3 +276,42 @@ def test_command(tmp_path):
     assert shown.exit_code == 0, shown.output
     assert "0 of 100 held-out environments fail" in shown.output
     assert list(pd.read_csv(tmp_path / "found.csv")) == ["k", "rho", "environments"]
+
+
+def shaken(features):
+    """Fail with least probability at gain 0.3, and everywhere with some."""
+    far = abs(features["gain"] - 0.3) + 0.5 * features["push"]
+    return vj.Trace({"x": np.array([far])}, dt=1.0)
+
+
+@pytest.fixture(scope="module")
+def shaken_problem():
+    space = {"gain": vj.Box(0.0, 1.0), "push": vj.Normal(0.0, 1.0)}
+    return vj.Problem(
+        "shaken", space, vj.blackbox(shaken), "x <= 1", nominal={"gain": 0.9, "push": 0.0}
+    )
+
+
+@pytest.mark.thorough
+def test_the_least_failure_probability_is_found_and_checked(shaken_problem):
+    found = synthesize(shaken_problem, ["gain"], 4000, aim="probability", held_out=1000)
+    assert found.parameters["gain"] == pytest.approx(0.3, abs=0.15)
+    assert found.simulations <= 4000
+    failing, samples = found.counted
+    assert failing / samples == pytest.approx(norm.sf(2), abs=0.03)
+    exact = norm.sf(2 - 2 * abs(found.parameters["gain"] - 0.3))
+    assert found.held_out.rate.low <= exact <= found.held_out.rate.high
+    assert f"{failing} of {samples} samples of the prior fail" in str(found)
+    assert not found.holds
+
+
+@pytest.mark.thorough
+def test_a_repair_may_aim_at_it_too(shaken_problem):
+    mended = repair(shaken_problem, ["gain"], 4000, aim="probability", held_out=1000)
+    assert mended.parameters["gain"] == pytest.approx(0.3, abs=0.15)
+    assert mended.held_out_after.failures < mended.held_out_before.failures
+    assert mended.stopped == "fewest failures"
+    assert not mended.repaired
+    assert "samples of the prior fail; the check counts in other samples" in str(mended)
+    with pytest.raises(ValueError, match="needs features that vary: all are parameters here"):
+        synthesize(shaken_problem, ["gain", "push"], aim="probability")

@@ -7,6 +7,7 @@ certificates.safest, certificates[3].verdict, certificates.counterexamples(3)
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -23,6 +24,7 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.programs import power_of_two
 from verifai_jax.core.progress import say_done, shows_progress
+from verifai_jax.evaluation.confirmations import Repetitions
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
@@ -127,15 +129,20 @@ def certify(
         stopped = _sample(blocks, sampled, allocation, margins, report)
     except KeyboardInterrupt:
         stopped = "interrupted"
-    notes: list[str] = []
+    again = [Repetitions() for _ in policies]
     if blocks.problem.black_box and stopped != "interrupted":
-        said = (
+        again = [
             repeat_failures(blocks, number, sampled[number], attacked[number])
             for number in range(len(policies))
-        )
-        notes = [f"policy {number}: {note}" for number, note in enumerate(said) if note]
+        ]
+    notes = [f"policy {number}: {found}" for number, found in enumerate(again) if str(found)]
     rows = tuple(
-        _certificate(number, sampled[number], attacked[number], allocation, len(policies), blocks)
+        replace(
+            _certificate(
+                number, sampled[number], attacked[number], allocation, len(policies), blocks
+            ),
+            fragile=again[number].lost,
+        )
         for number in range(len(policies))
     )
     known = all(row.simulations for row in rows)

@@ -1,6 +1,7 @@
 """Failures of policies on the host, simulated once more before a certificate shows them.
 
-    note = repeat_failures(blocks, policy, sampled, attacked)
+    found = repeat_failures(blocks, policy, sampled, attacked)
+    str(found), found.lost
 
 What does not fail again was due to what earlier simulations left behind, or to numbers that do not
 come from the random key. It stays in the failure rate, which is that of the system as simulated,
@@ -20,7 +21,7 @@ from verifai_jax.evaluation.confirmer import LIMIT, MORE, REPEATED, SHARE_REPEAT
 
 def repeat_failures(
     blocks: Blocks, policy: int, sampled: PolicyRecord, attacked: PolicyRecord
-) -> str:
+) -> Repetitions:
     """Simulate the worst failures of a policy again, and take out what does not fail again.
 
     One for 25 simulations or 32 of them, and up to 1024 where one has not come again.
@@ -31,7 +32,7 @@ def repeat_failures(
     - `policy`: its number.
     - `sampled`, `attacked`: its simulations, of which verdicts are replaced.
 
-    **Returns:** what that says of the system; empty if all came again.
+    **Returns:** the counts, which as text say what that means of the system.
     """
     rows = [
         (float(verdicts.lowest[index]), record, block, index)
@@ -67,7 +68,7 @@ def repeat_failures(
             attacked.failures -= record is attacked
         if found.moved:
             maximum = LIMIT
-    return str(found)
+    return found
 
 
 def _again(

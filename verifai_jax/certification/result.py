@@ -25,9 +25,11 @@ class Certificate:
       decided the number of samples; None before the first sample.
     - `verdict`: `"safe@p"` if the interval is below p, `"unsafe"` if above, or `"undecided"`.
     - `attacks`: simulations of the attack, `attack_failures` among them; they are in no rate.
-    - `worst_robustness`: the least over everything simulated, NaN if nothing had a verdict;
-      `worst_features`: the table columns at which it was met.
+    - `worst_robustness`: the least over everything simulated but `fragile` rows, NaN if nothing
+      had a verdict; `worst_features`: the table columns at which it was met.
     - `counterexamples`: columns of features and `rho`, worst first.
+    - `fragile`: failures that did not fail again with the same features and random key. They are
+      in the `rate`, and in neither of the two above.
     """
 
     number: int
@@ -41,6 +43,7 @@ class Certificate:
     worst_robustness: float
     worst_features: Mapping[str, Any] | None
     counterexamples: Mapping[str, np.ndarray] = field(repr=False)
+    fragile: int = 0
 
     @property
     def cost(self) -> int:
@@ -61,6 +64,9 @@ class Certificate:
             text += f"; {self.not_finite} of them gave no verdict"
         if np.isfinite(self.worst_robustness):
             text += f"; worst robustness {self.worst_robustness:z.4g}"
+        if self.fragile:
+            again = f"{self.fragile} failure{'s' * (self.fragile > 1)} that did not fail again"
+            text += f"{', leaving out' if np.isfinite(self.worst_robustness) else ';'} {again}"
         return text
 
 
@@ -144,6 +150,7 @@ class Certificates(InNotebook):
                 "worst_robustness": [row.worst_robustness for row in self.rows],
                 "attacks": [row.attacks for row in self.rows],
                 "attack_failures": [row.attack_failures for row in self.rows],
+                "fragile": [row.fragile for row in self.rows],
                 "cost": [row.cost for row in self.rows],
             }
         )

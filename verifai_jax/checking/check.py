@@ -8,7 +8,7 @@ independent samples are drawn until the failure probability is known to be below
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from verifai_jax.core.checks import check_count, check_fraction
@@ -114,8 +114,12 @@ class Check:
         outcome = CheckOutcome(problem.name, self, target, replayed, run)
         if corpus is None or not outcome.refuted or not run.table.counts.claimed:
             return outcome
-        saved = save_counterexamples(run, corpus, max_count=1, budget=SHRINKING)
-        return CheckOutcome(problem.name, self, target, replayed, run, tuple(saved))
+        try:
+            saved = save_counterexamples(run, corpus, max_count=1, budget=SHRINKING)
+        except OSError as error:
+            # A checkout that cannot be written, or a full disk, hides no failure.
+            return replace(outcome, unsaved=str(error))
+        return replace(outcome, saved=tuple(saved))
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +132,7 @@ class CheckOutcome:
     - `replayed`: the corpus; None if there is none.
     - `run`: what the budget was spent on; None if the corpus failed already.
     - `saved`: files that were added to the corpus.
+    - `unsaved`: why a counterexample could not be added; empty if none was to be.
     """
 
     problem: str
@@ -136,6 +141,7 @@ class CheckOutcome:
     replayed: CorpusReplay | None = None
     run: Run | None = None
     saved: tuple[Path, ...] = ()
+    unsaved: str = ""
 
     @property
     def rate(self) -> Rate | None:
@@ -203,6 +209,8 @@ class CheckOutcome:
             parts.append(f"  {self._probability()}")
         for path in self.saved:
             parts.append(_describe_saved(path))
+        if self.unsaved:
+            parts.append(f"  not saved    {self.unsaved}")
         return printable("\n".join(parts))
 
     def _probability(self) -> str:

@@ -156,6 +156,13 @@ def all_of(*decorators: Callable[[Any], Any]) -> Callable[[Command], Command]:
 
 
 PARAMETER_CHOICE = all_of(
+    click.option(
+        "--aim",
+        type=click.Choice(("robustness", "probability")),
+        default="robustness",
+        show_default=True,
+        help="Robustness against an attack, or the least failure probability.",
+    ),
     click.option("--margin", type=float, default=0.0, show_default=True, help="Robustness wanted."),
     click.option(
         "--attack", default="cross_entropy", show_default=True, help="Search that attacks."

@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from verifai_jax.cli.json_output import command, give_result
+from verifai_jax.core.atomic_files import replacing
 
 FILES = {
     "README.md": "README.md.txt",
@@ -31,12 +32,12 @@ def new(folder: Path) -> None:
         )
     if folder.exists() and not folder.is_dir():
         raise click.UsageError(f"{folder} is a file; give a folder that does not exist yet")
-    folder.mkdir(parents=True, exist_ok=True)
     templates = resources.files("verifai_jax.cli").joinpath("new_project")
     for name, template in FILES.items():
         text = templates.joinpath(template).read_text(encoding="utf-8")
         text = text.replace("$name", folder.resolve().name).replace("$package", _package())
-        (folder / name).write_text(text, encoding="utf-8")
+        with replacing(folder / name) as partial:
+            partial.write_text(text, encoding="utf-8")
     give_result(folder=folder, files=list(FILES))
     click.echo(f"  written      {folder}")
     click.echo(f"  next         cd {folder} && verifai-jax falsify spec.py:upright")

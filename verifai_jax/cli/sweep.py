@@ -82,6 +82,7 @@ def sweep(
     """Train configurations of the study TARGET (specs/FILE.py:NAME), certify their policies."""
     from verifai_jax.core.targets import load_target, target_of_project
     from verifai_jax.core.text import printable
+    from verifai_jax.store.cache import cache_file
     from verifai_jax.sweeps._sweep import sweep as run_sweep
     from verifai_jax.sweeps.study import Study
 
@@ -115,27 +116,32 @@ def sweep(
         "nominal": list(nominal),
     }
     keywords = _keywords(given, options)
-    with (
-        arguments.given_or_next(folder, "sweeps", study.name) as path,
-        arguments.on_cluster(cluster) as executor,
-    ):
-        folder = path
-        result = run_sweep(
-            study,
-            configurations=configurations,
-            folder=folder if cache is None else cache,
-            max_seconds=max_seconds,
-            note=note,
-            executor=executor,
-            even_if_changed=even_if_changed,
-            **keywords,
-        )
-        record = replace(result.record, options={**result.record.options, "target": target})
-        result = replace(result, record=record)
-        click.echo(printable(str(result)))
-        if len(result.table):
-            click.echo(_format_table(result))
-        result.save(folder)
+    try:
+        with (
+            arguments.given_or_next(folder, "sweeps", study.name) as path,
+            arguments.on_cluster(cluster) as executor,
+        ):
+            folder = path
+            result = run_sweep(
+                study,
+                configurations=configurations,
+                folder=folder if cache is None else cache,
+                max_seconds=max_seconds,
+                note=note,
+                executor=executor,
+                even_if_changed=even_if_changed,
+                **keywords,
+            )
+            record = replace(result.record, options={**result.record.options, "target": target})
+            result = replace(result, record=record)
+            click.echo(printable(str(result)))
+            if len(result.table):
+                click.echo(_format_table(result))
+            result.save(folder)
+    except KeyboardInterrupt:
+        if folder is not None and cache_file(folder if cache is None else cache).exists():
+            click.echo(f"  resume       {_resuming(folder, target, cache, max_seconds, cluster)}")
+        raise
     click.echo(f"  table        {folder / 'table.parquet'}")
     give_result(
         study=study.name,
@@ -149,12 +155,19 @@ def sweep(
     if pictures and record.certified:
         draw(result, folder / "sweep.png")
     if not record.complete:
-        apart = None if cache == folder else cache
-        more = {"--cache": apart, "--max-seconds": max_seconds, "--cluster": cluster}
-        click.echo(f"  resume       {arguments.resuming('sweep', folder, target, more)}")
+        click.echo(f"  resume       {_resuming(folder, target, cache, max_seconds, cluster)}")
     elif all(status not in ("trained", "stopped") for status in result.table["status"]):
         raise CommandError("no configuration was trained, so nothing is known of any", BROKEN)
     check_gate(fail_on, {"unsafe": not len(result.safe)})
+
+
+def _resuming(
+    folder: Path, target: str, cache: Path | None, max_seconds: float | None, cluster: str | None
+) -> str:
+    """Write the command that goes on with a sweep."""
+    apart = None if cache == folder else cache
+    more = {"--cache": apart, "--max-seconds": max_seconds, "--cluster": cluster}
+    return arguments.resuming("sweep", folder, target, more)
 
 
 def _keywords(given: Mapping[str, Any], options: tuple[str, ...]) -> dict[str, Any]:

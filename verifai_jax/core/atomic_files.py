@@ -5,6 +5,7 @@ partial.write_text(page)                    # takes the place of report.html at 
 """
 
 import contextlib
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,7 +20,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
     **Raises:** `OSError` that names `path`, for whatever the file system refuses.
     """
     path = Path(path)
-    partial = path.with_name(f".{path.stem}.part{path.suffix}")
+    # Several processes may write it at once, such as tests of one problem.
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield partial

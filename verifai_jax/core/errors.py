@@ -9,7 +9,8 @@ import functools
 import importlib
 import inspect
 from collections.abc import Callable, Iterable
-from typing import Any, ParamSpec, TypeVar
+from numbers import Number
+from typing import Any, ParamSpec, TypeVar, cast
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -50,15 +51,25 @@ def check_names(kind: str, names: Iterable[str], known: Iterable[str]) -> None:
 
 
 def suggests_options(function: Callable[P, R]) -> Callable[P, R]:
-    """Let a misspelt keyword of `function` raise `UnknownNameError` with the nearest keywords."""
+    """Let a misspelt keyword of `function` raise `UnknownNameError` with the nearest keywords.
+
+    Numbers of NumPy reach the function as Python's: arithmetic, JSON and JAX treat the two
+    differently.
+    """
     known = list(inspect.signature(function).parameters)
 
     @functools.wraps(function)
     def checked(*arguments: P.args, **options: P.kwargs) -> R:
         check_names(f"option of {function.__name__}", options, known)
-        return function(*arguments, **options)
+        plain = {name: _plain_number(value) for name, value in options.items()}
+        return cast(Callable[..., R], function)(*map(_plain_number, arguments), **plain)
 
     return checked
+
+
+def _plain_number(value: object) -> object:
+    is_numpy = type(value).__module__ == "numpy" and isinstance(value, Number)
+    return value.item() if is_numpy else value  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class MissingExtra(ImportError):

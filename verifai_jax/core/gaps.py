@@ -63,7 +63,8 @@ def _real(name: str, signal: Any) -> Any:
     if kind not in "biuf" and not (kind == "V" and "float" in getattr(dtype, "name", "")):
         hint = ": give seconds or other numbers in place of dates" if kind in "mM" else ""
         raise TypeError(f"signal {name!r} must hold real numbers; got {dtype}{hint}")
-    return signal
+    # NumPy's long doubles are no numbers for JAX.
+    return signal.astype(np.float64) if dtype == np.longdouble else signal
 
 
 def _is_masked(value: object) -> bool:

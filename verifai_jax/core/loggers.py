@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.callbacks import Values
 
 STEP = "step"
@@ -58,13 +59,10 @@ class CSVLogger:
         if self._columns:
             with self.path.open(newline="") as file:
                 rows = list(csv.DictReader(file))
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        partial = self.path.with_name(f"{self.path.name}.part")
-        with partial.open("w", newline="") as file:
+        with replacing(self.path) as partial, partial.open("w", newline="") as file:
             writer = csv.DictWriter(file, columns)
             writer.writeheader()
             writer.writerows(rows)
-        partial.replace(self.path)
         self._columns = columns
 
 

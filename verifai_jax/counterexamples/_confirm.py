@@ -124,12 +124,7 @@ def _finding(run: Run, row: int) -> str:
 def _one(
     run: Run, confirmer: Confirmer, row: int | np.integer | pd.Series | Mapping[str, Any]
 ) -> Confirmation:
-    number: int | None
-    if isinstance(row, (int, np.integer)):
-        number, values = int(row), run.table.row(int(row))
-    else:
-        name = getattr(row, "name", None)
-        number, values = int(name) if isinstance(name, int | np.integer) else None, row
+    number, values = run.table.entry(row)
     entries = {str(name): value for name, value in values.items()}
     _check_fails(number, entries)
     columns = {name: np.asarray([value]) for name, value in entries.items()}

@@ -9,7 +9,6 @@ how to see it again. Nothing in it is executed: the problem comes from whoever r
 
 import hashlib
 import json
-import os
 import re
 import shlex
 import sys
@@ -21,6 +20,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.checks import check_count, is_number
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.text import format_error, one_line
@@ -76,16 +76,17 @@ class SavedCounterexample:
         return f"{stem}-{hashlib.sha256(text.encode()).hexdigest()[:10]}.json"
 
     def write(self, folder: Path) -> Path:
-        """Write the file into a folder; return its path."""
+        """Write the file into a folder; return its path.
+
+        **Raises:** `OSError` that names the file, for whatever the file system refuses.
+        """
         path = folder / self.name
         content: dict[str, Any] = {"format": FORMAT, **asdict(self)}
         if self.target is not None:
             words = ["verifai-jax", "replay-counterexamples", self.target, str(path)]
             content["reproduce"] = shlex.join(words)
-        # Tests of one problem may write it at once, each in a process of its own.
-        partial = path.with_suffix(f".{os.getpid()}.part")
-        partial.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
-        partial.replace(path)
+        with replacing(path) as partial:
+            partial.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
         return path
 
     @classmethod

@@ -33,7 +33,7 @@ from verifai_jax.evaluation.confirmations import came_otherwise
 
 TWICE = 8
 """Samples of the prior that are simulated twice on the host, to learn whether a system has memory
-or chance of its own; in budgets in which they are less than a hundredth."""
+or chance of its own; fewer in budgets of which they are more than a hundredth."""
 TRIED_AGAIN = 64
 """Failures that are simulated again, to learn whether the system's own draws decide."""
 SURE = 0.8
@@ -53,16 +53,33 @@ def notice_own_chance(limit_state: LimitState, rng: np.random.Generator) -> None
 
     A function on the host may draw numbers that do not come from the random key, or keep state.
     """
-    if limit_state.draws or limit_state.budget < 200 * TWICE:
+    samples = min(TWICE, limit_state.budget // 200)
+    if limit_state.draws or not samples:
         return
     with suppress(Ended):
-        z = limit_state.sample_prior(rng, TWICE)
+        z = limit_state.sample_prior(rng, samples)
         once, again = limit_state(z).score, limit_state(z).score
-        if count := int(came_otherwise(once, again).sum()):
+        turned = (once == -np.inf) != (again == -np.inf)
+        if count := int((turned | came_otherwise(once, again)).sum()):
             limit_state.draws = True
             limit_state.own_chance = (
-                f"the system has memory or chance of its own: of {TWICE} samples of the prior "
+                f"the system has memory or chance of its own: of {samples} samples of the prior "
                 f"simulated again with the same features {count} gave another robustness"
+            )
+
+
+def notice_lost_failures(
+    limit_state: LimitState, rng: np.random.Generator, failures: Float[np.ndarray, "n d"]
+) -> None:
+    """Simulate a few failures again, and note that some do not fail, as chance may be rare."""
+    if limit_state.left < TWICE:
+        return
+    with suppress(Ended):
+        again = fails_at(limit_state, failures[rng.choice(len(failures), TWICE)])
+        if lost := int(np.sum(~again)):
+            limit_state.own_chance = (
+                f"the system has memory or chance of its own: of {TWICE} failures simulated again "
+                f"with the same features {lost} did not fail"
             )
 
 

@@ -75,6 +75,10 @@ class Ended(Exception):
     """Time is over, or the user has interrupted; finished simulations count."""
 
 
+class Spent(Ended):
+    """The budget of a strict limit state is spent; finished simulations count."""
+
+
 class LimitState:
     """Scores of points of standard normal space, within a budget of simulations.
 
@@ -130,6 +134,8 @@ class LimitState:
         """A sentence on memory or chance that the system has beside its random key, if it has."""
         self.lowest = np.inf
         self.ended: str | None = None
+        self.strict = False
+        """Whether simulations beyond the budget are refused; methods that plan need no refusal."""
 
     @property
     def left(self) -> int:
@@ -175,7 +181,8 @@ class LimitState:
     def __call__(self, z: Float[np.ndarray, "n d"]) -> Scores:
         """Simulate points of normal space.
 
-        **Raises:** `Ended` where time is over or the user interrupts; batches before it count.
+        **Raises:** `Ended` where time is over or the user interrupts, `Spent` where a strict budget
+        is; batches before it count.
         """
         if not len(z):
             return Scores(np.zeros(0), np.zeros(0, bool), np.zeros(0, bool))
@@ -201,6 +208,9 @@ class LimitState:
                 self.ended = self.ended or "max_seconds"
                 raise Ended
             began, stop = time.perf_counter(), start + self.step
+            cost = 2 if part_of == self._linearize else 1
+            if self.strict and cost * min(self.step, len(z) - start) > self.left:
+                raise Spent
             try:
                 parts.append(part_of(z[start:stop]))
             except KeyboardInterrupt:

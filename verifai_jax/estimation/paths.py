@@ -28,7 +28,7 @@ def connected(
     **Raises:** `Ended` where time is over.
     """
     joined = np.zeros(len(a), bool)
-    for path in (_straight, _arc):
+    for path in (straight, arc):
         rows = np.flatnonzero(~joined)
         for fraction in FRACTIONS:
             if not len(rows):
@@ -59,20 +59,21 @@ def halve(
     low, high = np.zeros((len(begin), 1)), np.ones((len(begin), 1))
     for _ in range(halvings):
         middle = (low + high) / 2
-        fails = fails_at(limit_state, _straight(begin, end, middle))[:, None]
+        fails = fails_at(limit_state, straight(begin, end, middle))[:, None]
         low, high = np.where(fails, middle, low), np.where(fails, high, middle)
-    return _straight(begin, end, low), _straight(begin, end, high)
+    return straight(begin, end, low), straight(begin, end, high)
 
 
-def _straight(
+def straight(
     a: Float[np.ndarray, "n d"],
     b: Float[np.ndarray, "n d"],
     fraction: float | Float[np.ndarray, "n 1"],
 ) -> Float[np.ndarray, "n d"]:
+    """Return points of the straight ways."""
     return (1 - fraction) * a + fraction * b
 
 
-def _arc(
+def arc(
     a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "n d"], fraction: float
 ) -> Float[np.ndarray, "n d"]:
     """Return points of the arcs: the angle and the distance from the origin change evenly."""

@@ -11,6 +11,7 @@ estimate, and sum to it.
 """
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -40,13 +41,14 @@ from verifai_jax.estimation.methods import (
     chains_for,
     estimate_by_importance_sampling,
 )
-from verifai_jax.estimation.moved_priors import notice_own_chance
-from verifai_jax.estimation.normal_space import Ended, LimitState, to_unit_cube
+from verifai_jax.estimation.moved_priors import notice_lost_failures, notice_own_chance
+from verifai_jax.estimation.normal_space import Ended, LimitState, Spent, to_unit_cube
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.confirmations import NOT_CLAIMED
 from verifai_jax.evaluation.replay import replay
 from verifai_jax.failure_modes.held_keys import Divided, Held, divide_under_keys
 from verifai_jax.failure_modes.naming import name_mode
+from verifai_jax.failure_modes.own_chance import divide_by_chance
 from verifai_jax.failure_modes.region_search import find_regions, share_explained
 from verifai_jax.failure_modes.result import Mode, Modes
 from verifai_jax.falsification import simulate
@@ -151,17 +153,22 @@ def modes(
         limit_state.budget = int(budget)
         limit_state.draws = draws  # Chance that is not of the key is under no key that is held.
         held = _under_keys(simulated, limit_state)
-        divided = _divide(limit_state, held, rng, answer, _failures_of(source))
+        divided = _divide(limit_state, held, rng, answer, _failures_of(source), problem.black_box)
     bound = answer.prior.upper_bound(confidence)
     listed, rest, run, unexplained = (), 0.0, None, (0.0, 1.0)
     notes = list(answer.notes)
     if limit_state.own_chance:
-        notes.insert(0, f"{limit_state.own_chance}; what a mode hands out may not fail again")
+        notes.insert(
+            0,
+            f"{limit_state.own_chance}; so each point fails with a probability, and each mode says "
+            "how many simulations of its likeliest failure fail",
+        )
     if divided is not None and answer.samples is not None:
         numbers = _Numbers(chosen.problem, seed, precision, backend, confidence, min_share)
         listed, rest, run = _list_modes(numbers, rng, answer, divided)
-        missed = clopper_pearson(divided.tried - divided.joined, divided.tried, confidence)
-        unexplained = (missed.low, missed.high)
+        if divided.tried:
+            missed = clopper_pearson(divided.tried - divided.joined, divided.tried, confidence)
+            unexplained = (missed.low, missed.high)
         if divided.held:
             notes.append(divided.note)
         notes = [*numbers.notes, *notes]
@@ -241,7 +248,7 @@ def _under_keys(simulated: DoublePrecisionEvaluator, limit_state: LimitState) ->
         slopes = None
         if limit_state.gradient is not None:
             slopes = lambda u: simulated.gradient_held(u, numbers(u))  # noqa: E731
-        return LimitState(
+        under = LimitState(
             lambda u: simulated.held(u, numbers(u)),
             limit_state.dim,
             budget,
@@ -251,6 +258,8 @@ def _under_keys(simulated: DoublePrecisionEvaluator, limit_state: LimitState) ->
             gradient=slopes,
             uniform=limit_state.uniform,
         )
+        under.strict = True
+        return under
 
     return held
 
@@ -261,6 +270,7 @@ def _divide(
     rng: np.random.Generator,
     answer: Answer,
     more: Float[np.ndarray, "n d"] | None,
+    black_box: bool,
 ) -> Divided | None:
     """Divide the weighted failures into regions; return None if there are none, or time ends."""
     if answer.samples is None or not answer.samples.x.any():
@@ -271,11 +281,18 @@ def _divide(
     z = samples.failures
     nearest = [part for part in (answer.nearest, more) if part is not None]
     starts = np.concatenate(nearest) if nearest else z[:0]
+    if black_box and not limit_state.draws and not limit_state.own_chance:
+        notice_lost_failures(limit_state, rng, z)
+    if limit_state.own_chance:
+        return divide_by_chance(limit_state, rng, samples)
+    limit_state.strict, joined, tried = True, 0, 0
     try:
         if limit_state.draws:
             return divide_under_keys(limit_state, held, rng, samples, starts)
+        starts = starts[: limit_state.left // 4]
         regions = find_regions(limit_state, rng, z, share, _failing(limit_state, starts))
-        joined, tried = share_explained(limit_state, rng, regions, z, share)
+        with suppress(Spent):
+            joined, tried = share_explained(limit_state, rng, regions, z, share)
     except (Ended, KeyboardInterrupt):
         return None
     return Divided(regions, np.zeros(len(regions.points), int), joined, tried, 1.0, 0)
@@ -300,18 +317,21 @@ def _list_modes(
     rest = whole * max(0.0, float(1 - masses[order].sum()))
     if not order:
         return (), rest, None
-    rows_of_design = np.array(regions.design_rows)[order]
+    rows_of_design = divided.design_rows[order]
     design = regions.points[rows_of_design]
     likeliest = _columns(problem.space, design)
     prior = _columns(problem.space, rng.standard_normal((5 * SHOWN, problem.space.dim)))
     keys = divided.keys[rows_of_design]
-    found = _simulate_under(numbers, design, keys) if divided.held else _simulate(numbers, design)
+    if divided.held:
+        found = _simulate_under(numbers, design, keys)
+    else:
+        found = _simulate(numbers, design, OUTWARD[:1] if divided.times else OUTWARD)
     key = run_keys(numbers.seed)[1]
     listed = []
     of_failure = of_sample[samples.failing]
     for number, k in enumerate(order):
-        chance = np.where(of_failure == k, samples.x[samples.failing], 0.0)
-        drawn = rng.choice(len(chance), SHOWN, p=chance / chance.sum())
+        weight = np.where(of_failure == k, samples.x[samples.failing], 0.0)
+        drawn = rng.choice(len(weight), SHOWN, p=weight / weight.sum())
         failures = _columns(problem.space, samples.failures[drawn])
         low, high = parts[k].interval(numbers.confidence)
         run, row = found[number]
@@ -321,6 +341,14 @@ def _list_modes(
             simulated = run.table.all.loc[row]
             features = {name: simulated[name] for name in features}
         rho, cause = _cause(numbers, features, key, int(keys[number]))
+        chance = None
+        if divided.times:
+            chance = divided.failing[k] / divided.times
+            why = f"; in one that failed {cause}" if rho < 0 and cause else ""
+            cause = (
+                f"its likeliest failure fails in {divided.failing[k]} of {divided.times} "
+                f"simulations{why}"
+            )
         listed.append(
             Mode(
                 number=number,
@@ -340,6 +368,7 @@ def _list_modes(
                 key=key,
                 precision=numbers.precision,
                 key_number=int(keys[number]),
+                chance=chance,
             )
         )
     return tuple(listed), rest, found[0][0]
@@ -362,10 +391,12 @@ def _columns(space: FeatureSpace, z: Float[np.ndarray, "n d"]) -> pd.DataFrame:
     return pd.DataFrame(space.rows(features))
 
 
-def _simulate(numbers: _Numbers, design: Float[np.ndarray, "k d"]) -> list[tuple[Run, int | None]]:
+def _simulate(
+    numbers: _Numbers, design: Float[np.ndarray, "k d"], outward: tuple[float, ...] = OUTWARD
+) -> list[tuple[Run, int | None]]:
     """Simulate likeliest failures and points just beyond; return run and failing row of each."""
     count = len(design)
-    points = np.concatenate([factor * design for factor in OUTWARD])
+    points = np.concatenate([factor * design for factor in outward])
     frame = _columns(numbers.problem.space, points)
     run = simulate(
         numbers.problem,
@@ -376,7 +407,7 @@ def _simulate(numbers: _Numbers, design: Float[np.ndarray, "k d"]) -> list[tuple
         progress=False,
     )
     failing = set(run.table.counterexamples.index)
-    if numbers.problem.black_box and failing:
+    if numbers.problem.black_box and failing and len(outward) > 1:
         # What it claims has been simulated at least once more.
         checked = confirm(run)
         lost = np.isin(checked.table["verdict"].to_numpy(), NOT_CLAIMED)

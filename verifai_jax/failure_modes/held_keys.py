@@ -12,19 +12,20 @@ either joins their likeliest points.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from verifai_jax.estimation.importance import ImportanceSamples
-from verifai_jax.estimation.normal_space import LimitState, fails_at, squared_distances
+from verifai_jax.estimation.normal_space import LimitState, Spent, fails_at, squared_distances
 from verifai_jax.estimation.paths import COST_OF_PATHS, connected
 from verifai_jax.failure_modes.region_search import find_regions
 from verifai_jax.failure_modes.regions import Regions
 
 ASKED = 24
-"""Failures whose keys are tried on one another."""
+"""Failures whose keys are tried on one another, at most, in a sixth of the budget."""
 MAX_KEYS = 4
 """Keys that are held, at most."""
 ENOUGH = 0.9
@@ -32,7 +33,8 @@ ENOUGH = 0.9
 TYPICAL = 0.5
 """Share of the failures left that fail under the next key, at least."""
 FOLLOWED = 300
-"""Failures of which those that fail under a held key are followed to their regions."""
+"""Failures of which those that fail under a held key are followed to their regions, at most; they
+are simulated in a fourth of the budget."""
 
 Held = Callable[[int, int], LimitState]
 """From the number of a random key and a budget to the limit state under that key."""
@@ -47,6 +49,9 @@ class Divided:
     - `joined`, `tried`: failures that a path joins to a region, of so many.
     - `under`: share of the failures that fail under one of the keys.
     - `held`: number of keys.
+    - `design`: row of the likeliest failure of each region; the least distant one when left out.
+    - `failing`: for a system with chance of its own, how many of `times` simulations of each
+      likeliest failure fail.
     """
 
     regions: Regions
@@ -55,6 +60,14 @@ class Divided:
     tried: int
     under: float
     held: int
+    design: tuple[int, ...] = ()
+    failing: tuple[int, ...] = ()
+    times: int = 0
+
+    @property
+    def design_rows(self) -> Int[np.ndarray, " k"]:
+        """Row of the likeliest failure of each region."""
+        return np.array(self.design or self.regions.design_rows, int)
 
     @property
     def note(self) -> str:
@@ -88,30 +101,36 @@ def divide_under_keys(
     **Raises:** `Ended` where time is over.
     """
     x = samples.x[samples.failing]
-    rows = rng.choice(len(x), FOLLOWED, p=x / x.sum())
-    z = samples.failures[rows]
-    keys = _choose_keys(limit_state, held, samples.keys[rows[:ASKED]], z[:ASKED])
+    asked = int(np.clip(np.sqrt(limit_state.left / 6), 1, ASKED))
+    followed = int(np.clip(limit_state.left // (4 * MAX_KEYS), 1, FOLLOWED))
+    rows = rng.choice(len(x), max(asked, followed), p=x / x.sum())
+    keys = _choose_keys(
+        limit_state, held, samples.keys[rows[:asked]], samples.failures[rows[:asked]]
+    )
+    z = samples.failures[rows[:followed]]
     regions, numbers = Regions(z[:0], np.zeros(0, int)), np.zeros(0, int)
     region, looked_at, under = np.full(len(z), -1), np.zeros(len(z), bool), np.zeros(len(z), bool)
     for turn, key in enumerate(keys):
         own = held(key, limit_state.left // (len(keys) - turn))
         failing = fails_at(own, z)
-        new = np.flatnonzero(failing & (region < 0))
-        if len(new):
-            share = np.full(len(new), 1 / len(new))
-            begin = starts[fails_at(own, starts)] if len(starts) else starts
-            found = find_regions(own, rng, z[new], share, begin)
-            new = new[: max(4, own.left // (2 * COST_OF_PATHS * max(1, found.count)))]
-            joined_to = _likeliest_of(own, found, z[new])
-            same = _same_regions(held, regions, numbers, found, key)
-            same = np.where(same >= 0, same, regions.count + np.cumsum(same < 0) - 1)
-            joined = joined_to >= 0
-            region[new[joined]] = same[joined_to[joined]]
-            points = np.concatenate([found.design_points, z[new[joined]]])
-            regions.add(points, np.append(same, region[new[joined]]).astype(int))
-            numbers = np.append(numbers, np.full(len(points), key))
-            looked_at[new] = True
         under |= failing
+        with suppress(Spent):
+            new = np.flatnonzero(failing & (region < 0))
+            if len(new):
+                share = np.full(len(new), 1 / len(new))
+                begin = starts[: own.left // 4]
+                begin = begin[fails_at(own, begin)] if len(begin) else begin
+                found = find_regions(own, rng, z[new], share, begin)
+                new = new[: own.left // (2 * COST_OF_PATHS * max(1, found.count))]
+                joined_to = _likeliest_of(own, found, z[new])
+                same = _same_regions(own, held, regions, numbers, found, key)
+                same = np.where(same >= 0, same, regions.count + np.cumsum(same < 0) - 1)
+                joined = joined_to >= 0
+                region[new[joined]] = same[joined_to[joined]]
+                points = np.concatenate([found.design_points, z[new[joined]]])
+                regions.add(points, np.append(same, region[new[joined]]).astype(int))
+                numbers = np.append(numbers, np.full(len(points), key))
+                looked_at[new] = True
         limit_state.simulations += own.simulations
     if not regions.count:
         return None
@@ -164,7 +183,12 @@ def _choose_keys(
 
 
 def _same_regions(
-    held: Held, regions: Regions, numbers: Int[np.ndarray, " m"], found: Regions, key: int
+    under: LimitState,
+    held: Held,
+    regions: Regions,
+    numbers: Int[np.ndarray, " m"],
+    found: Regions,
+    key: int,
 ) -> Int[np.ndarray, " k"]:
     """Return for each region under a key the earlier one that it is, -1 where it is a new one."""
     same = np.full(found.count, -1)
@@ -175,6 +199,8 @@ def _same_regions(
         others = np.flatnonzero(same < 0)
         there = np.repeat(regions.points[row][None], len(others), axis=0)
         for which in dict.fromkeys((key, int(numbers[row]))):
-            own = held(which, 10 * len(others) + 10)
-            same[others[connected(own, ends[others], there)]] = number
+            own = held(which, max(0, under.left))
+            with suppress(Spent):
+                same[others[connected(own, ends[others], there)]] = number
+            under.simulations += own.simulations
     return same

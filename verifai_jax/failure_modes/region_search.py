@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from verifai_jax.estimation.corners import approach_corner, cost_of_corner
-from verifai_jax.estimation.normal_space import LimitState, fails_at, farthest_first
+from verifai_jax.estimation.normal_space import LimitState, Spent, fails_at, farthest_first
 from verifai_jax.estimation.paths import connected
 from verifai_jax.estimation.towards_origin import approach_origin, come_in_by_parts
 from verifai_jax.failure_modes.regions import Regions
@@ -54,11 +54,27 @@ def find_regions(
     - `share`: the part `[n]` of the failure probability that each stands for, of sum one.
     - `nearest`: further failures `[m, d]`, such as those of searches.
 
-    **Raises:** `Ended` where time is over.
+    **Raises:** `Ended` where time is over, and where the budget is before a region was found.
     """
-    d = limit_state.dim
+    regions = Regions(np.zeros((0, limit_state.dim)), np.zeros(0, int))
+    try:
+        _find(limit_state, rng, regions, z, share, nearest)
+    except Spent:
+        if not regions.count:
+            raise
+    return regions
+
+
+def _find(
+    limit_state: LimitState,
+    rng: np.random.Generator,
+    regions: Regions,
+    z: Float[np.ndarray, "n d"],
+    share: Float[np.ndarray, " n"],
+    nearest: Float[np.ndarray, "m d"],
+) -> None:
+    """Add the regions that are found."""
     maximum = _scaled(limit_state, CANDIDATES)
-    regions = Regions(np.zeros((0, d)), np.zeros(0, int))
     near = z[np.argsort(np.sum(z * z, axis=1))[: max(1, maximum // 4)]]
     drawn = z[rng.choice(len(z), maximum // 2, p=share)]
     _extend(limit_state, rng, regions, np.concatenate([_spread(nearest, maximum), near, drawn]))
@@ -71,7 +87,6 @@ def find_regions(
     _merge(limit_state, regions)
     if limit_state.gradient is not None:
         _approach_corners(limit_state, regions)
-    return regions
 
 
 def share_explained(

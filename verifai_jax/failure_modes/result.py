@@ -42,6 +42,8 @@ class Mode(InNotebook):
       draws.
     - `row`: row of `run` that fails at, or just beyond, the likeliest failure; None if
       none does.
+    - `chance`: where the system has memory or chance of its own, the share of several simulations
+      of the likeliest failure that failed; None for other systems.
     """
 
     number: int
@@ -61,6 +63,7 @@ class Mode(InNotebook):
     key: Key[Array, ""] = field(repr=False)
     precision: str = "float32"
     key_number: int = 0
+    chance: float | None = None
 
     @property
     def random_key(self) -> Key[Array, ""]:
@@ -118,9 +121,10 @@ class Mode(InNotebook):
 
     def _row(self) -> int:
         if self.row is None:
+            how = "with another random key" if self.chance is None else "every time"
             raise ValueError(
                 f"the likeliest failure of mode {self.number} of {self.problem.name!r} does not "
-                "fail when it is simulated again with another random key"
+                f"fail when it is simulated again {how}"
             )
         return self.row
 

@@ -349,11 +349,7 @@ class Run(InNotebook):
                 f"the run of {self.name!r} was loaded without its problem; "
                 "give it: vj.load(path, problem)"
             )
-        if isinstance(row, (int, np.integer)):
-            number, values = int(row), self.table.row(int(row))
-        else:
-            index = getattr(row, "name", None)
-            number, values = None if index is None else int(index), row
+        number, values = self.table.entry(row)
         precision = self.precision if precision is None else precision
         if number is None or not 0 <= number < self.simulations:
             return self._replayed(self.problem, values, number, precision)

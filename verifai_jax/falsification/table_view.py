@@ -8,7 +8,7 @@ table.safe              rows that ended properly and kept it
 """
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -110,6 +110,24 @@ class TableView(InNotebook):
                 _, own = cut((first, batch), number, number + 1)
                 return to_frame(np.array([number]), own).loc[number]
         raise AssertionError(number)
+
+    def entry(
+        self, row: "int | np.integer | pd.Series | Mapping[str, object]"
+    ) -> "tuple[int | None, pd.Series | Mapping[str, object]]":
+        """Return the number, if it is known, and the values of a row by its number or itself.
+
+        **Raises:** `TypeError` for anything else; `IndexError` for a number that the table does not
+        have.
+        """
+        if isinstance(row, int | np.integer) and not isinstance(row, bool):
+            return int(row), self.row(int(row))
+        if isinstance(row, bool | int | np.integer) or not hasattr(row, "items"):
+            raise TypeError(
+                "a row must be the number of a row of the table, such a row, or a mapping with its "
+                f"feature columns; got {row!r}"
+            )
+        name = getattr(row, "name", None)
+        return int(name) if isinstance(name, int | np.integer) else None, row
 
     @property
     def counts(self) -> Counts:

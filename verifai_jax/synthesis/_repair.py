@@ -14,7 +14,7 @@ before and after are those of fresh samples, which the repair has never seen.
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -31,12 +31,14 @@ from verifai_jax.search import Search
 from verifai_jax.statistics.max_min import max_min_step
 from verifai_jax.statistics.smallest_change import smallest_change
 from verifai_jax.synthesis._synthesize import (
+    AIMS,
     ATTACK,
     attack_search,
     check_numbers,
     feature_parameters,
 )
 from verifai_jax.synthesis.adversary import attack
+from verifai_jax.synthesis.failure_counts import FailureCounts
 from verifai_jax.synthesis.held_out import held_out
 from verifai_jax.synthesis.optimize import (
     MIN_BATCH,
@@ -49,7 +51,7 @@ from verifai_jax.synthesis.optimize import (
     has_gradients,
     value_merit,
 )
-from verifai_jax.synthesis.parametric import ArrayParameters, Parametric
+from verifai_jax.synthesis.parametric import ArrayParameters, FeatureParameters, Parametric
 from verifai_jax.synthesis.region import Region, region_of
 from verifai_jax.synthesis.results import Repair, Round
 
@@ -69,6 +71,7 @@ def repair(
     *,
     nominal: Mapping[str, Any] | None = None,
     system_of: Callable[[Any], Any] | None = None,
+    aim: Literal["robustness", "probability"] = "robustness",
     attack: str | Search = "cross_entropy",
     margin: float = 0.0,
     rounds: int = 30,
@@ -91,6 +94,8 @@ def repair(
     - `budget`: simulations at most, the check not counted.
     - `nominal`: values of the parameters to start from; the problem's own when left out.
     - `system_of(parameters) -> system`: pure, and traced by JAX. All features are the environment.
+    - `aim`: the formula in all that an attack finds, or the least failure probability, counted in
+      samples of the prior, where no parameters keep the formula everywhere. No attack is made then.
     - `attack`: the search over the environment that attacks the parameters.
     - `margin`: robustness that is wanted.
     - `rounds`: turns of attack and repair at most.
@@ -117,6 +122,12 @@ def repair(
         raise ValueError(f"the run of {run.name!r} was loaded without its problem; load it with it")
     check_options(budget, batch, seed, max_seconds, None)
     check_numbers(margin, rounds=rounds, held_out=held_out)
+    check_names("aim", [aim], AIMS)
+    if aim == "probability" and system_of is not None:
+        raise ValueError(
+            "arrays of parameters are repaired by gradients, for their robustness; "
+            "aim='probability' needs features as parameters"
+        )
     loop: Parametric
     if system_of is not None:
         loop = _array_parameters(
@@ -131,8 +142,13 @@ def repair(
     sources, begun = sources_of(whole, system_of, made=whole.made_in or ()), time.time()
     limits, checking = split_budget(lambda: loop.simulations, budget, started, max_seconds)
     region = region_of(loop, mass)
+    if aim == "probability":
+        region = region_of(loop, 1.0)  # Samples are of the whole prior.
     assert region is not None
     work = _Repair(loop, start, search, limits, margin, seed, region)
+    if aim == "probability":
+        assert isinstance(loop, FeatureParameters)
+        work.counts = FailureCounts(loop, margin, limits, seed, start)
     try:
         if run is not None:
             work.add_run(run)
@@ -166,6 +182,7 @@ def repair(
         stopped=stopped,
         seed=seed,
         arrays=system_of is not None,
+        counted=None if work.counts is None else (work.counts.failing, work.counts.samples),
         notes=tuple(work.notes),
         make=lambda: loop.with_parameters(theta),
         make_nominal=lambda: loop.with_parameters(start),
@@ -278,6 +295,7 @@ class _Repair:
         self.archive = Archive()
         self.turns: list[Round] = []
         self.notes: list[str] = [region.describe()]
+        self.counts: FailureCounts | None = None
         self.stopped = "rounds"
 
     def add_run(self, run: Run) -> None:
@@ -327,7 +345,15 @@ class _Repair:
         return self.margin + 0.5 * self.slack
 
     def run(self, rounds: int) -> None:
-        """Attack and repair in turn."""
+        """Attack and repair in turn, or count failures."""
+        if (counts := self.counts) is not None:
+            try:
+                counts.run()
+            finally:
+                self.now = Choice(counts.theta, counts.value, counts.samples)
+                self.robustness, self.environments = counts.value, counts.environments
+            self.stopped = "fewest failures" if counts.failing else "repaired"
+            return
         if len(self.environments) and not self.repair_set():
             return
         for number in range(1, rounds + 1):

@@ -13,7 +13,7 @@ which they do worse than in any of the set, choose again. The result is checked 
 
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -21,7 +21,7 @@ from jaxtyping import Float
 from verifai_jax import search as searches
 from verifai_jax.core.budget import Budget, split_budget
 from verifai_jax.core.checks import check_count, check_options
-from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.errors import check_names, suggests_options
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.evaluation.backends import resolved
@@ -31,6 +31,7 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.max_min import max_min_step
 from verifai_jax.synthesis.adversary import attack
+from verifai_jax.synthesis.failure_counts import FailureCounts
 from verifai_jax.synthesis.held_out import HeldOut, draw, held_out
 from verifai_jax.synthesis.optimize import (
     Archive,
@@ -51,6 +52,8 @@ from verifai_jax.synthesis.results import Synthesis
 if TYPE_CHECKING:
     import pandas as pd
 
+AIMS = ("robustness", "probability")
+"""What parameters are chosen for."""
 CANDIDATES = 32
 """Choices of parameters at a time, and at most in the table at the end."""
 STARTS = 4
@@ -70,6 +73,7 @@ def synthesize(
     parameters: Sequence[str] | str | None = None,
     budget: int = 10_000,
     *,
+    aim: Literal["robustness", "probability"] = "robustness",
     attack: str | Search = "cross_entropy",
     margin: float = 0.0,
     environments: int = 16,
@@ -91,6 +95,8 @@ def synthesize(
     - `parameters`: names of the features to choose; all when left out. The others are the
       environment, which varies.
     - `budget`: simulations at most, the check not counted.
+    - `aim`: the greatest robustness, which an attack measures, or the least failure probability,
+      counted in samples of the prior, where no parameters keep the formula everywhere.
     - `attack`: the search over the environment that attacks the parameters.
     - `margin`: robustness that is wanted.
     - `environments`: in the set at first.
@@ -111,6 +117,7 @@ def synthesize(
     started = time.perf_counter()
     check_options(budget, batch, seed, max_seconds, None)
     check_numbers(margin, environments=environments, held_out=held_out)
+    check_names("aim", [aim], AIMS)
     loop = feature_parameters(
         problem, parameters, gradient, batch, budget, precision, backend, seed
     )
@@ -118,7 +125,11 @@ def synthesize(
     sources, begun = problem.sources(), time.time()
     limits, checking = split_budget(lambda: loop.simulations, budget, started, max_seconds)
     region = region_of(loop, mass)
+    if aim == "probability":
+        region = region_of(loop, 1.0)  # Samples are of the whole prior.
     work = _Synthesis(loop, search, limits, margin, environments, seed, region)
+    if aim == "probability":
+        work.counts = FailureCounts(loop, margin, limits, seed)
     try:
         work.run()
         stopped = work.stopped
@@ -156,6 +167,7 @@ def synthesize(
         stopped=stopped,
         seed=seed,
         varied="" if region is None else region.describe(),
+        counted=None if work.counts is None else (work.counts.failing, work.counts.samples),
         sources=sources.settled(begun).to_json(),
     )
 
@@ -198,6 +210,7 @@ class _Synthesis:
         self.stopped = "budget"
         self.attacked: list[Choice] = []
         self.attacks: dict[bytes, int] = {}
+        self.counts: FailureCounts | None = None
         self.final: list[Choice] = []
         self.rho: Any = None  # Of the best, in each environment of the set.
         self.environments: Any = np.zeros((1, 0), np.float32)
@@ -212,6 +225,10 @@ class _Synthesis:
             self.environments = region.project(self.environments)
 
     def run(self) -> None:
+        if self.counts is not None:
+            self.counts.run()
+            self.stopped = self.limits.stopped_by
+            return
         whole = self.limits
         if self.loop.environment is not None:
             # A tenth is kept for comparing the candidates over the whole set at last.
@@ -314,6 +331,8 @@ class _Synthesis:
     @property
     def best(self) -> Choice:
         """The choice of parameters with the greatest least robustness in all attacks."""
+        if (counts := self.counts) is not None:
+            return Choice(counts.theta, counts.value, len(counts.environments))
         if self.attacked:
             known: dict[bytes, Choice] = {}
             for choice in self.attacked:
@@ -332,6 +351,9 @@ class _Synthesis:
 
     def conclude(self) -> None:
         """Evaluate the attacked and the best other choices over the whole set."""
+        if (counts := self.counts) is not None:
+            self.environments, self.rho, self.final = counts.environments, counts.rho, counts.final
+            return
         if self.loop.environment is None:
             return
         pool = Archive()

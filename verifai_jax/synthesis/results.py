@@ -31,8 +31,9 @@ class Synthesis(InNotebook):
     last attack found no environment worse than those of the set; `simulations` (without
     those of the check), `without_verdict` and `seconds`; `stopped`: `"converged"`, `"budget"`,
     `"max_seconds"`, `"no verdict"` or `"interrupted"`; `problem`: the one given; `seed`;
-    `varied`: what was chosen, what the environment varied, and how far; `sources`: what the model
-    was made of, as a run records it.
+    `varied`: what was chosen, what the environment varied, and how far; `counted`: with
+    `aim="probability"`, failures and samples by which the parameters were chosen; `sources`: what
+    the model was made of, as a run records it.
     """
 
     problem: Problem = field(repr=False)
@@ -50,6 +51,7 @@ class Synthesis(InNotebook):
     stopped: str
     seed: int
     varied: str = ""
+    counted: tuple[int, int] | None = None
     sources: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @property
@@ -75,7 +77,9 @@ class Synthesis(InNotebook):
         wanted = f" by the margin of {self.margin:zg}" if self.margin else ""
         lines = [f"synthesis for {self.problem.name}: {shown}"]
         around = self.environments.shape[1] > 1
-        if self.robustness == -np.inf:
+        if self.counted is not None:
+            lines.append(f"  {_counted(self.counted)}")
+        elif self.robustness == -np.inf:
             lines.append("  no simulation with any parameters had a verdict")
         elif self.holds:
             where = f", the least over {self.attacks} simulated environments" if around else ""
@@ -111,9 +115,18 @@ class Synthesis(InNotebook):
         text = f"{self.simulations:,} simulations in {self.seconds:z.1f} s, stopped: {self.stopped}"
         if self.without_verdict:
             text += f"; {self.without_verdict} gave no verdict"
-        if self.environments.shape[1] > 1:
+        if self.environments.shape[1] > 1 and self.counted is None:
             text += "; an attack that finds nothing proves nothing, the check above is the evidence"
         return text
+
+
+def _counted(counts: tuple[int, int]) -> str:
+    """Say how many samples fail with the parameters that were chosen for that."""
+    failing, samples = counts
+    return (
+        f"chosen for the least failure probability: {failing} of {samples} samples of the prior "
+        "fail; the check counts in other samples"
+    )
 
 
 def format_value(value: object) -> str:
@@ -195,9 +208,11 @@ class Repair(Drawn, InNotebook):
     wanted; `change`: distance of the parameters, as in `Round`; `found`: whether the last attack
     found nothing; `simulations` (without those of the check), `without_verdict`, `seconds`;
     `stopped`: `"repaired"`, `"no parameters"` (none found for the set), `"budget"`,
-    `"max_seconds"`, `"rounds"`, `"no verdict"` or `"interrupted"`; `arrays`: whether the
-    parameters are a pytree; `notes`; `seed`; `sources`: what the model was made of, as a run
-    records it; `changed`: says that the model of the run from which it began has changed since.
+    `"max_seconds"`, `"rounds"`, `"fewest failures"`, `"no verdict"` or `"interrupted"`;
+    `arrays`: whether the parameters are a pytree; `notes`; `seed`; `counted`: with
+    `aim="probability"`, failures and samples by which the parameters were chosen; `sources`: what
+    the model was made of, as a run records it; `changed`: says that the model of the run from which
+    it began has changed since.
     """
 
     _picture = "repair", "plot_repair"
@@ -223,6 +238,7 @@ class Repair(Drawn, InNotebook):
     notes: tuple[str, ...] = ()
     make: Callable[[], Problem] | None = field(default=None, repr=False)
     make_nominal: Callable[[], Problem] | None = field(default=None, repr=False)
+    counted: tuple[int, int] | None = None
     sources: Mapping[str, Any] = field(default_factory=dict, repr=False)
     changed: str = ""
 
@@ -267,7 +283,9 @@ class Repair(Drawn, InNotebook):
     def __str__(self) -> str:
         lines = [self.changed] if self.changed else []
         lines.append(f"repair of {self.name}: {self._changes()}")
-        if self.found and not self.change:
+        if self.counted is not None:
+            lines.append(f"  {_counted(self.counted)}")
+        elif self.found and not self.change:
             lines.append("  the nominal parameters were kept: no attack found a failure")
         elif self.found:
             lines.append(
@@ -299,8 +317,9 @@ class Repair(Drawn, InNotebook):
             lines.append("  too rare for the check to compare: see .estimate()")
         if _worse(self.held_out_before, self.held_out_after):
             lines.append("  the change made it worse: keep the nominal parameters")
-        counts = ", ".join(str(turn.counterexamples) for turn in self.rounds)
-        lines.append(f"  counterexamples round by round: {counts}")
+        if self.rounds:
+            counts = ", ".join(str(turn.counterexamples) for turn in self.rounds)
+            lines.append(f"  counterexamples round by round: {counts}")
         text = f"{self.simulations:,} simulations in {self.seconds:z.1f} s, stopped: {self.stopped}"
         if self.without_verdict:
             text += f"; {self.without_verdict} gave no verdict"
