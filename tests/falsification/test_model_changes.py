@@ -3,6 +3,7 @@
 import json
 import sqlite3
 import sys
+from contextlib import closing
 from dataclasses import replace
 from importlib.machinery import EXTENSION_SUFFIXES
 
@@ -259,6 +260,7 @@ def test_a_counterexample_that_gives_another_number_of_itself(tmp_path):
 
 DYNAMIC = """
 import importlib, importlib.util, sqlite3
+from contextlib import closing
 from pathlib import Path
 import numpy as np
 import verifai_jax as vj
@@ -275,7 +277,7 @@ def placed_gain():
     return module.GAIN
 
 def stored_gain():
-    with sqlite3.connect(HERE / ("gain" + ".db")) as base:
+    with closing(sqlite3.connect(HERE / ("gain" + ".db"))) as base:
         return base.execute("SELECT value FROM gain").fetchone()[0]
 
 def problem(gain):
@@ -288,7 +290,7 @@ late, placed, stored = map(problem, (late_gain, placed_gain, stored_gain))
 
 
 def store_gain(file, value):
-    with sqlite3.connect(file) as base:
+    with closing(sqlite3.connect(file)) as base, base:
         base.execute("CREATE TABLE IF NOT EXISTS gain (value REAL)")
         base.execute("DELETE FROM gain")
         base.execute("INSERT INTO gain VALUES (?)", (value,))

@@ -104,6 +104,14 @@ BAD_PAIRS = (
         "environments pass our tests with jax 0.12.0 all the same, so verdicts stand; gymnax "
         "itself promises to work with pip install 'jax<0.12'",
     ),
+    BadPair(
+        "flax",
+        (None, "0.12.9"),
+        "jax",
+        ("0.12", None),
+        "flax.nnx cannot be imported, because it asks for jax.experimental.hijax.HiPrimitive, so "
+        "vj.policy can take no module of nnx; flax.linen works. To use nnx, pip install 'jax<0.12'",
+    ),
 )
 """Known bad pairs."""
 

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtri
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.checks import check_count, check_fraction
@@ -160,7 +161,7 @@ class Wants:
         - `marks`: marks of a row.
         """
 
-        def array(*shape: int, dtype: type = jnp.float32) -> Any:
+        def array(*shape: int, dtype: DTypeLike = jnp.float32) -> Any:
             return jax.ShapeDtypeStruct(shape, dtype)
 
         everything = Observations(
