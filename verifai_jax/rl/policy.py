@@ -111,8 +111,13 @@ class Policy:
         if Path(path).suffix == ".npz":
             save_policy(self, path)
             return Path(path)
+        graph, arrays, start = self.as_graph()
+        return late("verifai_jax.policies.writing", "write")(graph, arrays, start, Path(path))
+
+    def as_graph(self, observation: object = None) -> tuple[Any, Any, Any]:
+        """Return the policy as a graph of ONNX operators, as policies of other frameworks do."""
         as_any = late("verifai_jax.policies.base", "Policy")(self, _act)
-        return as_any.save(path, np.zeros(self.layers[0][0].shape[0]))
+        return as_any.as_graph(np.zeros(self.layers[0][0].shape[0]))
 
 
 def _act(policy: Policy, observation: Array, memory: None) -> tuple[Array, None]:

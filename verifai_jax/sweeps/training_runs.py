@@ -25,7 +25,7 @@ from verifai_jax.rl.policy import Policy
 from verifai_jax.sweeps.clock import Clock, OutOfTime
 from verifai_jax.sweeps.fingerprint import digest
 from verifai_jax.sweeps.hyperparameters import Hyperparameters
-from verifai_jax.sweeps.record import Curve
+from verifai_jax.sweeps.record import Curve, TrainedPolicy
 from verifai_jax.sweeps.study import Study
 
 RECENT = 0.1
@@ -42,7 +42,7 @@ class RunCheckpoint:
     - `seconds`: of one core, without compilation.
     """
 
-    policy: Policy
+    policy: TrainedPolicy
     finite: bool
     curve: Curve
     seconds: float
