@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from verifai_jax.checking import test as test
     from verifai_jax.comparison import Comparison as Comparison
     from verifai_jax.comparison import compare as compare
+    from verifai_jax.comparison import transfer as transfer
     from verifai_jax.core.loggers import CSVLogger as CSVLogger
     from verifai_jax.core.loggers import TensorBoardLogger as TensorBoardLogger
     from verifai_jax.core.trace import Status as Status

@@ -7,15 +7,17 @@ import verifai_jax as vj
 
 
 def sb3_ppo(key, hyperparameters, steps, resume):
+    import gymnasium
     import stable_baselines3 as sb3
 
+    env = gymnasium.make("Pendulum-v1")
     file = resume / "model.zip"
     if file.exists():
-        model = sb3.PPO.load(file, env="Pendulum-v1")
+        model = sb3.PPO.load(file, env=env)
     else:
         seed = int(jax.random.key_data(key)[-1])
         model = sb3.PPO(
-            "MlpPolicy", "Pendulum-v1", seed=seed, n_steps=64, policy_kwargs={"net_arch": [8]},
+            "MlpPolicy", env, seed=seed, n_steps=64, policy_kwargs={"net_arch": [8]},
             **hyperparameters,
         )  # fmt: skip
     model.learn(steps - model.num_timesteps, reset_num_timesteps=False)
