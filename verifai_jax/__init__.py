@@ -119,6 +119,7 @@ if TYPE_CHECKING:
     from verifai_jax.systems.environments import brax as brax
     from verifai_jax.systems.environments import gymnasium as gymnasium
     from verifai_jax.systems.environments import gymnax as gymnax
+    from verifai_jax.systems.environments import playground as playground
     from verifai_jax.systems.mujoco import Scaled as Scaled
     from verifai_jax.systems.mujoco import mjx as mjx
     from verifai_jax.systems.mujoco import mujoco as mujoco

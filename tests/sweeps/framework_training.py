@@ -30,6 +30,10 @@ def brax_ppo(key, hyperparameters, steps, resume):
     from brax.training.agents.ppo import networks, train
     from flax import serialization
 
+    # Brax 0.14 calls what JAX 0.10 has taken out.
+    jax.device_put_replicated = lambda tree, devices: jax.tree.map(
+        lambda leaf: jnp.stack([leaf] * len(devices)), tree
+    )
     file = resume / "weights"
     made = networks.make_ppo_networks(4, 1, policy_hidden_layer_sizes=(8,))
     begun = None

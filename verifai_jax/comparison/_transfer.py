@@ -40,6 +40,8 @@ NUDGE = 2.0**-22
 in single precision. Simulations run in double precision, whose own rounding is far smaller."""
 GROWTH = 3.0
 """Times that growth which a gap must exceed: moves in other directions may grow more."""
+STILL, LEAST = 1e-3, 1e-9
+"""Least unit of a signal, as a part of its greatest value and by itself."""
 
 
 @suggests_options
@@ -354,8 +356,9 @@ def _scales(sides: Sequence[Verdicts]) -> dict[str, float]:
     for name in names:
         values = np.concatenate([each[name] for one in known for each in one])
         values = values[np.isfinite(values)]
-        extent = float(np.ptp(values)) if len(values) else 0.0
-        scales[name] = extent or float(np.max(np.abs(values), initial=0.0)) or 1.0
+        size = float(np.max(np.abs(values), initial=0.0))
+        # What hardly moves is in units of its size, lest its rounding look like a motion.
+        scales[name] = max(float(np.ptp(values)) if len(values) else 0.0, STILL * size, LEAST)
     return scales
 
 

@@ -88,9 +88,7 @@ def traced(
     # JAX sorts the keys of a dictionary.
     inputs = [*held, *sorted(seen), *first]
     translation = _Translation(dict(zip(held, map(np.asarray, values), strict=True)))
-    outputs = translation.translate(
-        closed.jaxpr, [np.asarray(c) for c in closed.consts], list(inputs)
-    )
+    outputs = translation.translate(closed.jaxpr, [_known(c) for c in closed.consts], list(inputs))
     after = [f"memory.{i}.next" for i in range(len(states))]
     for name, value in zip(["action", *after], outputs, strict=True):
         translation.node("Identity", [value], name)
@@ -150,7 +148,7 @@ class _Translation:
         values |= dict(zip(jaxpr.invars, inputs, strict=True))
 
         def read(variable: Jaxpr) -> Any:
-            return np.asarray(variable.val) if hasattr(variable, "val") else values[variable]
+            return _known(variable.val) if hasattr(variable, "val") else values[variable]
 
         for equation in jaxpr.eqns:
             given = [read(v) for v in equation.invars]
@@ -165,10 +163,8 @@ class _Translation:
             plain = getattr(inner, "jaxpr", inner)
             return self.translate(plain, getattr(inner, "consts", ()), given)
         if not any(isinstance(value, str) for value in given) and kind != "pure_callback":
-            made = equation.primitive.bind(*map(jnp.asarray, given), **options)
-            return [
-                np.asarray(m) for m in (made if equation.primitive.multiple_results else [made])
-            ]
+            made = equation.primitive.bind(*map(_on_device, given), **options)
+            return [_known(m) for m in (made if equation.primitive.multiple_results else [made])]
         if kind == "scan":
             return self.scan(given, options)
         if kind == "unstack":
@@ -393,6 +389,16 @@ class _Translation:
             mean = self.node("AveragePool", [image], **attributes, count_include_pad=1)
             made = self.node("Mul", [mean, np.asarray(math.prod(kernel), real)])
         return self.node("Transpose", [made], perm=tuple(int(i) for i in np.argsort(order)))
+
+
+def _known(value: Any) -> Any:
+    """Return a value that does not depend on inputs as NumPy's; a random key has no such form."""
+    is_key = jnp.issubdtype(getattr(value, "dtype", None), jax.dtypes.prng_key)
+    return value if is_key else np.asarray(value)
+
+
+def _on_device(value: Any) -> Any:
+    return jnp.asarray(value) if isinstance(value, np.ndarray | np.generic) else value
 
 
 def _same(one: np.ndarray, other: np.ndarray) -> bool:

@@ -120,9 +120,14 @@ class Bindings:
             )
         return _set(leaves, groups[2], features, self._base)
 
-    def start(self, features: Mapping[str, Any]) -> dict[str, Float[Array, " k"]]:
-        """Return `qpos`, `qvel` and `act` at time 0, and where mocap bodies are, if that is set."""
-        begin = self.model.begin
+    def start(
+        self, features: Mapping[str, Any], begin: Mapping[str, Float[Array, " k"]] | None = None
+    ) -> dict[str, Float[Array, " k"]]:
+        """Return `qpos`, `qvel` and `act` at time 0, and where mocap bodies are, if that is set.
+
+        - `begin`: what they are where no feature sets them; as in the model's keyframe if None.
+        """
+        begin = self.model.begin if begin is None else begin
         bound = {"qpos", "qvel", "act"} | {b.place.array for b in self.state} | set(begin)
         values = {
             name: jnp.asarray(begin.get(name, self._base(name)), _float())
