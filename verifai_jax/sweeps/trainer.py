@@ -207,7 +207,7 @@ class Trainer:
 
     @property
     def name(self) -> str:
-        """What is trained: the kind of the task, or the function."""
+        """Kind of the task, or name of the function that trains."""
         return type(self.task).__name__
 
     def check(self, space: FeatureSpace) -> None:
