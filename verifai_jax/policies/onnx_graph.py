@@ -7,6 +7,7 @@ fixed shapes. Source: the ONNX specification, `docs/IR.md` and `docs/Operators.m
 """
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -19,8 +20,8 @@ from jaxtyping import Array, PyTree
 
 from verifai_jax.core.errors import check_names, require
 from verifai_jax.core.text import one_line
-from verifai_jax.policies.errors import MAX_BYTES, PolicyError
-from verifai_jax.policies.onnx_operators import OPERATORS, Node
+from verifai_jax.policies.errors import MAX_BYTES, MAX_NUMBERS, PolicyError
+from verifai_jax.policies.onnx_operators import OPERATORS, Node, output_size
 
 Values = dict[str, Any]
 
@@ -123,12 +124,14 @@ def run(nodes: Sequence[Node], values: Values) -> None:
 
     **Raises:** `PolicyError` that names the node, its operator and the shapes that it got.
     """
+    total = 0
     for node in nodes:
         absent = [name for name in node.inputs if name and name not in values]
         if absent:
             raise PolicyError(f"{node} reads {absent[0]!r}, an output that is not supported")
         inputs = [values[name] if name else None for name in node.inputs]
         try:
+            _check_size(node, total + output_size(node, *inputs))
             if node.operator == "If":
                 outputs = _branch(node, inputs[0], values)
             else:
@@ -141,7 +144,17 @@ def run(nodes: Sequence[Node], values: Values) -> None:
                 f"{node} cannot be computed from inputs of shapes {shapes}: {one_line(str(error))}"
             ) from error
         outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+        total += sum(int(np.size(made)) for made in outputs)
+        _check_size(node, total)
         values.update(zip(node.outputs, outputs, strict=False))
+
+
+def _check_size(node: Node, count: int) -> None:
+    if count > MAX_NUMBERS:
+        raise PolicyError(
+            f"with {node} the graph computes {count:.3g} numbers, and one of a policy may compute "
+            f"{MAX_NUMBERS:,}"
+        )
 
 
 def _branch(node: Node, condition: Any, values: Values) -> tuple[Any, ...]:
@@ -196,6 +209,9 @@ def read_onnx(
     fed = [i for i in graph.input if i.name not in arrays]
     nodes = _nodes(graph, opset, {*arrays, *(i.name for i in fed)}, path, what)
     weights, constants = _sorted_out(arrays)
+    for each in fed:
+        if math.prod(_shape(each)) > MAX_NUMBERS:
+            raise PolicyError(f"{what} takes an input {each.name!r} of shape {list(_shape(each))}")
     made = [o.name for o in graph.output]
     feeds = dict(_memory(fed, graph.output, memory))
     left = [i for i in fed if i.name not in feeds]
@@ -357,6 +373,8 @@ def _external(tensor: Any, path: Path | None) -> np.ndarray:
     file = path.parent / name
     if length != count or min(offset, count) < 0 or count > MAX_BYTES:
         raise ValueError(f"it says {length} bytes for shape {list(tensor.dims)}")
+    if file.resolve().parent != path.resolve().parent:
+        raise ValueError(f"{name} is a link to another folder")
     if offset + count > file.stat().st_size:
         raise ValueError(f"{name} is smaller than the model says")
     with file.open("rb") as opened:

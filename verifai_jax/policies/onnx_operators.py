@@ -440,40 +440,58 @@ def _where(node: Node, condition: Value, a: Value, b: Value) -> Value:
     return _module(condition, a, b).where(condition, a, b)
 
 
+_OF_NUMPY = {
+    "Add": "add", "Sub": "subtract", "Mul": "multiply", "Pow": "power", "Sqrt": "sqrt",
+    "Exp": "exp", "Log": "log", "Abs": "abs", "Neg": "negative", "Floor": "floor", "Ceil": "ceil",
+    "Round": "round", "Sign": "sign", "Sin": "sin", "Cos": "cos", "Tan": "tan", "Atan": "arctan",
+    "Tanh": "tanh", "Equal": "equal", "Greater": "greater", "Less": "less",
+    "GreaterOrEqual": "greater_equal", "LessOrEqual": "less_equal", "And": "logical_and",
+    "Or": "logical_or", "Xor": "logical_xor", "Not": "logical_not",
+}  # fmt: skip
+"""Operators that are functions of NumPy, entry by entry."""
+_ELEMENTWISE = {*_OF_NUMPY, "Min", "Max", "Sum", "Mean", "Div", "Mod", "PRelu", "Where"}
+
+
+def output_size(node: Node, *inputs: Value | None) -> int:
+    """Return how many numbers an operator gives at most, before it is computed.
+
+    Only for those that can give many more than they take; 0 for all others.
+    """
+    shapes = [np.shape(value) for value in inputs]
+    match node.operator, len(inputs):
+        case "ConstantOfShape", 1:
+            return math.prod(_static(node, inputs[0]))
+        case "Expand", 2:
+            return math.prod(np.broadcast_shapes(shapes[0], _static(node, inputs[1])))
+        case "Tile", 2:
+            return math.prod(shapes[0]) * math.prod(_static(node, inputs[1]))
+        case "Range", 3:
+            start, end, step = (float(np.asarray(value)) for value in inputs)
+            return int(max(0.0, (end - start) / step)) if step else 0
+        case "Pad", _:
+            pads = node.get("pads", ()) if len(inputs) == 1 else _static(node, inputs[1])
+            return math.prod(n + 2 * max(0, 0, *pads) for n in shapes[0])
+        case "Conv" | "MaxPool" | "AveragePool", _:
+            channels = shapes[1][0] if node.operator == "Conv" else shapes[0][1]
+            wide = 2 * max(0, 0, *node.get("pads", ()))
+            return shapes[0][0] * channels * math.prod(n + wide for n in shapes[0][2:])
+        case "Gather", 2:
+            rows = max(1, shapes[0][node.get("axis", 0)])
+            return math.prod(shapes[0]) // rows * math.prod(shapes[1])
+        case "MatMul", 2:
+            a, b = shapes
+            batch = math.prod(np.broadcast_shapes(a[:-2], b[:-2]))
+            return batch * math.prod(a[-2:-1]) * math.prod(b[-1:] if len(b) > 1 else ())
+        case "Gemm", _:
+            return max(shapes[0]) * max(shapes[1])
+        case operator, _ if operator in _ELEMENTWISE:
+            return math.prod(np.broadcast_shapes(*shapes))
+    return 0
+
+
 OPERATORS: dict[str, Callable[..., Any]] = {
-    **{
-        operator: _same(name)
-        for operator, name in {
-            "Add": "add",
-            "Sub": "subtract",
-            "Mul": "multiply",
-            "Pow": "power",
-            "MatMul": "matmul",
-            "Sqrt": "sqrt",
-            "Exp": "exp",
-            "Log": "log",
-            "Abs": "abs",
-            "Neg": "negative",
-            "Floor": "floor",
-            "Ceil": "ceil",
-            "Round": "round",
-            "Sign": "sign",
-            "Sin": "sin",
-            "Cos": "cos",
-            "Tan": "tan",
-            "Atan": "arctan",
-            "Tanh": "tanh",
-            "Equal": "equal",
-            "Greater": "greater",
-            "Less": "less",
-            "GreaterOrEqual": "greater_equal",
-            "LessOrEqual": "less_equal",
-            "And": "logical_and",
-            "Or": "logical_or",
-            "Xor": "logical_xor",
-            "Not": "logical_not",
-        }.items()
-    },
+    **{operator: _same(name) for operator, name in _OF_NUMPY.items()},
+    "MatMul": _same("matmul"),
     "Min": _folded("minimum"),
     "Max": _folded("maximum"),
     "Sum": _folded("add"),
