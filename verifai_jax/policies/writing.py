@@ -393,7 +393,7 @@ class _Translation:
 
 def _known(value: Any) -> Any:
     """Return a value that does not depend on inputs as NumPy's; a random key has no such form."""
-    is_key = jnp.issubdtype(getattr(value, "dtype", None), jax.dtypes.prng_key)
+    is_key = jnp.issubdtype(getattr(value, "dtype", np.bool_), jax.dtypes.prng_key)
     return value if is_key else np.asarray(value)
 
 
