@@ -14,7 +14,7 @@ import argparse
 from pathlib import Path
 
 import jax
-from augmentation_scene import least_gaps, task
+from augmentation_scene import smallest_gaps, task
 
 import verifai_jax as vj
 from verifai_jax.statistics.paired import paired_difference
@@ -46,8 +46,10 @@ def run(args, shifted):
     for metric in result.metrics:
         compare(result, metric)
     differences = result.compare("error", "none")
-    guided, blind = differences["counterexamples"], differences["random"]
-    print(f"\ngain of counterexamples over that of random inputs: {guided.mean / blind.mean:.2f}")
+    by_search, blind = differences["counterexamples"], differences["random"]
+    print(
+        f"\ngain of counterexamples over that of random inputs: {by_search.mean / blind.mean:.2f}"
+    )
     print(f"counterexamples against random: {result.compare('error', 'random')['counterexamples']}")
     errors = {
         arm: result.table.loc[result.table["arm"] == arm, "error"].to_numpy() for arm in result.arms
@@ -67,7 +69,7 @@ def run(args, shifted):
             print(f"loop failures with counterexamples against half of those of {arm}: {half}")
     print(f"\nrules of the error table of seed 0:\n{vj.analysis.rules(result.error_tables[0])}")
     if shifted:
-        gaps, _ = least_gaps(None, jax.random.key(1), 10_240, "truth")
+        gaps, _ = smallest_gaps(None, jax.random.key(1), 10_240, "truth")
         print(
             f"with perfect perception {int((gaps < 0.8).sum())} of {len(gaps)} drives fail; "
             f"least gap {gaps.min():.2f} m"

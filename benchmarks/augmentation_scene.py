@@ -64,8 +64,8 @@ def scene(features, distance):
     """Return the scene with the nearest cone at a distance from the camera."""
     there = features["present"]
     at = features["hue"] * (len(HUES) - 1)
-    place = jnp.clip(jnp.floor(at), 0, len(HUES) - 2).astype(int)
-    colour = HUES[place] + (HUES[place + 1] - HUES[place]) * (at - place)
+    index = jnp.clip(jnp.floor(at), 0, len(HUES) - 2).astype(int)
+    colour = HUES[index] + (HUES[index + 1] - HUES[index]) * (at - index)
     cones = tuple(
         Cone(
             (
@@ -81,11 +81,11 @@ def scene(features, distance):
         for number in range(3)
     )
     ahead = distance + features["ahead"]
-    beside = features["aside"] - features["lateral"]
+    lateral = features["aside"] - features["lateral"]
     cosine, sine = jnp.cos(features["yaw"]), jnp.sin(features["yaw"])
-    body = Box((ahead, beside, 0.3), (4.4, 1.8, 0.6), colour, features["yaw"])
+    body = Box((ahead, lateral, 0.3), (4.4, 1.8, 0.6), colour, features["yaw"])
     cabin = Box(
-        (ahead + 0.3 * cosine, beside + 0.3 * sine, 0.9),
+        (ahead + 0.3 * cosine, lateral + 0.3 * sine, 0.9),
         (2.2, 1.6, 0.55),
         0.6 * colour,
         features["yaw"],
@@ -247,7 +247,7 @@ DRIVES = {
 }
 
 
-def least_gaps(weights, key, drives=512, seen="network"):
+def smallest_gaps(weights, key, drives=512, seen="network"):
     """Return the least gaps of drives from the whole domain, and their features."""
     gaps, rows = [], []
     for number in range(drives // LANES):
@@ -263,7 +263,7 @@ def least_gaps(weights, key, drives=512, seen="network"):
 
 def failure_rate(weights, key):
     """Return the share of 512 drives that end less than 0.8 m before a cone."""
-    return float(np.mean(least_gaps(weights, key)[0] < 0.8))
+    return float(np.mean(smallest_gaps(weights, key)[0] < 0.8))
 
 
 def task(narrow):

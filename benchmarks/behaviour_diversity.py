@@ -57,10 +57,10 @@ def boxes() -> tuple[vj.Problem, Kinds]:
         u, time = f["u"], jnp.arange(24)
         outside = jnp.max(jnp.abs(u - lows - widths[:, None] / 2) - widths[:, None] / 2, axis=1)
         number = jnp.argmin(outside)
-        least = outside[number]
+        lowest = outside[number]
         x = jnp.where(u[0] > 0.7, 0.5, 0.0) * jnp.ones(24)
         # Each box at a time, and on a side, of its own.
-        spike = jnp.where(time // 4 == number % 6, 0.5 - least, 0.0)
+        spike = jnp.where(time // 4 == number % 6, 0.5 - lowest, 0.0)
         up = jnp.where(number < 6, spike, 0.0)
         down = jnp.where(number < 6, 0.0, spike)
         return vj.Trace({"x": x, "up": up, "down": down}, dt=1.0)
@@ -119,15 +119,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--budget", type=int, default=1000)
     arguments = parser.parse_args()
-    ways = {"plain": False, "inputs": True, "behaviour": "behaviour"}
+    settings = {"plain": False, "inputs": True, "behaviour": "behaviour"}
     searches = ("cross_entropy", "portfolio")
-    print(f"| problem | search | {' | '.join(ways)} |")
-    print(f"|---|---|{'---|' * len(ways)}")
+    print(f"| problem | search | {' | '.join(settings)} |")
+    print(f"|---|---|{'---|' * len(settings)}")
     for make in (bands, boxes, balance):
         problem, kinds = make()
         for search in searches:
             cells = []
-            for diverse in ways.values():
+            for diverse in settings.values():
                 counts = []
                 for seed in range(arguments.seeds):
                     # In batches of 16 as the others, which learn once a round.
@@ -138,13 +138,13 @@ def main() -> None:
                     counts.append(len(kinds(run)))
                 cells.append(f"{np.mean(counts):.1f} ({min(counts)} to {max(counts)})")
             print(f"| `{problem.name}` | {search} | {' | '.join(cells)} |", flush=True)
-    problem, most = stages(), 5 * arguments.budget
+    problem, maximum = stages(), 5 * arguments.budget
     for search in searches:
         cells = []
-        for diverse in ways.values():
+        for diverse in settings.values():
             runs = [
                 vj.falsify(
-                    problem, search, most, batch=16, seed=seed, diverse=diverse, stop_after=1,
+                    problem, search, maximum, batch=16, seed=seed, diverse=diverse, stop_after=1,
                     confirm=False, progress=False,
                 )
                 for seed in range(arguments.seeds)

@@ -169,9 +169,9 @@ def policies(configurations, runs, heavy):
         order, taken = random.permutation(heavy), np.zeros(len(rates), int)
 
         def draw(arm, n):
-            places = order[(taken[arm] + np.arange(n)) % heavy]
+            indices = order[(taken[arm] + np.arange(n)) % heavy]
             taken[arm] += n
-            return int(failing[arm, places].sum())
+            return int(failing[arm, indices].sum())
 
         return draw
 

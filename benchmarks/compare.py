@@ -168,8 +168,8 @@ class Regression(NamedTuple):
 def failing(evaluate: Evaluator, gain: float, samples: int, seed: int) -> np.ndarray:
     """Return which of many samples fail with a gain; the same samples for every gain."""
     u = np.random.default_rng(seed).random((samples, evaluate.problem.space.dim), np.float32)
-    place = list(evaluate.problem.space.columns).index("gain")
-    u[:, place] = gain / 2.0
+    index = list(evaluate.problem.space.columns).index("gain")
+    u[:, index] = gain / 2.0
     return np.asarray(evaluate(u, first=0).violated, bool)
 
 

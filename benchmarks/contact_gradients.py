@@ -34,11 +34,11 @@ def balanced(unit: jax.Array) -> jax.Array:
     """Angle of the pole after 1.5 s, for a throw of the pole that `unit` says."""
     low, high = jnp.array([-0.5, -0.1, 0.05]), jnp.array([0.5, 0.1, 0.5])
     values = low + unit * (high - low)
-    places = ("x0", "theta0", "masspole")
+    features = ("x0", "theta0", "masspole")
     system = mujoco_cartpole.cartpole(
-        cartpole.linear(), features=places, duration=1.5, backend="mjx"
+        cartpole.linear(), features=features, duration=1.5, backend="mjx"
     )
-    return system(dict(zip(places, values, strict=True)))["theta"][-1]
+    return system(dict(zip(features, values, strict=True)))["theta"][-1]
 
 
 def compare(name: str, simulate: Callable[[jax.Array], jax.Array]) -> None:

@@ -105,14 +105,14 @@ def physics_steps(problem):
     return system.steps * getattr(getattr(system, "env", None), "_n_frames", 1)
 
 
-def measured_speed(problem, batch, least=0.5):
+def measured_speed(problem, batch, duration=0.5):
     """Physics steps a second: the best of at least three batches."""
     engine = engine_of(problem, batch)
     engine.compile()
     u = points(problem, batch)
     engine.evaluate(u, KEY, 0)
     times = []
-    while len(times) < 3 or sum(times) < least:
+    while len(times) < 3 or sum(times) < duration:
         times.append(seconds(lambda: engine.evaluate(u, KEY, 0)))
     return batch * physics_steps(problem) / min(times)
 
@@ -170,7 +170,7 @@ ONE_THROUGHPUT = """
 import os
 os.sched_setaffinity(0, {cores})
 from benchmarks import engine as bench
-print(bench.measured_speed(bench.{problem}(), 4096, least=2.0))
+print(bench.measured_speed(bench.{problem}(), 4096, duration=2.0))
 """
 
 

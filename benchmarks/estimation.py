@@ -171,14 +171,14 @@ LIMIT_STATES: dict[str, tuple[Callable, int, float | None]] = {
 
 def by_grid(robustness: Callable, step: float = 0.002, end: float = 8.5) -> float:
     """The probability that a limit state in two dimensions fails, by the midpoint rule."""
-    places = np.arange(-end, end, step) + step / 2
-    mass = norm.pdf(places) * step
+    positions = np.arange(-end, end, step) + step / 2
+    mass = norm.pdf(positions) * step
     rows = jax.jit(jax.vmap(jax.vmap(lambda a, b: robustness(jnp.stack([a, b])) < 0, (None, 0)),
                             (0, None)))  # fmt: skip
     total = 0.0
-    for start in range(0, len(places), 250):
+    for start in range(0, len(positions), 250):
         block = slice(start, start + 250)
-        total += mass[block] @ (np.asarray(rows(places[block], places)) @ mass)
+        total += mass[block] @ (np.asarray(rows(positions[block], positions)) @ mass)
     return float(total)
 
 

@@ -124,8 +124,8 @@ def run_quadrotor(problem, budget):
     import verifai_jax as vj
 
     run = vj.falsify(problem, budget=budget, progress=False)
-    least = run.table.all["rho"].min()
-    print(f"{len(run.table.counterexamples)} of {len(run.table)}, {least:.9g}")
+    lowest = run.table.all["rho"].min()
+    print(f"{len(run.table.counterexamples)} of {len(run.table)}, {lowest:.9g}")
 
 
 def hopper():
@@ -178,8 +178,8 @@ def measure(command, checkout, cache):
     return usage.ru_utime + usage.ru_stime, seconds, answered, said
 
 
-def command_of(case, place):
-    """Return the command of a case; `place` is an empty folder."""
+def command_of(case, path):
+    """Return the command of a case; `path` is an empty folder."""
     python = sys.executable
     if case in ("cold", "again", "bound", "budget"):
         gust, budget = 2.1 if case == "bound" else 2.0, 9000 if case == "budget" else 10_000
@@ -189,14 +189,14 @@ def command_of(case, place):
     if case == "brax":
         return [python, __file__, "--brax", "both"]
     if case in ("simulate", "confirm"):
-        return [python, __file__, "--brax", case, str(place / "run")]
+        return [python, __file__, "--brax", case, str(path / "run")]
     if case == "list":
         return [python, "-c", COMMAND, "list"]
     if case == "import":
         return [python, "-c", "import verifai_jax; verifai_jax.Box"]
     if case == "help":
         return [python, "-c", COMMAND, "--help"]
-    folder = ["--folder", str(place / "run"), "--no-progress"]
+    folder = ["--folder", str(path / "run"), "--no-progress"]
     if case == "at1":
         return [python, "-c", COMMAND, "falsify", AT1, "--stop-after", "1", *folder]
     target = ["specs/cartpole.py:balance", "--search", "uniform", "--budget", "20000"]
@@ -211,11 +211,11 @@ def one(case, checkout, caches):
         fill(case, checkout, caches, cache)
     else:
         shutil.rmtree(cache, ignore_errors=True)
-    with tempfile.TemporaryDirectory() as place:
+    with tempfile.TemporaryDirectory() as path:
         if case == "confirm":
-            measure(command_of("simulate", Path(place)), checkout, cache)
+            measure(command_of("simulate", Path(path)), checkout, cache)
             shutil.rmtree(cache)
-        result = measure(command_of(case, Path(place)), checkout, cache)
+        result = measure(command_of(case, Path(path)), checkout, cache)
     if case == "cold":
         shutil.copytree(cache, kept(case, checkout, caches), dirs_exist_ok=True)
     return result
@@ -226,9 +226,9 @@ def fill(case, checkout, caches, cache):
     earlier = kept(case, checkout, caches)
     shutil.rmtree(cache, ignore_errors=True)
     if not earlier.exists():
-        with tempfile.TemporaryDirectory() as place:
+        with tempfile.TemporaryDirectory() as path:
             before = "cold" if case in ("again", "bound", "budget") else case
-            measure(command_of(before, Path(place)), checkout, cache)
+            measure(command_of(before, Path(path)), checkout, cache)
         cache.mkdir(parents=True, exist_ok=True)  # Some compile nothing that is kept.
         shutil.copytree(cache, earlier)
     else:

@@ -3,7 +3,8 @@
     python benchmarks/fuzzing.py                        # 20 seeds each, then one is shrunk
 
 Both draw from the automaton of `specs/handover.py`, a black box in Python, and stop at the first
-counterexample. Uniform sequences are cut off at `MOST` simulations, which counts as the number.
+counterexample. Uniform sequences are cut off at `MAX_SIMULATIONS` simulations, which counts as the
+number.
 """
 
 import argparse
@@ -14,26 +15,28 @@ import numpy as np
 import verifai_jax as vj
 from specs.handover import MODES, handover
 
-MOST = 100_000
+MAX_SIMULATIONS = 100_000
 """Simulations of a run at most."""
 
 
 def fuzzed(seed: int) -> int:
     """Return the number of simulations until `vj.fuzz` finds the fault."""
-    run = vj.fuzz(handover, MOST, cells=MODES, seed=seed, stop_after=1, progress=False)
+    run = vj.fuzz(handover, MAX_SIMULATIONS, cells=MODES, seed=seed, stop_after=1, progress=False)
     return first_failure(run)
 
 
 def sampled(seed: int) -> int:
     """Return the number of simulations until uniform sequences have it."""
-    run = vj.falsify(handover, "uniform", MOST, seed=seed, stop_after=1, batch=1024, progress=False)
+    run = vj.falsify(
+        handover, "uniform", MAX_SIMULATIONS, seed=seed, stop_after=1, batch=1024, progress=False
+    )
     return first_failure(run)
 
 
 def first_failure(run: vj.Run) -> int:
-    """Return the number of the first failing simulation, from 1; `MOST` where none fails."""
+    """Return the number of the first failing simulation, from 1, or `MAX_SIMULATIONS`."""
     violated = run.table.all["violated"].to_numpy()
-    return int(violated.argmax()) + 1 if violated.any() else MOST
+    return int(violated.argmax()) + 1 if violated.any() else MAX_SIMULATIONS
 
 
 def main() -> None:
@@ -52,7 +55,9 @@ def main() -> None:
         print(" ", sorted(counts.tolist()), flush=True)
     lengths = []
     for seed in seeds:
-        run = vj.fuzz(handover, MOST, cells=MODES, seed=seed, stop_after=1, progress=False)
+        run = vj.fuzz(
+            handover, MAX_SIMULATIONS, cells=MODES, seed=seed, stop_after=1, progress=False
+        )
         small = vj.shrink(run)
         lengths.append(int(small.features["events"].length))
     print("events after vj.shrink:", lengths)

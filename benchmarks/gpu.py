@@ -221,8 +221,8 @@ def written(results, text):
     old = re.compile(rf"^{re.escape(HEADING)}\n.*?(?=^## |\Z)", re.DOTALL | re.MULTILINE)
     if old.search(results):
         return old.sub(lambda _: text, results)
-    place = results.find(BEFORE)
-    return results + "\n" + text if place < 0 else results[:place] + text + results[place:]
+    index = results.find(BEFORE)
+    return results + "\n" + text if index < 0 else results[:index] + text + results[index:]
 
 
 def main():

@@ -103,12 +103,14 @@ LANDSCAPES = {
 
 def tell_of(search, state, cube, u, rho, slope):
     """Return the observations of points of one clause, as far as the search asks for them."""
-    told = Observations(u, rho, jnp.ones(len(u), bool), slope if search.wants.gradient else None)
+    observations = Observations(
+        u, rho, jnp.ones(len(u), bool), slope if search.wants.gradient else None
+    )
     if not search.wants.clauses:
-        return told
+        return observations
     plan = search.plan(state, cube, len(u))
     gradients = jnp.zeros((len(u), CLAUSES, u.shape[1])).at[:, 0].set(slope)
-    return told._replace(
+    return observations._replace(
         valid=jnp.arange(len(u)) < plan.rows,
         clauses=jnp.full((len(u), CLAUSES), ABSENT).at[:, 0].set(rho),
         clause_gradients=jnp.where(plan.differentiate, gradients, 0.0),

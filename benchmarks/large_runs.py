@@ -23,7 +23,7 @@ import time
 from pathlib import Path
 
 SIZES = (1_000_000, 10_000_000, 100_000_000)
-MOST_IN_MEMORY = 50_000_000
+MAX_IN_MEMORY = 50_000_000
 """Rows beyond which a run without a folder is left out."""
 
 
@@ -78,9 +78,9 @@ def peak() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
 
 
-def command(rows: int, place: str, *more: str) -> list[str]:
+def command(rows: int, target: str, *more: str) -> list[str]:
     """Return the command of one measurement."""
-    return [sys.executable, __file__, str(rows), "--one", place, *more]
+    return [sys.executable, __file__, str(rows), "--one", target, *more]
 
 
 def kill_in_the_middle(rows: int, folder: Path, seconds: float) -> None:
@@ -117,20 +117,22 @@ def main() -> None:
         folder, killed = temporary / "run", temporary / "killed"
         seconds = 0.0
         try:
-            for place, resumes in (("", False), (folder, False), (folder, False), (killed, True)):
-                if not place and rows > MOST_IN_MEMORY:
+            for target, resumes in (("", False), (folder, False), (folder, False), (killed, True)):
+                if not target and rows > MAX_IN_MEMORY:
                     continue
                 if resumes:
                     kill_in_the_middle(rows, killed, seconds)
                 more = ("--resume",) if resumes else ()
                 output = subprocess.run(
-                    command(rows, str(place), *more), check=True, capture_output=True, text=True
+                    command(rows, str(target), *more), check=True, capture_output=True, text=True
                 ).stdout
                 seen = json.loads(output.splitlines()[-1])
-                if place == folder and not seconds:
+                if target == folder and not seconds:
                     seconds = seen["seconds"]
-                files = [path for path in Path(place or temporary).rglob("*") if path.is_file()]
-                size = f"{sum(path.stat().st_size for path in files) / 1e6:.0f} MB" if place else ""
+                files = [path for path in Path(target or temporary).rglob("*") if path.is_file()]
+                size = (
+                    f"{sum(path.stat().st_size for path in files) / 1e6:.0f} MB" if target else ""
+                )
                 print(
                     f"| {rows:.0e} | {seen['run']} | {seen['seconds']:.1f} "
                     f"| {seen['summary']:.2f} | {seen['counterexamples']:,} "

@@ -25,7 +25,7 @@ from scipy.stats import ncx2, norm
 
 import verifai_jax as vj
 
-LEAST = 0.005
+MIN_MASS = 0.005
 """Part of the probability from which a mode has to be found."""
 
 
@@ -202,7 +202,7 @@ def measure(shape: str, dim: int, count: int, budget: int, seeds: int) -> str:
     """One line of the table."""
     planted = SHAPES[shape](dim, count)
     masses = planted.masses
-    wanted = np.flatnonzero(masses >= LEAST * masses.sum())
+    wanted = np.flatnonzero(masses >= MIN_MASS * masses.sum())
     complete = covered = intervals = extra = 0
     farthest, started = 1.0, time.perf_counter()
     for seed in range(seeds):
@@ -243,8 +243,8 @@ def main() -> None:
     for shape in options.shapes:
         for dim in options.dims:
             for count in options.counts:
-                least, most = DIMENSIONS[shape]
-                if count <= dim * (0.5 if shape in OBLIQUE else 2) and least <= dim <= most:
+                lowest, maximum = DIMENSIONS[shape]
+                if count <= dim * (0.5 if shape in OBLIQUE else 2) and lowest <= dim <= maximum:
                     print(measure(shape, dim, count, options.budget, options.seeds), flush=True)
 
 

@@ -169,11 +169,12 @@ def compositional(seeds: int) -> None:
         print(seed, {name: values[-1] for name, values in counts.items()}, flush=True)
     print("| | median | quartiles | extremes | fewer than uniform |\n|---|---|---|---|---|")
     for name, values in counts.items():
-        least, first, median, third, most = np.quantile(values, [0, 0.25, 0.5, 0.75, 1])
+        lowest, first, median, third, maximum = np.quantile(values, [0, 0.25, 0.5, 0.75, 1])
         fewer = np.median(np.array(counts["uniform"]) / np.array(values))
         print(
-            f"| {name} | {median:,.0f} | {first:,.0f} to {third:,.0f} | {least:,.0f} to "
-            f"{most:,.0f} | {np.median(counts['uniform']) / median:.3g} (of pairs: {fewer:.3g}) |"
+            f"| {name} | {median:,.0f} | {first:,.0f} to {third:,.0f} | {lowest:,.0f} to "
+            f"{maximum:,.0f} | {np.median(counts['uniform']) / median:.3g} (of pairs: "
+            f"{fewer:.3g}) |"
         )
 
 

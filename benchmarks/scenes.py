@@ -26,7 +26,7 @@ warnings.simplefilter("ignore")
 ROOT = Path(__file__).parent.parent
 CONES = ROOT / "tests" / "scenes" / "gallery" / "cones.scenic"
 ROUNDS, BATCH, CALLS, THEIRS = 5, 32_768, 4, 60
-SEEDS, SAMPLED, MOST, PRIOR = 10, 3, 30_000, 500_000
+SEEDS, SAMPLED, MAX_SIMULATIONS, PRIOR = 10, 3, 30_000, 500_000
 
 
 def scenes_per_second() -> None:
@@ -81,7 +81,7 @@ def simulations_to_a_failure() -> None:
     print(f"failure rate: {failed / total:.2e} ({rate}) of {total:,} scenes")
     searched = []
     for seed in range(SEEDS):
-        run = vj.falsify(braking, budget=MOST, stop_after=1, seed=seed, confirm=False)
+        run = vj.falsify(braking, budget=MAX_SIMULATIONS, stop_after=1, seed=seed, confirm=False)
         rows = run.table.all
         broken = np.flatnonzero(rows["violated"].to_numpy(bool))
         searched.append(int(broken[0]) + 1 if len(broken) else len(rows))
@@ -93,7 +93,7 @@ def simulations_to_a_failure() -> None:
     block = 250
     for _ in range(SAMPLED):
         count = 0
-        while count < MOST:
+        while count < MAX_SIMULATIONS:
             drawn = [scene.scenario.generate(maxIterations=10_000)[0] for _ in range(block)]
             rows = pd.DataFrame([scene.features_of(one) for one in drawn])
             features = space.features_of({name: rows[name].to_numpy() for name in rows})

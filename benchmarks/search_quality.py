@@ -31,7 +31,9 @@ OPTIONS = {"halton": {"scramble": True}, "sobol": {"scramble": True}}
 # A grid's result depends on how it lies to the failures, and the predecessor's one-sample rule
 # learns from failures alone: neither has a figure that would say something here.
 LEFT_OUT = ("grid",)
-MOST = 12_288  # Simulations of one seed; one without a failure by then counts as infinite.
+MAX_SIMULATIONS = (
+    12_288  # Simulations of one seed; one without a failure by then counts as infinite.
+)
 SIMULATIONS_A_CALL = 256
 
 
@@ -84,14 +86,14 @@ def first_failures(search, landscape, batch, seeds):
     rounds = max(1, SIMULATIONS_A_CALL // batch)
     first, doubled = np.full(seeds, np.inf), np.full(seeds, np.inf)
     done, spent = np.zeros(seeds), np.zeros(seeds)
-    while done.min() < MOST and np.isinf(first).sum() > (seeds - 1) // 2:
+    while done.min() < MAX_SIMULATIONS and np.isinf(first).sum() > (seeds - 1) // 2:
         state, values, costs = advance(search, rho, cube, batch, rounds, state)
         failing, costs = np.asarray(values) < 0, np.asarray(costs)
         number = done[:, None] + np.cumsum(costs > 0, axis=1)
         price = spent[:, None] + np.cumsum(costs, axis=1)
         found = failing.any(axis=1) & np.isinf(first)
-        place = failing.argmax(axis=1)[found]
-        first[found], doubled[found] = number[found, place], price[found, place]
+        index = failing.argmax(axis=1)[found]
+        first[found], doubled[found] = number[found, index], price[found, index]
         done, spent = number[:, -1], price[:, -1]
     return first, doubled
 

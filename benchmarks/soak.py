@@ -61,7 +61,7 @@ def main() -> int:
     for name in given.names or (*FUZZERS, "memory"):
         if name == "memory":
             report = memory.soak(given.seconds)
-            broken |= report.grown > memory.MOST_GROWTH_GB
+            broken |= report.grown > memory.MAX_GROWTH_GB
             print(f"memory: {report}", flush=True)
             continue
         with _fuzzer(name) as case:

@@ -22,7 +22,7 @@ from verifai_jax.systems.mujoco.system import MuJoCo, mujoco
 MODEL = Path(__file__).with_name("ball.xml")
 RAIL = 2.0
 
-PLACES: dict[str, Any] = {
+BOUND_FEATURES: dict[str, Any] = {
     "speed": "joint/ball/qvel[0]",
     "lift": "joint/ball/qvel[2]",
     "height": "joint/ball/qpos[2]",
@@ -57,7 +57,7 @@ def ball(
     """Make the ball a system with signals `x`, `z`, `speed` (forwards) and `hit`.
 
     - `controller(time, state, features) -> push` in N, forwards; none when left out.
-    - `features`: which of `PLACES` the feature space has.
+    - `features`: which of `BOUND_FEATURES` the feature space has.
     - `duration`: simulated seconds, a multiple of 0.02.
     - `backend`: `"auto"`, `"mjx"` or `"native"`.
 
@@ -65,12 +65,12 @@ def ball(
 
     **Raises:** `UnknownNameError` for a feature that there is no place for.
     """
-    check_names("feature of the ball", features, PLACES)
+    check_names("feature of the ball", features, BOUND_FEATURES)
     return mujoco(
         MODEL,
         duration=duration,
         control_period=0.02,
-        bind={name: PLACES[name] for name in features},
+        bind={name: BOUND_FEATURES[name] for name in features},
         controller=controller,
         initial=None if "height" in features else _on_the_lawn,
         signals={

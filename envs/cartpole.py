@@ -280,9 +280,9 @@ class CartPoleTask:
                 state = state._replace(**{name: getattr(state, name) / 0.05 * farthest})
         features = {}
         ranges = {"masspole": self.masspole_range, "length": self.length_range}
-        for place, (name, spread) in enumerate(ranges.items()):
+        for index, (name, spread) in enumerate(ranges.items()):
             if spread is not None:
-                unit = jax.random.uniform(jax.random.fold_in(key, place), minval=-1.0)
+                unit = jax.random.uniform(jax.random.fold_in(key, index), minval=-1.0)
                 features[name] = NOMINAL[name] * factor(unit, spread)
         return Episode(state, features)
 

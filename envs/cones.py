@@ -134,7 +134,7 @@ class Pose(NamedTuple):
 # --- what there is to see ------------------------------------------------------------------------
 
 
-def cone_places(features: Features) -> Float[Array, "3 2"]:
+def cone_positions(features: Features) -> Float[Array, "3 2"]:
     """Return x and y of the cones; the first one is at x = 0."""
     spacing = feature(features, "cone_spacing")
     x = jnp.concatenate([jnp.zeros(1, spacing.dtype), jnp.cumsum(spacing)])
@@ -145,7 +145,9 @@ def _cones(features: Features) -> tuple[Cone, ...]:
     """Return the cones; 0 stands, 1 to 4 have fallen ahead, left, back, right."""
     slant = math.hypot(CONE_RADIUS, CONE_HEIGHT)
     cones = []
-    for place, lies in zip(cone_places(features), feature(features, "cone_lies"), strict=True):
+    for position, lies in zip(
+        cone_positions(features), feature(features, "cone_lies"), strict=True
+    ):
         turn = (lies - 1.0) * math.pi / 2
         flat = jnp.stack([jnp.cos(turn), jnp.sin(turn)]) * CONE_HEIGHT / slant
         stands = lies == 0
@@ -153,15 +155,15 @@ def _cones(features: Features) -> tuple[Cone, ...]:
             stands, jnp.asarray([0.0, 0.0, 1.0]), jnp.append(flat, -CONE_RADIUS / slant)
         )
         base = jnp.where(stands, 0.0, CONE_RADIUS * CONE_HEIGHT / slant)
-        cones.append(Cone(jnp.append(place, base), CONE_RADIUS, CONE_HEIGHT, CONE_COLOUR, axis))
+        cones.append(Cone(jnp.append(position, base), CONE_RADIUS, CONE_HEIGHT, CONE_COLOUR, axis))
     return tuple(cones)
 
 
 def scene(features: Features, present: Bool[Array, ""] | bool = True) -> Scene:
     """Return road, disabled car and cones; without the cones where they are not `present`."""
     colour = hsv(feature(features, "car_hue"), 0.85, feature(features, "car_value"))
-    places = cone_places(features)
-    x = places[-1, 0] + feature(features, "car_gap") + LENGTH / 2
+    positions = cone_positions(features)
+    x = positions[-1, 0] + feature(features, "car_gap") + LENGTH / 2
     y, yaw = feature(features, "car_offset"), feature(features, "car_yaw")
     body = BoxSolid(jnp.stack([x, y, jnp.full_like(x, 0.25)]), (LENGTH, BREADTH, 0.6), colour, yaw)
     cabin = BoxSolid(
@@ -225,7 +227,7 @@ def render(
 def distance_of_nearest(features: Features, pose: Pose) -> Scalar:
     """Return the distance from the camera to the nearest cone in sight; `NOTHING` without any."""
     x, y = _eye(pose)
-    dx, dy = (cone_places(features) - jnp.stack([x, y])).T
+    dx, dy = (cone_positions(features) - jnp.stack([x, y])).T
     cos, sin = jnp.cos(pose.heading), jnp.sin(pose.heading)
     ahead, left = cos * dx + sin * dy, cos * dy - sin * dx
     in_sight = (ahead > 2.5) & (jnp.abs(left) < ahead * math.tan(FIELD_OF_VIEW / 2))
@@ -234,7 +236,7 @@ def distance_of_nearest(features: Features, pose: Pose) -> Scalar:
 
 def gap_to_cones(features: Features, pose: Pose) -> Scalar:
     """Return the least distance between the car's outline and a cone; negative where they meet."""
-    dx, dy = (cone_places(features) - jnp.stack([pose.x, pose.y])).T
+    dx, dy = (cone_positions(features) - jnp.stack([pose.x, pose.y])).T
     cos, sin = jnp.cos(pose.heading), jnp.sin(pose.heading)
     along = jnp.abs(cos * dx + sin * dy) - LENGTH / 2
     across = jnp.abs(cos * dy - sin * dx) - BREADTH / 2

@@ -22,7 +22,7 @@ from envs.cones import (
     LENGTH,
     NOTHING,
     Pose,
-    cone_places,
+    cone_positions,
     feature,
     render,
 )
@@ -30,7 +30,7 @@ from verifai_jax import Trace
 
 VERGE, ASPHALT, PAINT = "#dfe7d5", "#5b6069", "#f4f4f2"
 FINE, BROKEN, PLASTIC = "#3a7ca5", "#d1495b", "#ff6a13"
-BEHIND, AHEAD = 32.0, 22.0
+BACKWARD, AHEAD = 32.0, 22.0
 """Metres of the plan before the first cone, and beyond it."""
 
 _look = jax.jit(render)
@@ -109,17 +109,19 @@ def _draw_plan(
 
     low, high = -LANE / 2, 1.5 * LANE
     axes.set_facecolor(VERGE)
-    axes.add_patch(Rectangle((-BEHIND, low - 0.4), BEHIND + AHEAD, high - low + 0.8, color=ASPHALT))
+    axes.add_patch(
+        Rectangle((-BACKWARD, low - 0.4), BACKWARD + AHEAD, high - low + 0.8, color=ASPHALT)
+    )
     for edge in (low, high):
-        axes.plot([-BEHIND, AHEAD], [edge, edge], color=PAINT, linewidth=1)
-    axes.plot([-BEHIND, AHEAD], [LANE / 2] * 2, color=PAINT, linewidth=1, dashes=(4, 4))
-    places = np.asarray(cone_places(features))
+        axes.plot([-BACKWARD, AHEAD], [edge, edge], color=PAINT, linewidth=1)
+    axes.plot([-BACKWARD, AHEAD], [LANE / 2] * 2, color=PAINT, linewidth=1, dashes=(4, 4))
+    positions = np.asarray(cone_positions(features))
     hue, value = (float(feature(features, name)) for name in ("car_hue", "car_value"))
-    x = float(places[-1, 0]) + float(feature(features, "car_gap")) + LENGTH / 2
+    x = float(positions[-1, 0]) + float(feature(features, "car_gap")) + LENGTH / 2
     parked = x, float(feature(features, "car_offset")), float(feature(features, "car_yaw"))
     axes.add_patch(Polygon(_outline(*parked), color=hsv_to_rgb((hue, 0.85, value))))
-    for place in places:
-        axes.add_patch(Circle(tuple(place), 1.6 * CONE_RADIUS, color=PLASTIC, zorder=4))
+    for position in positions:
+        axes.add_patch(Circle(tuple(position), 1.6 * CONE_RADIUS, color=PLASTIC, zorder=4))
     past = slice(0, sample + 1)
     axes.plot(np.asarray(trace["x"])[past], np.asarray(trace["offset"])[past], color="#f2c14e")
     color = BROKEN if now["cone_gap"] < 0.1 else FINE
@@ -130,7 +132,7 @@ def _draw_plan(
         reach = 14.0 * np.array([math.cos(angle), math.sin(angle)])
         ends = np.array(here[:2]) + np.outer([0, 1], reach)
         axes.plot(*ends.T, color=PAINT, linewidth=0.6, alpha=0.7)
-    axes.set_xlim(-BEHIND, AHEAD)
+    axes.set_xlim(-BACKWARD, AHEAD)
     axes.set_ylim(low - 0.8, high + 0.8)
     axes.set_aspect("equal")
     axes.set_xticks([])

@@ -175,8 +175,8 @@ class HopperTask:
         spread = jnp.array([0.0, 0.0, 0.05, 0.05, 0.05, 0.05])
         qpos = jnp.asarray(STANCE, jnp.float32) + spread * _even(pose, 6)
         spread = jnp.array([0.5, 0.1, 0.3, 0.3, 0.3, 0.3])
-        least, most = jnp.array(list(TRAINED_FOR.values())).T
-        made = least + (most - least) * jax.random.uniform(body, (4,))
+        lowest, maximum = jnp.array(list(TRAINED_FOR.values())).T
+        made = lowest + (maximum - lowest) * jax.random.uniform(body, (4,))
         return State(qpos, spread * _even(speed, 6), jnp.zeros(6), jnp.zeros(3), made)
 
     def step(

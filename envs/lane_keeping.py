@@ -262,8 +262,8 @@ class LaneKeepingTask:
 
     def reset(self, key: Key[Array, ""]) -> Drive:
         """Start somewhere in the lane, on a road of 300 m with radii of at least 300 m."""
-        place, road = jax.random.split(key)
-        offset, heading, speed = jax.random.uniform(place, (3,), minval=-1.0, maxval=1.0)
+        position, road = jax.random.split(key)
+        offset, heading, speed = jax.random.uniform(position, (3,), minval=-1.0, maxval=1.0)
         knots = jax.random.uniform(road, (7,), minval=-1 / 300, maxval=1 / 300)
         features = {
             "offset0": 0.6 * offset,

@@ -9,7 +9,7 @@ import numpy as np
 from envs.lane_keeping import CAR_WIDTH, FRONT, LANE_WIDTH, REAR, feature
 from verifai_jax import Trace
 
-BEHIND, AHEAD = 11.0, 25.0
+BACKWARD, AHEAD = 11.0, 25.0
 BELOW, ABOVE = 7.5, 10.5
 VERGE, ASPHALT, PAINT = "#dfe7d5", "#5b6069", "#f4f4f2"
 FINE, BROKEN, TRAIL = "#3a7ca5", "#d1495b", "#f2c14e"
@@ -32,7 +32,7 @@ def draw(axes: Any, trace: Trace, sample: int, features: Mapping[str, Any]) -> N
     past = slice(0, sample + 1)
     distance, offset = (np.asarray(trace[name])[past] for name in ("distance", "offset"))
     near = distance >= road.first
-    axes.plot(*road.place(distance[near], offset[near]), color=TRAIL, linewidth=1.6)
+    axes.plot(*road.position(distance[near], offset[near]), color=TRAIL, linewidth=1.6)
 
     over = min(now["left"], now["right"]) < 0
     color = BROKEN if over else FINE
@@ -45,7 +45,7 @@ def draw(axes: Any, trace: Trace, sample: int, features: Mapping[str, Any]) -> N
         color=BROKEN if over else "#30323d",
         family="monospace",
     )
-    axes.set_xlim(-BEHIND, AHEAD)
+    axes.set_xlim(-BACKWARD, AHEAD)
     axes.set_ylim(-BELOW, ABOVE)
     axes.set_aspect("equal")
     axes.set_xticks([])
@@ -59,7 +59,7 @@ class _Road:
 
     def __init__(self, features: Mapping[str, Any], here: float) -> None:
         margin = 15.0
-        self.first, self.last = here - BEHIND - margin, here + AHEAD + margin
+        self.first, self.last = here - BACKWARD - margin, here + AHEAD + margin
         self.distance = np.linspace(self.first, self.last, 321)
         step = self.distance[1] - self.distance[0]
         curvature = np.asarray(feature(features, "curvature", self.distance))
@@ -72,7 +72,7 @@ class _Road:
         self.x = x - np.interp(here, self.distance, x)
         self.y = y - np.interp(here, self.distance, y)
 
-    def place(self, distance: Any, offset: Any) -> tuple[np.ndarray, np.ndarray]:
+    def position(self, distance: Any, offset: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return points of the plane at distances along the road and offsets to its left."""
         x, y, direction = (
             np.interp(distance, self.distance, values)
@@ -86,7 +86,7 @@ class _Road:
         """Draw a line beside the road's middle."""
         first = self.first if begin is None else begin
         last = self.last if end is None else end
-        return self.place(np.linspace(first, last, 60), offset)
+        return self.position(np.linspace(first, last, 60), offset)
 
     def band(self, right: float, left: float, color: str) -> Any:
         """Fill the surface between two offsets."""

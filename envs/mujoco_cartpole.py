@@ -23,7 +23,7 @@ from verifai_jax.systems.mujoco.system import MuJoCo, mujoco
 MODEL = Path(__file__).with_name("mujoco_cartpole.xml")
 
 # What each feature sets. A pole of another length has its middle elsewhere.
-PLACES: dict[str, Any] = {
+BOUND_FEATURES: dict[str, Any] = {
     "x0": "joint/slider/qpos",
     "x_dot0": "joint/slider/qvel",
     "theta0": "joint/hinge/qpos",
@@ -60,14 +60,15 @@ def cartpole(
 
     - `controller(time, state, features) -> force` in N, of `envs.cartpole`; `linear()` when left
       out.
-    - `features`: which of `PLACES` the feature space has. Others go to the controller alone.
+    - `features`: which of `BOUND_FEATURES` the feature space has. Others go to the controller
+      alone.
     - `duration`: simulated seconds, a multiple of 0.02.
     - `terminate`: end where CartPole-v1 would; otherwise the pole may fall and the cart run on.
     - `backend`: `"auto"`, `"mjx"` or `"native"`.
 
     **Raises:** `UnknownNameError` for a feature that there is no place for.
     """
-    check_names("feature of the MuJoCo cart-pole", features, PLACES)
+    check_names("feature of the MuJoCo cart-pole", features, BOUND_FEATURES)
     chosen = analytic.linear() if controller is None else controller
 
     def control(time: Array, state: State, features: Mapping[str, Any]) -> Array:
@@ -77,7 +78,7 @@ def cartpole(
         MODEL,
         duration=duration,
         control_period=analytic.DT,
-        bind={name: PLACES[name] for name in features},
+        bind={name: BOUND_FEATURES[name] for name in features},
         controller=control,
         signals={
             "x": "joint/slider/qpos",

@@ -28,8 +28,8 @@ def check_ranges(task: Any, farthest: Mapping[str, float]) -> None:
     """
     for field in dataclasses.fields(task):
         name, value = field.name, getattr(task, field.name)
-        most = farthest.get(name, math.inf)
+        maximum = farthest.get(name, math.inf)
         # JAX puts tracers and placeholders into a pytree's places too.
-        if isinstance(value, int | float) and not 0 <= value <= most:
-            wanted = "at least 0" if most == math.inf else f"between 0 and {most:g}"
+        if isinstance(value, int | float) and not 0 <= value <= maximum:
+            wanted = "at least 0" if maximum == math.inf else f"between 0 and {maximum:g}"
             raise ValueError(f"{type(task).__name__}'s {name} must be {wanted}; got {value}")

@@ -145,11 +145,11 @@ def reacher(
 
     def initial(features: Any, key: Any, qpos: Any, qvel: Any) -> tuple[Any, Any]:
         names = ("shoulder0", "elbow0", "target_angle", "target_radius")
-        places = [
+        positions = [
             qpos[k] if name in varied else jnp.asarray(NOMINAL[name], qpos.dtype)
             for k, name in enumerate(names)
         ]
-        return jnp.stack(places), qvel
+        return jnp.stack(positions), qvel
 
     return mujoco(
         MODEL,

@@ -28,7 +28,7 @@ TRAINING = Training(
     file=POLICY_FILE,
     steps=500_000,
     solved=SOLVED,
-    most=500,
+    maximum=500,
 )
 
 

@@ -32,7 +32,7 @@ TRAINING = Training(
     file=POLICY_FILE,
     steps=4_000_000,
     solved=SOLVED,
-    most=750,
+    maximum=750,
     seed=1,
     episodes=256,
 )

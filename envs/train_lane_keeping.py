@@ -29,7 +29,7 @@ TRAINING = Training(
     file=POLICY_FILE,
     steps=2_000_000,
     solved=SOLVED,
-    most=250,
+    maximum=250,
 )
 
 

@@ -16,7 +16,7 @@ class Training:
     """A task, the options of its training, and the return at which it counts as learned.
 
     - `steps`, `seed`: of the network that is shipped in `file`.
-    - `solved`: the mean return to reach, of at most `most`, over `episodes` that it was not
+    - `solved`: the mean return to reach, of at most `maximum`, over `episodes` that it was not
       trained on.
     """
 
@@ -26,7 +26,7 @@ class Training:
     file: Path
     steps: int
     solved: float
-    most: int
+    maximum: int
     seed: int = 0
     episodes: int = 1000
 
@@ -47,7 +47,7 @@ class Training:
         mean_return = float(returns.mean())
         print(
             f"{trained.steps[-1]} steps in {seconds:.1f} s, compile included; "
-            f"mean return {mean_return:.1f} of {self.most}, "
+            f"mean return {mean_return:.1f} of {self.maximum}, "
             f"worst {returns.min():.0f} of {len(returns)} episodes"
         )
         if mean_return < self.solved:

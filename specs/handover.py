@@ -46,7 +46,7 @@ TRAFFIC = vj.events.Automaton(
             for name, event in COMMON.items()
         },
     },
-    most=8,
+    max_events=8,
 )
 
 

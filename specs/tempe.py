@@ -36,7 +36,7 @@ FLOW = "eventually ego_y > 10"
 PREMISE = "always (until_conflict > 0.5 -> visible < 0)"
 """Stopped traffic hides the cars from each other until half a second before they meet."""
 
-MOST_NOTICE = 4.0
+MAX_NOTICE = 4.0
 
 PROGRAM = Path(__file__).with_name("tempe.scenic")
 """The same situation as a Scenic program."""
@@ -50,7 +50,7 @@ space = vj.FeatureSpace(
         "delay": vj.Box(0.0, 3.0),
         "reaction": vj.Box(0.1, 0.3),
         "brake": vj.Box(6.0, 8.5),
-        "notice": vj.Box(0.0, MOST_NOTICE),
+        "notice": vj.Box(0.0, MAX_NOTICE),
     }
 )
 
@@ -141,7 +141,7 @@ def collisions(
     points = np.random.default_rng(seed).uniform(size=(samples, len(features)))
     rows = []
     for notice in notices:
-        points[:, chosen] = notice / MOST_NOTICE
+        points[:, chosen] = notice / MAX_NOTICE
         run = vj.falsify(
             problem, PointList(points), samples, batch=4096, confirm=False, progress=False
         )
@@ -201,8 +201,8 @@ def failing_notices(
     `longest` notice among these, NaN where there is none.
     """
     rows = []
-    while floor < MOST_NOTICE:
-        domains = {**problem.space.domains, "notice": vj.Box(floor, MOST_NOTICE)}
+    while floor < MAX_NOTICE:
+        domains = {**problem.space.domains, "notice": vj.Box(floor, MAX_NOTICE)}
         above = vj.Problem(problem.name, domains, problem.system, problem.spec)
         run = vj.falsify(above, "cross_entropy", budget, seed=seed, batch=1024, progress=False)
         # Collisions that finer steps and double precision confirm.

@@ -16,6 +16,18 @@ SHARE_OF_ANY = 0.05
 SHADOWED_MODULES = 10
 """Modules hidden by a function of the same name that their package exports, at most."""
 
+DIALECT = {"place", "places", "most", "least", "fewest", "told", "behind", "beside"}
+"""Words of names that another one says better: index or position, `max_`, `min_`, observations,
+after, alongside."""
+
+USUAL = {
+    "most_likely_action",  # The superlative of an adjective is no limit.
+    "at_least",  # Plain English for a bound.
+    "_at_least",
+    "at_most",
+}
+"""Names with such a word that are plain English."""
+
 Documented = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
 
 
@@ -130,3 +142,37 @@ def test_signs_of_zeros_are_noticed():
         (1, ".3g"),
         (1, ".1f"),
     ]
+
+
+def bound_names(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield the names that a file gives to arguments, variables, attributes and functions."""
+    for node in ast.walk(tree):
+        if isinstance(node, Documented):
+            yield node.lineno, node.name
+        elif isinstance(node, ast.arg):
+            yield node.lineno, node.arg
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.lineno, node.id
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+            yield node.lineno, node.attr
+
+
+def is_dialect(name: str) -> bool:
+    return name not in USUAL and bool(DIALECT & set(name.lower().split("_")))
+
+
+def test_names_are_plain_english():
+    wrong = [str(file) for file in FILES if is_dialect(file.stem)]
+    wrong += [
+        f"{file.relative_to(PACKAGE)}:{line} {name}"
+        for file in FILES
+        for line, name in bound_names(ast.parse(file.read_text()))
+        if is_dialect(name)
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_names_that_are_dialect_are_noticed():
+    source = "def f(most):\n    self.last_place = 1\nclass Placed:\n    least_x: int = 0\n"
+    names = [name for _, name in bound_names(ast.parse(source)) if is_dialect(name)]
+    assert sorted(names) == ["last_place", "least_x", "most"]

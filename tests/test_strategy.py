@@ -16,7 +16,7 @@ EVENTS = vj.events.Automaton(
         ("off", "on"): {"to": "on", "wait": vj.Box(0.1, 1)},
         ("on", "push"): {"wait": vj.Box(0.1, 1), "force": vj.Box(0, 10)},
     },
-    most=4,
+    max_events=4,
 )
 SPACE = vj.FeatureSpace(
     {"x": vj.Box(-1, 1), "n": vj.DiscreteBox(0, 5), "kind": vj.Categorical("a", "b"), "e": EVENTS},

@@ -48,9 +48,9 @@ SHORTEST_PAUSE, LONGEST_PAUSE = 0.05, 2.0
 """Seconds between two attempts to connect."""
 GREETING_SECONDS = 10.0
 """Seconds within which a server must say hello."""
-GREETING_BYTES, MOST_BYTES = 1 << 16, 16 << 20
+GREETING_BYTES, MAX_BYTES = 1 << 16, 16 << 20
 """Bytes of a server's hello, and of any later message, beyond which it is none."""
-MOST_LOGGED = 20
+MAX_LOGGED = 20
 """Errors of one server that are logged."""
 RESERVED = ("dt", "times", "valid")
 """Names in a result that are no signals."""
@@ -101,10 +101,10 @@ class Waveform:
         gaps = np.diff(times)
         if held:
             shortest = gaps.min() if count > 1 else self.duration or 1.0
-            late = time + 1e-5 * shortest
-            piece = max(int(np.searchsorted(times, late, side="right")) - 1, 0)
+            later = time + 1e-5 * shortest
+            piece = max(int(np.searchsorted(times, later, side="right")) - 1, 0)
             width = shortest / 2 if self.width is None else self.width
-            on = self.hold == "constant" or 0 <= late - times[piece] < width
+            on = self.hold == "constant" or 0 <= later - times[piece] < width
             return self.knots[piece] if on else 0 * self.knots[piece]
         if count == 1:
             return self.knots[0]
@@ -226,8 +226,8 @@ class _Connection:
         self.welcome = False  # Whether the server has handed out a point.
         self.capacity = capacity
         self._received = bytearray()
-        self._most = GREETING_BYTES
-        self._told = 0
+        self._max_bytes = GREETING_BYTES
+        self._described = 0
         self._points: deque[dict[str, Any]] = deque()
         self._unsent: list[bytes] = []
         try:
@@ -241,7 +241,7 @@ class _Connection:
                 self.socket = _encrypted(self.socket, tls, host)
             self._greet(token, name)
             self.socket.settimeout(None)
-            self._most = MOST_BYTES
+            self._max_bytes = MAX_BYTES
         except BaseException:
             self.socket.close()
             raise
@@ -257,9 +257,9 @@ class _Connection:
                 flushed = time.monotonic()
             point = self._points.popleft()
             self._unsent.append(answer(point, simulate))
-            late = time.monotonic() - flushed > FLUSH_SECONDS
+            overdue = time.monotonic() - flushed > FLUSH_SECONDS
             many = 4 * len(self._unsent) >= self.capacity
-            if late or many or sum(map(len, self._unsent)) > FLUSH_BYTES:
+            if overdue or many or sum(map(len, self._unsent)) > FLUSH_BYTES:
                 self._flush()
                 flushed = time.monotonic()
                 if self._readable():
@@ -320,8 +320,8 @@ class _Connection:
                 case "bye":
                     raise EOFError("the run has ended")
                 case "error":
-                    self._told += 1
-                    if self._told <= MOST_LOGGED:
+                    self._described += 1
+                    if self._described <= MAX_LOGGED:
                         log.warning("the server says: %s", plain(message.get("message")))
                     if message.get("fatal") and not self.welcome:
                         raise _refusal(message)
@@ -336,8 +336,8 @@ class _Connection:
         if len(self._received) < 4:
             return None
         length = struct.unpack_from(">I", self._received)[0]
-        if length > self._most:
-            raise _no_run(f"it announces {length} bytes, more than {self._most}")
+        if length > self._max_bytes:
+            raise _no_run(f"it announces {length} bytes, more than {self._max_bytes}")
         end = 4 + length
         if len(self._received) < end:
             return None
@@ -473,7 +473,7 @@ def encoded(number: int, result: object) -> bytes:
     raw: list[bytes] = []
     at = 0
 
-    def place(name: str, value: object) -> dict[str, Any]:
+    def packed(name: str, value: object) -> dict[str, Any]:
         nonlocal at
         array = _with_gaps(value)
         if array.dtype.kind not in "biuf":
@@ -488,11 +488,11 @@ def encoded(number: int, result: object) -> bytes:
         return {"$array": kind, "shape": array.shape, "at": at - len(raw[-1])}
 
     header: dict[str, Any] = {"type": "result", "id": number}
-    header["signals"] = {str(name): place(f"signal {name!r}", v) for name, v in signals.items()}
+    header["signals"] = {str(name): packed(f"signal {name!r}", v) for name, v in signals.items()}
     if about["dt"] is not None:
         header["dt"] = float(about["dt"])
     if about["times"] is not None:
-        header["times"] = place("times", about["times"])
+        header["times"] = packed("times", about["times"])
     if about["valid"] is not None:
         header["valid"] = int(about["valid"])
     return b"".join((_framed({**header, "bytes": at}), *raw))
@@ -519,20 +519,20 @@ def function_of(text: str) -> Callable[..., Any]:
 
     **Raises:** `ValueError` where there is none.
     """
-    place, _, name = text.rpartition(":")
-    if place.endswith(".py"):
-        spec = importlib.util.spec_from_file_location(Path(place).stem, place)
-        if spec is None or spec.loader is None or not Path(place).exists():
-            raise ValueError(f"no file {place}")
+    path, _, name = text.rpartition(":")
+    if path.endswith(".py"):
+        spec = importlib.util.spec_from_file_location(Path(path).stem, path)
+        if spec is None or spec.loader is None or not Path(path).exists():
+            raise ValueError(f"no file {path}")
         module = importlib.util.module_from_spec(spec)
         sys.modules[spec.name] = module
         spec.loader.exec_module(module)
-    elif place:
-        module = importlib.import_module(place)
+    elif path:
+        module = importlib.import_module(path)
     else:
         raise ValueError(f"a simulator is MODULE:FUNCTION or FILE.py:FUNCTION; got {text!r}")
     if not callable(getattr(module, name, None)):
-        raise ValueError(f"{place} has no function {name!r}")
+        raise ValueError(f"{path} has no function {name!r}")
     return getattr(module, name)
 
 
@@ -554,7 +554,7 @@ def main(arguments: list[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     # Run by its path, the folder of this file would hide modules of other names: `trace`, `search`.
     here = str(Path(__file__).parent)
-    sys.path[:] = [os.getcwd(), *(place for place in sys.path if place not in ("", here))]
+    sys.path[:] = [os.getcwd(), *(path for path in sys.path if path not in ("", here))]
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     try:
         host, port = address_of(given.address)

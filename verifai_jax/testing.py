@@ -370,10 +370,10 @@ def _check_fold(
             )
 
 
-def _agree_all(alone: list[Trace], batch: Trace, tolerance: float, ways: str) -> None:
+def _agree_all(alone: list[Trace], batch: Trace, tolerance: float, results: str) -> None:
     for i, trace in enumerate(alone):
         row = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], batch)
-        _agree(trace, row, tolerance, f"a simulation must give the same {ways}")
+        _agree(trace, row, tolerance, f"a simulation must give the same {results}")
 
 
 def _agree(one: Trace, other: Trace, tolerance: float, law: str) -> None:
@@ -401,11 +401,11 @@ def _evaluate(u: Array, search: Search, pending: PyTree, cube: Cube) -> Observat
     rho, gradient = jnp.sum(offset**2, axis=1) - 0.01, 2 * offset
     valid = jnp.ones(len(u), bool)
     observations = Observations(u, rho, valid, gradient if search.wants.gradient else None)
-    if search.wants.marks:
+    if search.wants.coverage_ids:
         # What is covered depends on the first coordinate, and some rows cover less.
         first = (u[:, :1] * 5).astype(jnp.int32) if cube.dim else jnp.zeros((len(u), 1), jnp.int32)
-        marks = jnp.concatenate([first, jnp.where(rho[:, None] < 0, 7, -1)], axis=1)
-        observations = observations._replace(marks=marks)
+        coverage_ids = jnp.concatenate([first, jnp.where(rho[:, None] < 0, 7, -1)], axis=1)
+        observations = observations._replace(coverage_ids=coverage_ids)
     if search.wants.outcomes:
         # One of two predicates decides, and the shape follows the first coordinate.
         first = u[:, :1] if cube.dim else jnp.zeros((len(u), 1), jnp.float32)

@@ -52,17 +52,17 @@ def _whole() -> pd.DataFrame:
 
 @functools.cache
 def _base() -> Path:
-    place = Path(tempfile.mkdtemp(prefix="folders-"))
-    _falsify(BEGUN, place / "run")
-    return place / "run"
+    root = Path(tempfile.mkdtemp(prefix="folders-"))
+    _falsify(BEGUN, root / "run")
+    return root / "run"
 
 
 def case(number: int) -> str:
     """Damage a folder, and use it. **Returns:** what came of it."""
     random_ = chance(number, "folders")
     whole = _whole()
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(place) / "run"
+    with tempfile.TemporaryDirectory() as root:
+        folder = Path(root) / "run"
         shutil.copytree(_base(), folder)
         for _ in range(random_.choice((1, 1, 1, 2, 3))):
             damage(folder, random_)
@@ -70,7 +70,7 @@ def case(number: int) -> str:
         try:
             run = vj.load(folder, _problem())
         except NAMED as error:
-            told(error)
+            check_described(error)
             return "refused"
         _rows(run.table.all, whole)
         if not run.summary():
@@ -78,7 +78,7 @@ def case(number: int) -> str:
         try:
             resumed = vj.resume(run, budget=BUDGET, progress=False)
         except NAMED as error:
-            told(error)
+            check_described(error)
             return "loaded, not resumed"
         if run.damage:
             raise Broken(f"a damaged run went on: {run.damage}")
@@ -96,7 +96,7 @@ def _printed(folder: Path) -> None:
         raise Broken(f"the command line prints {done.output[-300:]!r}")
 
 
-def told(error: Exception) -> None:
+def check_described(error: Exception) -> None:
     """Check that an error says something, and not a book."""
     message = str(error)
     if not message or len(message) > 3000:
@@ -148,21 +148,21 @@ def _forge(file: Path, random_: random.Random) -> None:
         content = json.loads(file.read_text())
     except (ValueError, RecursionError):
         return
-    places: list[tuple[Any, Any]] = []
+    entries: list[tuple[Any, Any]] = []
 
     def walk(node: Any) -> None:
         items = node.items() if isinstance(node, dict) else enumerate(node)
         for key, value in list(items):
-            places.append((node, key))
+            entries.append((node, key))
             if isinstance(value, dict | list):
                 walk(value)
 
     if isinstance(content, dict | list):
         walk(content)
-    if not places or random_.random() < 0.05:
+    if not entries or random_.random() < 0.05:
         file.write_text(random_.choice(("", "null", "[]", "{}", "[" * 5000, '{"a": 1', "\x00")))
         return
-    node, key = random_.choice(places)
+    node, key = random_.choice(entries)
     if random_.random() < 0.3 and isinstance(node, dict):
         del node[key]
     else:

@@ -14,7 +14,7 @@ from benchmarks.faults.cases import Broken, chance
 from verifai_jax import Trace, mtl
 from verifai_jax.mtl.words import WORDS
 
-MOST_SECONDS = 2.0
+MAX_SECONDS = 2.0
 """CPU seconds for each thing that is done with a text."""
 EVALUATED = 40
 """Every so many formulas one is evaluated: its program is compiled, and thrown away."""
@@ -49,7 +49,7 @@ def _within(what, function, *arguments):
     begun = time.process_time()
     value = function(*arguments)
     spent = time.process_time() - begun
-    if spent > MOST_SECONDS:
+    if spent > MAX_SECONDS:
         raise Broken(f"{what} took {spent:.1f} s: {arguments[0]!s:.200}")
     return value
 

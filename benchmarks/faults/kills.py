@@ -66,8 +66,8 @@ def case(number: int) -> str:
     """
     random_ = chance(number, "kills")
     kind = random_.choice(tuple(BUDGETS))
-    with tempfile.TemporaryDirectory() as place:
-        folder, cut = Path(place) / "run", False
+    with tempfile.TemporaryDirectory() as root:
+        folder, cut = Path(root) / "run", False
         for _ in range(random_.randrange(1, 4)):
             cut |= _killed(kind, folder, random_.uniform(0.0, 4.0))
         done = run(kind, folder if (folder / "run.json").exists() else None)

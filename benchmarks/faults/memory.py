@@ -10,7 +10,7 @@ from pathlib import Path
 import verifai_jax as vj
 from benchmarks.faults import kills
 
-MOST_GROWTH_GB = 0.3
+MAX_GROWTH_GB = 0.3
 """Memory beyond that of its rows by which a run may grow once it is under way."""
 EVERY = 1.0
 """Seconds between two looks at the memory."""
@@ -21,20 +21,20 @@ class Report:
     """What one run took, in seconds and GB.
 
     - `begun`: resident memory after a fifth of the time.
-    - `most`: the most of it in the second half.
+    - `largest`: the most of it in the second half.
     - `grown`: the difference, beyond the memory that the rows would take.
     """
 
     seconds: float
     rows: int
     begun: float
-    most: float
+    largest: float
     grown: float
 
     def __str__(self) -> str:
         return (
             f"{self.rows:,} rows in {self.seconds:.0f} s; {self.begun:.2f} GB resident after a "
-            f"fifth of the time, at most {self.most:.2f} GB in the second half, "
+            f"fifth of the time, at most {self.largest:.2f} GB in the second half, "
             f"{self.grown:.2f} GB of the growth beyond that of the rows themselves"
         )
 
@@ -64,14 +64,14 @@ def soak(seconds: float) -> Report:
     watcher = threading.Thread(target=watch, daemon=True)
     begun = time.monotonic()
     watcher.start()
-    with tempfile.TemporaryDirectory() as place:
+    with tempfile.TemporaryDirectory() as root:
         run = vj.falsify(
             problem,
             "cross_entropy",
             1_000_000_000,
             batch=256,
             max_seconds=seconds,
-            folder=Path(place) / "run",
+            folder=Path(root) / "run",
             progress=False,
         )
         ended.set()
@@ -80,5 +80,5 @@ def soak(seconds: float) -> Report:
         table = run.table.all
         rows, size = len(table), table.memory_usage(deep=True).sum() / 1e9
     early = next((m for t, m in seen if t - begun > seconds / 5), seen[0][1])
-    late = max(m for t, m in seen if t - begun > seconds / 2)
-    return Report(time.monotonic() - begun, rows, early, late, late - early - 0.8 * size)
+    last = max(m for t, m in seen if t - begun > seconds / 2)
+    return Report(time.monotonic() - begun, rows, early, last, last - early - 0.8 * size)

@@ -27,7 +27,7 @@ TOKEN = "a secret of the fuzzer"
 CLIENTS = 4
 POINTS = 6
 """Honest simulations beside each hostile connection."""
-MOST_MEMORY_GB = 1.0
+MAX_MEMORY_GB = 1.0
 """Resident memory by which this process may grow: 256 MiB of messages, and what Python adds."""
 
 
@@ -67,7 +67,7 @@ class Fire:
                 raise Broken(f"row {index} of an honest client: {outcome.message!r}")
         if seen != set(range(POINTS)):
             raise Broken(f"only rows {sorted(seen)} came back")
-        if _memory() - self._memory > MOST_MEMORY_GB:
+        if _memory() - self._memory > MAX_MEMORY_GB:
             raise Broken(f"the process has grown by {_memory() - self._memory:.1f} GB")
         return "by a client with the token" if insider else "by a stranger"
 
@@ -125,9 +125,9 @@ def _messages(random_: random.Random) -> Iterator[bytes]:
     for _ in range(random_.randrange(1, 5)):
         data = _message(random_)
         if random_.random() < 0.3:
-            place = random_.randrange(len(data) + 1)
+            index = random_.randrange(len(data) + 1)
             junk = random_.randbytes(random_.randrange(1, 9))
-            data = random_.choice((data[:place], data[:place] + junk + data[place:]))
+            data = random_.choice((data[:index], data[:index] + junk + data[index:]))
         yield data
 
 

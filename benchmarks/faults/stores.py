@@ -13,7 +13,7 @@ import pandas as pd
 
 import verifai_jax as vj
 from benchmarks.faults.cases import Broken, chance
-from benchmarks.faults.folders import NAMED, damage, told
+from benchmarks.faults.folders import NAMED, check_described, damage
 from tests.sweeps.drifting import drifting
 from verifai_jax.sweeps.study import Study
 
@@ -47,8 +47,8 @@ def case(number: int) -> str:
     """Damage a sweep's folder, and use it. **Returns:** what came of it."""
     random_ = chance(number, "stores")
     expected = _table()
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(place) / "sweep"
+    with tempfile.TemporaryDirectory() as root:
+        folder = Path(root) / "sweep"
         shutil.copytree(_base(), folder)
         for _ in range(random_.choice((1, 1, 1, 2, 3))):
             damage(folder, random_)
@@ -56,12 +56,12 @@ def case(number: int) -> str:
             _same(vj.load_sweep(folder, _study()).table, expected)
             loaded = "loaded"
         except NAMED as error:
-            told(error)
+            check_described(error)
             loaded = "not loaded"
         try:
             _same(_sweep(folder).table, expected)
         except NAMED as error:
-            told(error)
+            check_described(error)
             return f"{loaded}, refused"
         return f"{loaded}, went on"
 

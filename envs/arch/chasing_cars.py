@@ -51,7 +51,7 @@ class State(NamedTuple):
 class Motion(NamedTuple):
     """A motion `v' = push - drag v` and `y' = sign v`, from a place and a speed on."""
 
-    place: Scalar
+    position: Scalar
     speed: Scalar
     push: Any
     drag: Any
@@ -65,8 +65,8 @@ class Motion(NamedTuple):
         series: Any = 0.0
         for coefficient in reversed(_SERIES):
             series = coefficient - z * series
-        place = self.place + self.sign * t * (self.speed + rate * t * series)
-        return place, self.speed + rate * t * (1 - z * series)
+        position = self.position + self.sign * t * (self.speed + rate * t * series)
+        return position, self.speed + rate * t * (1 - z * series)
 
 
 class Path(NamedTuple):
@@ -77,13 +77,13 @@ class Path(NamedTuple):
     after: Motion
 
 
-def _motion(mode: Any, place: Scalar, speed: Scalar) -> Motion:
+def _motion(mode: Any, position: Scalar, speed: Scalar) -> Motion:
     """Return a follower's motion in a mode: note that it moves up where it keeps its distance."""
     dtype = real()
     push = jnp.where(mode == CHASING, 1.0, 0.0).astype(dtype)
     drag = jnp.where(mode == BRAKING, 1.0, 0.0).astype(dtype)
     sign = jnp.where(mode == KEEPING, 1.0, -1.0).astype(dtype)
-    return Motion(place, speed, push, drag, sign)
+    return Motion(position, speed, push, drag, sign)
 
 
 def _threshold(mode: Any, gap: Scalar) -> tuple[Scalar, Any, Any]:
@@ -106,7 +106,7 @@ def _followed(leader: Path, car: Any, dt: Any) -> tuple[Path, Any]:
     own = _motion(mode, jnp.zeros_like(gap), speed)
 
     bend, end = leader.change, jnp.asarray(dt, gap.dtype)
-    gap_bend = gap + own.at(bend)[0] - leader.after.place
+    gap_bend = gap + own.at(bend)[0] - leader.after.position
     gap_end = gap + own.at(end)[0] - leader.after.at(end - bend)[0]
     # The first of three instants at which the mode is over: the transition lies just before it.
     at_start, at_bend, at_end = (_threshold(mode, g) for g in (gap, gap_bend, gap_end))
@@ -118,9 +118,9 @@ def _followed(leader: Path, car: Any, dt: Any) -> tuple[Path, Any]:
     leading = jax.tree.map(lambda a, b: jnp.where(early, a, b), leader.before, leader.after)
 
     def newton(t: Scalar) -> Scalar:
-        place, speed = own.at(t)
-        leading_place, leading_speed = leading.at(t - low)
-        error = gap + place - leading_place - threshold
+        position, speed = own.at(t)
+        leading_position, leading_speed = leading.at(t - low)
+        error = gap + position - leading_position - threshold
         closing = jax.lax.stop_gradient(own.sign * speed - leading.sign * leading_speed)
         # A gap that touches its threshold without crossing it leaves the instant where it is.
         return t - error / jnp.where(jnp.abs(closing) > 1e-6, closing, 1e6)
@@ -151,8 +151,8 @@ def _first(middle: Scalar, state: State, features: Features, dt: Any) -> Path:
     zero, one = jnp.zeros_like(state.y1), jnp.ones_like(state.y1)
     motion = Motion(zero, state.v1, -throttle, jnp.asarray(brake, zero.dtype), one)
     end = jnp.asarray(dt, zero.dtype)
-    place, speed = motion.at(end)
-    return Path(motion, end, motion._replace(place=place, speed=speed))
+    position, speed = motion.at(end)
+    return Path(motion, end, motion._replace(position=position, speed=speed))
 
 
 def advance(
@@ -167,10 +167,10 @@ def advance(
         # Each car follows the path of the one before; the first has only the input.
         _, cars = jax.lax.scan(
             partial(step, dt=dt),
-            (first, first.after.place),
+            (first, first.after.position),
             (state.gaps, state.speeds, state.modes),
         )
-        return State(state.y1 + first.after.place, first.after.speed, *cars)
+        return State(state.y1 + first.after.position, first.after.speed, *cars)
 
     return repeated(substep, state, substeps)
 
@@ -178,25 +178,25 @@ def advance(
 def _located(carry: Any, car: Any, dt: Any) -> Any:
     leader, moved = carry
     path, mode = _followed(leader, car, dt)
-    place, speed = path.after.at(dt - path.change)
-    return (path, place), (car[0] + (place - moved), speed, mode)
+    position, speed = path.after.at(dt - path.change)
+    return (path, position), (car[0] + (position - moved), speed, mode)
 
 
 def _unlocated(carry: Any, car: Any, dt: Any) -> Any:
     first, moved = carry
     gap, speed, mode = car
-    place, speed = _motion(mode, jnp.zeros_like(gap), speed).at(dt)
-    gap = gap + (place - moved)
+    position, speed = _motion(mode, jnp.zeros_like(gap), speed).at(dt)
+    gap = gap + (position - moved)
     _, ended, following = _threshold(mode, gap)
-    return (first, place), (gap, speed, jnp.where(ended, following, mode))
+    return (first, position), (gap, speed, jnp.where(ended, following, mode))
 
 
 def signals(k: Int[Array, ""], state: State, features: Features) -> dict[str, Float[Array, ""]]:
     """Return the positions of the cars."""
-    places = [state.y1]
+    positions = [state.y1]
     for car in range(4):
-        places.append(places[-1] + state.gaps[car])
-    return {f"y{i}": place for i, place in enumerate(places, 1)}
+        positions.append(positions[-1] + state.gaps[car])
+    return {f"y{i}": position for i, position in enumerate(positions, 1)}
 
 
 def chasing_cars(duration: float = 100.0, *, located: bool = True, substeps: Any = 1) -> Stepped:

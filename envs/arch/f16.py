@@ -32,7 +32,7 @@ LEVEL_PHI = math.radians(5)
 LEVEL_P = math.radians(10)
 LOAD = 5.0
 PROPORTIONAL, DERIVATIVE = 4.0, 2.0
-LEAST_PULL = 60  # Samples: 2 s.
+MIN_PULL = 60  # Samples: 2 s.
 FLIGHT_DECK = 1000.0
 
 NOMINAL = {
@@ -68,7 +68,7 @@ def decided(state: State) -> State:
     plane = state.plane
     level = (jnp.abs(_wrapped(plane.phi)) < LEVEL_PHI) & (jnp.abs(plane.p) < LEVEL_P)
     low = ~nose_high(plane) & (plane.altitude < FLIGHT_DECK)
-    up = nose_high(plane) & (state.since >= LEAST_PULL)
+    up = nose_high(plane) & (state.since >= MIN_PULL)
     mode = jnp.where(
         state.mode == ROLL,
         jnp.where(level, PULL, ROLL),
@@ -105,8 +105,8 @@ def _flown(start: Plane, mode: Int[Array, ""], dt: Any) -> Plane:
     # stages that are written out.
     def stage(carry: Any, weights: Any) -> Any:
         rate, total = carry
-        place, share = weights
-        rate = _moved(start, rate, place)
+        position, share = weights
+        rate = _moved(start, rate, position)
         rate = slope(rate, reference(rate, mode))
         return (rate, _moved(total, rate, share)), None
 

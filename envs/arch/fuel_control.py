@@ -82,9 +82,9 @@ class State(NamedTuple):
     """The engine, and its controller.
 
     `throttle` behind its lag; `pressure` of the manifold, 1 is that of the air; `film` of fuel;
-    `first` and `sensed`, the two lags of the sensor; `way`, the exhaust gas in lengths of its pipe,
-    and `line` with the past of it and of the ratio. Of the controller: `estimate` of the pressure,
-    `integral`, `fuel` (g/s), `normal` and `power`, its modes, and `target` of the ratio.
+    `first` and `sensed`, the two lags of the sensor; `progress`, the exhaust gas in lengths of its
+    pipe, and `line` with the past of it and of the ratio. Of the controller: `estimate` of the
+    pressure, `integral`, `fuel` (g/s), `normal` and `power`, its modes, and `target` of the ratio.
     """
 
     throttle: Scalar
@@ -92,7 +92,7 @@ class State(NamedTuple):
     film: Scalar
     first: Scalar
     sensed: Scalar
-    way: Scalar
+    progress: Scalar
     line: DelayLine
     estimate: Scalar
     integral: Scalar
@@ -112,7 +112,7 @@ def initial(features: Features) -> State:
         film=jnp.asarray(0.0112, real()),
         first=ratio,
         sensed=ratio,
-        way=zero,
+        progress=zero,
         line=line,
         estimate=pressure,
         integral=zero,
@@ -172,12 +172,14 @@ def manifold(pressure: Scalar, plate: Scalar, speed: Scalar, dt: Any) -> Scalar:
 
 def delayed(state: State) -> Scalar:
     """Return the ratio of the gas that now reaches the sensor: it entered one pipe's length ago."""
-    ways, ratios = state.line.values[:, 0], state.line.values[:, 1]
-    wanted = state.way - 1
-    left = jnp.clip(jnp.sum(ways >= wanted).astype(jnp.int32) - 1, 0, len(ways) - 2)
-    gap = ways[left] - ways[left + 1]
+    shares_of_pipe, ratios = state.line.values[:, 0], state.line.values[:, 1]
+    wanted = state.progress - 1
+    left = jnp.clip(
+        jnp.sum(shares_of_pipe >= wanted).astype(jnp.int32) - 1, 0, len(shares_of_pipe) - 2
+    )
+    gap = shares_of_pipe[left] - shares_of_pipe[left + 1]
     moved = gap > 0
-    share = jnp.where(moved, (ways[left] - wanted) / jnp.where(moved, gap, 1), 0)
+    share = jnp.where(moved, (shares_of_pipe[left] - wanted) / jnp.where(moved, gap, 1), 0)
     return ratios[left] + jnp.clip(share, 0, 1) * (ratios[left + 1] - ratios[left])
 
 
@@ -193,7 +195,9 @@ def driven(state: State, throttle: Scalar, rpm: Scalar, dt: Any) -> tuple[State,
     settled = lasts * state.fuel * (1 - share)
     film = settled + (state.film - settled) * jnp.exp(-dt / lasts)
     ratio = taken / (share * state.fuel + film / lasts)
-    state = state._replace(pressure=pressure, film=film, way=state.way + dt / TRANSPORT(rpm, air))
+    state = state._replace(
+        pressure=pressure, film=film, progress=state.progress + dt / TRANSPORT(rpm, air)
+    )
     arriving = delayed(state)
     first = arriving + (state.first - arriving) * jnp.exp(-10 * dt)
     middle = (first + state.first) / 2
@@ -232,7 +236,7 @@ def advance(k: Int[Array, ""], state: State, features: Features, substeps: Any =
             return driven(carry[0], throttle, rpm, PERIOD / substeps)
 
         state, ratio = repeated(substep, (state, state.sensed), substeps)
-        line = state.line.push(time + (j + 1) * PERIOD, jnp.stack([state.way, ratio]))
+        line = state.line.push(time + (j + 1) * PERIOD, jnp.stack([state.progress, ratio]))
         return state._replace(line=line)
 
     state = jax.lax.fori_loop(0, STEPS, block, state)

@@ -60,15 +60,20 @@ class Body:
         """Return the middles of the discs."""
         sin, cos = sin_cos(pose.heading)
         cell = self.length / self.discs
-        places = [self.ahead - self.length / 2 + (i + 0.5) * cell for i in range(self.discs)]
-        return [(pose.x + place * cos, pose.y + place * sin) for place in places]
+        positions = [self.ahead - self.length / 2 + (i + 0.5) * cell for i in range(self.discs)]
+        return [(pose.x + position * cos, pose.y + position * sin) for position in positions]
 
     def corners(self, pose: Pose) -> list[tuple[Scalar, Scalar]]:
         """Return the corners, anticlockwise from the front on the right."""
         sin, cos = sin_cos(pose.heading)
         half = self.width / 2
-        places = [(self.front, -half), (self.front, half), (-self.rear, half), (-self.rear, -half)]
-        return [(pose.x + a * cos - b * sin, pose.y + a * sin + b * cos) for a, b in places]
+        positions = [
+            (self.front, -half),
+            (self.front, half),
+            (-self.rear, half),
+            (-self.rear, -half),
+        ]
+        return [(pose.x + a * cos - b * sin, pose.y + a * sin + b * cos) for a, b in positions]
 
 
 CAR = Body(4.7, 1.85)
@@ -103,14 +108,14 @@ def _corner_distances(a: Pose, body: Body, b: Pose, other: Body) -> tuple[Scalar
         along.append(x * cos + y * sin - body.ahead)
         across.append(y * cos - x * sin)
         out = jnp.maximum(jnp.abs(along[-1]) - half_length, 0.0)
-        beside = jnp.maximum(jnp.abs(across[-1]) - half_width, 0.0)
-        squares.append(out**2 + beside**2)
-    first = jnp.maximum(_least(along), -_greatest(along)) - half_length
-    second = jnp.maximum(_least(across), -_greatest(across)) - half_width
-    return _least(squares), jnp.maximum(first, second)
+        lateral = jnp.maximum(jnp.abs(across[-1]) - half_width, 0.0)
+        squares.append(out**2 + lateral**2)
+    first = jnp.maximum(_lowest(along), -_greatest(along)) - half_length
+    second = jnp.maximum(_lowest(across), -_greatest(across)) - half_width
+    return _lowest(squares), jnp.maximum(first, second)
 
 
-def _least(values: list[Any]) -> Any:
+def _lowest(values: list[Any]) -> Any:
     return functools.reduce(jnp.minimum, values)
 
 
@@ -133,7 +138,7 @@ def disc_gap(a: Pose, body: Body, b: Pose, other: Body, temperature: float = 0.0
     squares = [(x - u) ** 2 + (y - v) ** 2 for x, y in body.middles(a) for u, v in other.middles(b)]
     radii = body.radius + other.radius
     if temperature <= 0:
-        return jnp.sqrt(_least(squares) + TINY) - radii
+        return jnp.sqrt(_lowest(squares) + TINY) - radii
     distances = jnp.sqrt(jnp.stack(squares) + TINY)
     return -temperature * jax.nn.logsumexp(-distances / temperature, axis=0) - radii
 
@@ -159,5 +164,5 @@ def sight(
     across = jnp.maximum(jnp.minimum(b, d), -jnp.maximum(b, d)) - half_width
     span = jnp.sqrt((c - a) ** 2 + (d - b) ** 2 + TINY)
     reach = half_length * jnp.abs(d - b) + half_width * jnp.abs(c - a)
-    beside = (jnp.abs(a * d - b * c) - reach) / span
-    return jnp.maximum(jnp.maximum(along, across), beside)
+    lateral = (jnp.abs(a * d - b * c) - reach) / span
+    return jnp.maximum(jnp.maximum(along, across), lateral)

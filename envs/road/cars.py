@@ -26,8 +26,8 @@ class Car(NamedTuple):
 
     def pose(self, path: Path) -> Pose:
         """Return where it is in the plane."""
-        place = path.pose(self.distance, self.offset)
-        return Pose(place.x, place.y, place.heading + self.heading)
+        position = path.pose(self.distance, self.offset)
+        return Pose(position.x, position.y, position.heading + self.heading)
 
 
 def bicycle(
@@ -71,19 +71,19 @@ def steering(
     rate: Scalar = 0.0,
     curvature: Scalar = 0.0,
     wheelbase: Scalar = WHEELBASE,
-    least: float = 6.0,
+    lowest: float = 6.0,
 ) -> Scalar:
     """Return the angle of the wheels (rad) that leads to an `offset` beside the path.
 
     For small angles o'' = -(o - offset) / l^2 - 2 (o' - offset') / l over the distance: critically
-    damped, with l what the car drives in 0.8 s, at `least` that many metres.
+    damped, with l what the car drives in 0.8 s, at `lowest` that many metres.
 
     **Arguments:**
 
     - `offset`: wanted, in m; `rate`: in m/s, where it changes.
     - `curvature`: of the path where the car is, 1/m.
     """
-    ahead = jnp.maximum(0.8 * car.speed, least)
+    ahead = jnp.maximum(0.8 * car.speed, lowest)
     slope = rate / jnp.maximum(car.speed, 1.0)
     wanted = curvature - (car.offset - offset) / ahead**2 - 2 * (car.heading - slope) / ahead
     return jnp.clip(jnp.arctan(wheelbase * wanted), -STEER_LIMIT, STEER_LIMIT)

@@ -64,7 +64,7 @@ class Picture:
             seen = at("visible") > 0
             directions = [at(f"{name}_heading") for name in self.hidden]
             fronts = [self.bodies[name].front for name in self.hidden]
-            places = [
+            positions = [
                 [
                     at(f"{name}_{part}") + front * turn(direction)
                     for name, front, direction in zip(self.hidden, fronts, directions, strict=True)
@@ -72,7 +72,7 @@ class Picture:
                 for part, turn in (("x", np.cos), ("y", np.sin))
             ]
             style = "-" if seen else (0, (2, 2))
-            axes.plot(*places, color=PAINT, linewidth=1.4, linestyle=style, zorder=7)
+            axes.plot(*positions, color=PAINT, linewidth=1.4, linestyle=style, zorder=7)
             title += "  in sight" if seen else "  hidden"
         axes.set_title(
             title + ("  collision" if hit else ""),

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 Scalar = Float[Array, ""] | float
 
-LEAST_GAP = 0.1
+MIN_GAP = 0.1
 """Gaps in m are taken for at least this: beyond it cars have collided."""
 
 
@@ -45,7 +45,7 @@ def idm(speed: Scalar, space: Scalar, leader: Scalar, driver: Driver) -> Scalar:
     closing = speed * (speed - leader) / (2 * jnp.sqrt(driver.acceleration * driver.deceleration))
     wished = driver.standstill + jnp.maximum(speed * driver.headway + closing, 0.0)
     free = (jnp.maximum(speed, 0.0) / driver.speed) ** driver.exponent
-    near = (wished / jnp.maximum(space, LEAST_GAP)) ** 2
+    near = (wished / jnp.maximum(space, MIN_GAP)) ** 2
     return jnp.maximum(driver.acceleration * (1 - free - near), -driver.hardest)
 
 
@@ -67,12 +67,12 @@ def cruise_control(
     Source: Kesting, Treiber and Helbing, Enhanced intelligent driver model to assess the impact of
     driving strategies on traffic capacity, Phil. Trans. R. Soc. A 368 (2010), section 2.
     """
-    plain, space = idm(speed, space, leader, driver), jnp.maximum(space, LEAST_GAP)
+    plain, space = idm(speed, space, leader, driver), jnp.maximum(space, MIN_GAP)
     lead = jnp.minimum(leader_acceleration, driver.acceleration)
     closing = speed - leader
     halting = leader * closing < -2 * space * lead
     # Both halves of a `where` have derivatives, so the one not taken must be finite.
-    room = jnp.where(halting, jnp.maximum(leader**2 - 2 * space * lead, LEAST_GAP), 1.0)
+    room = jnp.where(halting, jnp.maximum(leader**2 - 2 * space * lead, MIN_GAP), 1.0)
     going = lead - jnp.maximum(closing, 0.0) ** 2 / (2 * space)
     constant = jnp.where(halting, speed**2 * lead / room, going)
     comfort = driver.deceleration

@@ -69,11 +69,11 @@ class Path:
 
         **Raises:** `ValueError` for fewer than two points, or two that are the same in a row.
         """
-        places = [(float(x), float(y)) for x, y in points]
-        if len(places) < 2:
-            raise ValueError(f"a path goes through at least two points; got {places}")
+        positions = [(float(x), float(y)) for x, y in points]
+        if len(positions) < 2:
+            raise ValueError(f"a path goes through at least two points; got {positions}")
         lines = []
-        for (x, y), (u, v) in pairwise(places):
+        for (x, y), (u, v) in pairwise(positions):
             if (x, y) == (u, v):
                 raise ValueError(f"the path stands still at ({x:g}, {y:g}); leave one of them out")
             lines.append((math.hypot(u - x, v - y), math.atan2(v - y, u - x)))
@@ -81,7 +81,7 @@ class Path:
         for length, direction in lines:
             parts.append((length, 0.0, math.remainder(direction - heading, math.tau)))
             heading += parts[-1][2]
-        return Path(*places[0], lines[0][1], tuple(parts))
+        return Path(*positions[0], lines[0][1], tuple(parts))
 
     def straight(self, length: float) -> "Path":
         """Go straight on for `length` metres."""

@@ -173,7 +173,7 @@ def test_refused(monkeypatch):
         frequent_patterns(frame, against="safe")  # pyright: ignore[reportArgumentType]
     # The package has a function of that name.
     module = importlib.import_module("verifai_jax.analysis._frequent_patterns")
-    monkeypatch.setattr(module, "MOST_COMBINATIONS", 5)
+    monkeypatch.setattr(module, "MAX_COMBINATIONS", 5)
     with pytest.raises(ValueError, match=r"more than 5 combinations of up to 2 values .*raise min"):
         frequent_patterns(frame, minimum=0.01)
 

@@ -39,9 +39,9 @@ def test_features_in_one_table(found):
     features = found.table
     assert features.index[0] == "x"
     assert set(features.index) == {"x", "y", "colour", "lanes", "same"}
-    assert features.loc["x", "most_failing"] == pytest.approx(0.3, abs=0.02)
+    assert features.loc["x", "max_failing"] == pytest.approx(0.3, abs=0.02)
     assert features.loc["colour", "occupied"] == 1
-    assert np.isnan(features.loc["colour", "most_failing"])
+    assert np.isnan(features.loc["colour", "max_failing"])
 
 
 def test_names_of_others_do_not_write_the_report(tmp_path):

@@ -146,7 +146,7 @@ def test_order_company_and_devices_change_nothing(certificates):
 
 def test_an_accelerator_works_on_all_blocks_at_once(certificates, monkeypatch):
     monkeypatch.setattr(programs, "_one_by_one", lambda devices: False)
-    monkeypatch.setattr(programs, "MOST_BLOCKS", 4)
+    monkeypatch.setattr(programs, "MAX_BLOCKS", 4)
     other = certify(
         lambda policy: problem_of(policy), POLICIES, p=0.1, samples=128, seed=3,
         attack_simulations=0,

@@ -11,7 +11,7 @@ from checked_types import unchecked
 
 import verifai_jax as vj
 from verifai_jax.checking import Check, CounterexampleFound
-from verifai_jax.checking.check import least_budget
+from verifai_jax.checking.check import min_budget
 from verifai_jax.statistics.confidence_sequences import anytime_interval
 
 pytest_plugins = ["pytester"]
@@ -223,5 +223,5 @@ def test_what_is_refused():
         Check(budget=500, max_failure_probability=0.001)
     with pytest.raises(ValueError, match="did you mean 'budget'"):
         vj.test("specs/a.py:a", buget=3)
-    least = least_budget(0.01, 0.95)
+    least = min_budget(0.01, 0.95)
     assert anytime_interval(0, least).high <= 0.01 < anytime_interval(0, least - 1).high

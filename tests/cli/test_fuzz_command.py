@@ -15,7 +15,7 @@ traffic = vj.events.Automaton(
     "free",
     {("free", "join"): {"to": "busy", "wait": vj.Box(0.1, 1)},
      ("busy", "leave"): {"to": "free", "wait": vj.Box(0.1, 1)}},
-    most=3,
+    max_events=3,
 )
 
 def level(features, key):

@@ -110,7 +110,7 @@ def test_falsify_with_a_rate_and_what_follows_a_run(call):
         assert told["gate"] == {"asked": "counterexample", "passed": False}
     told = json.loads(call("shrink", "one", "--no-pictures", "--json").stdout)
     assert list(told["changed"]) == ["a"]
-    told = json.loads(call("save-counterexamples", "one", "--most", 1, "--json").stdout)
+    told = json.loads(call("save-counterexamples", "one", "--max-count", 1, "--json").stdout)
     assert len(told["files"]) == 1
     told = json.loads(call("replay-counterexamples", "spec.py:often", "--json").stdout)
     assert told["passed"] is False

@@ -79,7 +79,7 @@ def test_completion_shows_what_is_for_users(problem, run):
     assert names(vj.Categorical("a", "b")) >= {"choices", "probabilities", "check"}
     assert names(vj.signal("x")) >= {"abs", "max", "norm", "name"}
     for thing, wanted, internal in (
-        (vj.Normal(0, 1), {"mean", "std"}, {"mark_count", "settled", "tail"}),
+        (vj.Normal(0, 1), {"mean", "std"}, {"coverage_id_count", "settled", "tail"}),
         (problem, {"check", "only", "space", "nominal"}, {"programs", "made_in", "draws"}),
         (problem.space, {"sample", "domains", "where"}, {"root", "cube", "nudged"}),
         (problem.system, set(), {"reverse_hint", "lanes", "why_not"}),

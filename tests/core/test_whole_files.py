@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.whole_files import replacing
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.plotting.style import new_figure, show_or_save
 from verifai_jax.rl import Continuous, Policy
 

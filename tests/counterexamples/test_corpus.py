@@ -40,7 +40,7 @@ def run():
 @pytest.fixture(scope="module")
 def corpus(run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("corpus")
-    assert len(run.save_counterexamples(folder, most=3, budget=200)) == 3
+    assert len(run.save_counterexamples(folder, max_count=3, budget=200)) == 3
     return folder
 
 
@@ -61,7 +61,7 @@ def test_files_say_what_fails_and_how_it_was_found(run, corpus):
         assert content["features"]["wind[1]"] == pytest.approx(0.0, abs=1e-6)
         assert SavedCounterexample.read(path).name == path.name
     # The same run again writes the same files.
-    again = save_counterexamples(run, corpus, most=3, budget=200)
+    again = save_counterexamples(run, corpus, max_count=3, budget=200)
     assert {p.name for p in again} == {p.name for p in corpus.iterdir()}
 
 
@@ -159,7 +159,7 @@ def test_command(run, tmp_path, monkeypatch):
         return result.output
 
     call("falsify", "spec.py:ramp", "--search", "uniform", "--budget", 64, "--folder", "one")
-    (path,) = call("save-counterexamples", "one", "--most", 1).split()
+    (path,) = call("save-counterexamples", "one", "--max-count", 1).split()
     reproduce = json.loads((tmp_path / path).read_text())["reproduce"]
     output = call(*reproduce.split()[1:])
     assert "ramp: 1 counterexample in" in output

@@ -24,7 +24,7 @@ def problem():
 def saved(problem, tmp_path_factory):
     folder = tmp_path_factory.mktemp("corpus")
     run = vj.falsify(problem, "uniform", 64, confirm=False, progress=False)
-    (path,) = run.save_counterexamples(folder, most=1)
+    (path,) = run.save_counterexamples(folder, max_count=1)
     return path.read_text()
 
 

@@ -21,7 +21,7 @@ EVENTS = vj.events.Automaton(
         ("off", "noise"): {"wait": ANY},
         ("on", "noise"): {"wait": ANY},
     },
-    most=7,
+    max_events=7,
 )
 
 

@@ -99,7 +99,7 @@ def test_the_pilot_rolls_pulls_and_stands_by():
     np.testing.assert_array_equal(modes[[0, *changes]], [plane.ROLL, plane.PULL, plane.STANDBY])
     rolled, pulled = changes
     assert abs(float(trace["phi"][rolled])) < plane.LEVEL_PHI
-    assert pulled - rolled >= plane.LEAST_PULL
+    assert pulled - rolled >= plane.MIN_PULL
     assert float(trace["theta"][pulled] - trace["alpha"][pulled]) > 0
     # Below the flight deck, nose down, it does not stay on standby.
     falling = Plane(*(jnp.array(0.0),) * 16)._replace(theta=jnp.array(-0.2))

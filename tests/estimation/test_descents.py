@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from closed_forms import Cells, with_gradient
 
-from verifai_jax.estimation.descents import Ends, _begin, _places_ahead, descend_from_many
+from verifai_jax.estimation.descents import Ends, _begin, _points_ahead, descend_from_many
 from verifai_jax.estimation.exploration import _spread_out
 from verifai_jax.estimation.normal_space import LimitState
 
@@ -50,13 +50,13 @@ def test_a_start_is_where_its_slope_leads():
         lambda z: 2.0 - z @ normals, lambda z: np.broadcast_to(-normals, z.shape), 3, 1000
     )
     z = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, -2.0], [-3.0, -4.0, 0.5]])
-    ahead = _places_ahead(known, _begin(known, z))
+    ahead = _points_ahead(known, _begin(known, z))
     assert ahead[:2] @ normals == pytest.approx(2.0)
     assert ahead[:2, 2] == pytest.approx(z[:2, 2])
     # No farther than one step, and nowhere without a slope.
     assert np.linalg.norm(ahead[2] - z[2]) == pytest.approx(3.0)
     flat = with_gradient(lambda z: np.ones(len(z)), np.zeros_like, 3, 1000)
-    assert np.array_equal(_places_ahead(flat, _begin(flat, z)), z)
+    assert np.array_equal(_points_ahead(flat, _begin(flat, z)), z)
 
 
 def warped(cells, power):

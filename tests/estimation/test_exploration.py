@@ -203,7 +203,7 @@ def test_points_are_chosen_the_farthest_first():
     for count in range(1, 10):
         left = gaps[:, rows[:count]].min(axis=1)
         assert left[rows[count]] == left.max()
-    near = farthest_first(7, lambda row: gaps[row], 40, least=2.0)
+    near = farthest_first(7, lambda row: gaps[row], 40, min_gap=2.0)
     assert gaps[:, near].min(axis=1).max() <= 2.0
     assert gaps[np.ix_(near, near)][np.triu_indices(len(near), 1)].min() > 2.0
 

@@ -416,7 +416,7 @@ def test_of_many_those_that_may_flip_are_examined(circles, monkeypatch):
     run = vj.falsify(smooth, "uniform", 1024, batch=1024, seed=1, progress=False, confirm=False)
     failing = run.table.counterexamples
     columns = {name: failing[name].to_numpy() for name in failing.columns}
-    confirmer = Confirmer(smooth, most=100)
+    confirmer = Confirmer(smooth, max_rows=100)
     found = confirmer(columns, failing.index.to_numpy())
     left = found.verdict == "unexamined"
     assert (~left).sum() == confirmer.examined == 100
@@ -432,17 +432,17 @@ def test_of_many_those_that_may_flip_are_examined(circles, monkeypatch):
     assert np.isnan(found.rho["float64"][left]).all()
     # Where rounding or the step decides, all of them are.
     rows = circles.table.counterexamples
-    all_of_them = Confirmer(circles.problem, most=10)(
+    all_of_them = Confirmer(circles.problem, max_rows=10)(
         {name: rows[name].to_numpy() for name in rows.columns}, rows.index.to_numpy()
     )
     assert "unexamined" not in all_of_them.verdict
-    with pytest.raises(ValueError, match="most must be a positive integer; got 0"):
-        Confirmer(smooth, most=0)
+    with pytest.raises(ValueError, match="max_rows must be a positive integer; got 0"):
+        Confirmer(smooth, max_rows=0)
 
 
 def test_a_row_worse_than_all_before_is_examined_whatever_the_limit():
     smooth = plain(lambda f, key: f["x"], "always x <= 0.2")
-    confirmer = Confirmer(smooth, most=4)
+    confirmer = Confirmer(smooth, max_rows=4)
 
     def verdicts(x, limit):
         x = np.asarray(x)

@@ -18,8 +18,8 @@ from verifai_jax.evaluation.replay import replay
 CAR = vj.Struct({"size": vj.Box(1, 2), "at": vj.Struct({"kind": vj.Categorical("a", "b")})})
 TRAFFIC = vj.events.Automaton(
     start="s",
-    most=3,
-    least=2,
+    max_events=3,
+    min_events=2,
     events={("s", "go"): {"to": "s", "wait": vj.Box(0.5, 1.0), "gap": vj.LogUniform(1, 9)}},
 )
 DOMAINS = {

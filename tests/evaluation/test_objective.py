@@ -30,7 +30,7 @@ SMOOTH = vj.mtl.smooth(0.05)
 def test_it_is_the_robustness_of_the_engine():
     verdicts = Evaluator(PROBLEM, 64)(POINTS)
     found = jax.jit(jax.vmap(PROBLEM.objective()))(POINTS)
-    np.testing.assert_allclose(found, verdicts.least, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(found, verdicts.lowest, rtol=1e-5, atol=1e-6)
     assert np.isnan(found).any()
     for column, name in enumerate(SPEC):
         one = jax.jit(jax.vmap(PROBLEM.objective(formula=name)))(POINTS)
@@ -94,7 +94,7 @@ def test_the_key_is_that_of_the_simulation():
     verdicts = Evaluator(NOISY, 2, seed=3)(u, first=7)
     keys = jnp.stack([simulation_key(run_keys(3)[1], row) for row in (7, 8)])
     rho = jax.jit(NOISY.objective())
-    np.testing.assert_allclose(jax.vmap(rho)(u, keys), verdicts.least, rtol=1e-5)
+    np.testing.assert_allclose(jax.vmap(rho)(u, keys), verdicts.lowest, rtol=1e-5)
     assert NOISY.objective(key=keys[0])(u[0]) == rho(u[0], keys[0]) != rho(u[0])
     assert rho(u[0]) == rho(u[0])
 

@@ -258,9 +258,9 @@ def test_a_corpus_holds_what_comes_again(tmp_path):
     claimed = len(run.table.counterexamples)
     assert claimed == 5
     wavering.count = 0
-    assert run.save_counterexamples(tmp_path / "none", most=1) == []
+    assert run.save_counterexamples(tmp_path / "none", max_count=1) == []
     steady = falsified(Counter(lambda a, count: a - 0.5), 10, batch=10)
-    [path] = steady.save_counterexamples(tmp_path / "some", most=1)
+    [path] = steady.save_counterexamples(tmp_path / "some", max_count=1)
     assert vj.replay_counterexamples(steady.problem, path).failing
     wavering.count = 1
     seen = vj.replay_counterexamples(problem(wavering), path)
@@ -275,7 +275,7 @@ def test_counts_of_repetitions():
     verdict = np.array(["confirmed", "confirmed", "fragile", "fragile", "unexamined"], object)
     found = Repetitions.count(rho, again, verdict)
     assert (found.rows, found.moved, found.rounded, found.lost) == (4, 2, 1, 2)
-    assert found.most == 1.5
+    assert found.max_difference == 1.5
     assert found.joined(Repetitions()) == found
     assert str(Repetitions(5)) == ""
     assert came_otherwise(rho, again).tolist() == [False, False, True, False, False]

@@ -56,7 +56,7 @@ def test_batches_join_in_order():
     assert whole.violated.tolist() == [False, False, True]
     assert whole.proper.tolist() == [True, False, True]
     assert whole.messages == ["", "lost", ""]
-    assert Verdicts.nothing(2, 3).least.shape == (0,)
+    assert Verdicts.nothing(2, 3).lowest.shape == (0,)
 
 
 def test_parts_of_equal_length_are_split_again():
@@ -69,7 +69,7 @@ def test_parts_of_equal_length_are_split_again():
         traces=[None] * 6,
     )
     first, second = whole.split(2)
-    assert [part.least.tolist() for part in (first, second)] == [[0, 1, 2], [3, 4, 5]]
+    assert [part.lowest.tolist() for part in (first, second)] == [[0, 1, 2], [3, 4, 5]]
     assert second.messages == ["3.0", "4.0", "5.0"]
     assert second.traces == [None] * 3
     assert Verdicts.concatenate([first, second]).messages == whole.messages

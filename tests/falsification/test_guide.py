@@ -12,7 +12,7 @@ from checked_types import unchecked
 import verifai_jax as vj
 from verifai_jax.evaluation.engine import engine_for
 from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.evaluation.steering import Steering
+from verifai_jax.evaluation.guidance import Guidance
 
 SPACE = {name: vj.Box(0.0, 1.0) for name in "abcd"}
 
@@ -48,13 +48,13 @@ def test_verdicts_and_robustness_are_those_without_it():
     points = np.random.default_rng(0).uniform(size=(64, 4)).astype(np.float32)
     points[:3] = [0.9, 0.2, 0.7, 0.4]
     plain = Evaluator(PLAIN, 64)(points)
-    guided = Evaluator(GUIDED, 64, steering=Steering(guide=True))(points)
+    guided = Evaluator(GUIDED, 64, guidance=Guidance(guide=True))(points)
     np.testing.assert_array_equal(plain.rho, guided.rho)
     np.testing.assert_array_equal(plain.violated, guided.violated)
     assert guided.violated[:3].all()
-    assert plain.steering is None
+    assert plain.guidance is None
     heat = 1 - np.mean(np.abs(points - np.float32([0.9, 0.2, 0.7, 0.4])), axis=1)
-    np.testing.assert_allclose(guided.steering[:, 0], 0.9 - heat, atol=1e-6)
+    np.testing.assert_allclose(guided.guidance[:, 0], 0.9 - heat, atol=1e-6)
     # Points of a sequence are simulated the same with it.
     rows = [{"a": 0.9, "b": 0.2, "c": 0.7, "d": 0.4}, {"a": 0.1, "b": 0.2, "c": 0.7, "d": 0.4}]
     one, two = vj.simulate(PLAIN, rows).table.all, vj.simulate(GUIDED, rows).table.all
@@ -93,7 +93,7 @@ def test_its_gradient_passes(clauses):
         return made.evaluate(point, key, 0, temperature=0.05)
 
     plain = evaluate(replace(problem, guide=None))
-    guided = evaluate(problem, steering=Steering(guide=True))
+    guided = evaluate(problem, guidance=Guidance(guide=True))
     name = "clause_gradients" if clauses else "gradient"
     own, both = (np.reshape(getattr(each, name), (-1, 2))[0] for each in (plain, guided))
 

@@ -252,7 +252,7 @@ def test_a_saved_counterexample_knows_its_model(folder, tmp_path):
 def test_a_counterexample_that_gives_another_number_of_itself(tmp_path):
     problem = load_target("counting.py:memory", vj.Problem)
     run = falsified(problem)
-    run.save_counterexamples(tmp_path / "corpus", shrink=False, most=1)
+    run.save_counterexamples(tmp_path / "corpus", shrink=False, max_count=1)
     (one,) = vj.replay_counterexamples(problem, tmp_path / "corpus").replayed
     assert not one.changed
     assert "it does not give its number again, though no file of its model has changed" in one.note

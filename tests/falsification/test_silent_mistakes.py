@@ -175,7 +175,7 @@ class TestRuns:
         assert again.notes[0].startswith(note)
 
     def test_what_may_take_long_is_not_simulated_for_it(self, monkeypatch):
-        monkeypatch.setattr("verifai_jax.falsification.silent_mistakes.MOST_SAMPLES", 100)
+        monkeypatch.setattr("verifai_jax.falsification.silent_mistakes.MAX_SAMPLES", 100)
         nominal = {"a": 0.5, "b": 0.5}
         problem = vj.Problem("p", SPACE, both, "always x + y < 0.9", nominal=nominal)
         assert vj.falsify(problem, "uniform", 40, batch=40).notes == ()

@@ -27,7 +27,7 @@ TRAFFIC = Automaton(
             "guard": lambda past: past.count("cut_in") >= 2,
         },
     },
-    most=5,
+    max_events=5,
 )
 SPACE = FeatureSpace({"traffic": TRAFFIC, "v": Box(0, 1)})
 
@@ -44,23 +44,23 @@ def legal(automaton):
         ]
         found[taken] = (share, not ways)
         total = sum(each.weight for _, each in ways)
-        if len(taken) < automaton.most:
+        if len(taken) < automaton.max_events:
             for number, each in ways:
                 own = share * each.weight / total
                 walk(each.to, past.then(each.name), (*taken, number), own)
 
     walk(automaton.start, Past(), (), 1.0)
-    lengths = automaton.most - automaton.least + 1
+    lengths = automaton.max_events - automaton.min_events + 1
     prior = {}
     for taken, (share, ended) in found.items():
-        if len(taken) >= automaton.least or ended:
-            longer = automaton.most - len(taken) + 1 if ended else 1
+        if len(taken) >= automaton.min_events or ended:
+            longer = automaton.max_events - len(taken) + 1 if ended else 1
             prior[taken] = share * longer / lengths
     return prior
 
 
 def taken_by(points):
-    marks = np.asarray(SPACE.marks_at(points))[:, : TRAFFIC.most]
+    marks = np.asarray(SPACE.coverage_ids_at(points))[:, : TRAFFIC.max_events]
     return [tuple(int(m) for m in row if m >= 0) for row in marks]
 
 
@@ -72,15 +72,15 @@ POINTS = np.asarray(jax.random.uniform(jax.random.key(2), (4096, SPACE.dim)))
     "automaton",
     [
         TRAFFIC,
-        Automaton("a", {("a", "x"): {"wait": Box(0, 1)}}, most=3, least=3),
+        Automaton("a", {("a", "x"): {"wait": Box(0, 1)}}, max_events=3, min_events=3),
         Automaton(
             "a",
             {
                 ("a", "x"): {"to": "b", "wait": Box(0, 1), "n": DiscreteBox(1, 3)},
                 ("a", "y"): {"to": "b", "wait": Box(1, 2), "p": Box([0, 1], [2, 3])},
             },
-            most=4,
-            least=1,
+            max_events=4,
+            min_events=1,
         ),
     ],
     ids=["guards", "one event", "dead end"],
@@ -106,8 +106,8 @@ def test_what_can_be_covered_is_counted_exactly():
     assert set(TRAFFIC.graph.pairs) == pairs
     assert set(TRAFFIC.graph.transitions) == {number for taken in sequences for number in taken}
     assert set(TRAFFIC.graph.reachable_states) == {"cruise", "crowded", "over"}
-    marks = np.asarray(SPACE.marks_at(POINTS))
-    assert set(np.unique(marks)) == {-1, *range(TRAFFIC.mark_count)}
+    marks = np.asarray(SPACE.coverage_ids_at(POINTS))
+    assert set(np.unique(marks)) == {-1, *range(TRAFFIC.coverage_id_count)}
 
 
 def test_without_events_is_legal_too_and_closes_up():
@@ -183,7 +183,11 @@ def test_refused_values(events, message):
         ({("a", "x"): {"wait": Box(0, 1), "weight": 0}}, {}, "weight of event"),
         ({("a", "x"): {"wait": Box(0, 1), "after": "y"}}, {}, "unknown event in after="),
         ({("a", "x"): {"wait": Box(0, 1), "time": Box(0, 1)}}, {}, "cannot be called 'time'"),
-        ({("a", "x"): {"wait": Box(0, 1)}}, {"least": 9}, "least must be an integer from 0"),
+        (
+            {("a", "x"): {"wait": Box(0, 1)}},
+            {"min_events": 9},
+            "min_events must be an integer from 0",
+        ),
         ({("a", "x"): {"wait": Box(0, 1), "p": Signal(Box(0, 1), 3)}}, {}, "must be a number"),
         (
             {("a", "x"): {"wait": Box(0, 1), "guard": lambda past: False}},
@@ -239,13 +243,13 @@ W = {"wait": Box(0, 1)}
         ),
         (
             {("cruise", "a"): {"to": "near", **W}, ("near", "b"): {"to": "over", **W}},
-            {"least": 3},
-            "least=3 events are impossible: no sequence from 'cruise' has more than 2",
+            {"min_events": 3},
+            "min_events=3 events are impossible: no sequence from 'cruise' has more than 2",
         ),
         (
             {("cruise", "a"): {"at_most": 2, **W}},
-            {"least": 4, "most": 5},
-            "least=4 events are impossible: no sequence from 'cruise' has more than 2",
+            {"min_events": 4, "max_events": 5},
+            "min_events=4 events are impossible: no sequence from 'cruise' has more than 2",
         ),
         ({("cruise", "a"): {"to": 3, **W}}, {}, "to of event .* must be the name of a state"),
     ],
@@ -256,7 +260,9 @@ def test_states_and_lengths_that_cannot_be_are_refused(events, options, message)
 
 
 def test_a_state_in_which_a_sequence_ends_is_none_of_these():
-    assert Automaton("lane1", {("lane1", "change"): {"to": "lane2", **W}}, least=1, most=1).most
+    assert Automaton(
+        "lane1", {("lane1", "change"): {"to": "lane2", **W}}, min_events=1, max_events=1
+    ).max_events
     ends = Automaton("cruise", {("cruise", "hit"): {"to": "crash", **W}, ("cruise", "go"): W})
     assert ends.graph.longest(6) == 6
 
@@ -268,8 +274,8 @@ def test_plain_data_and_analysis_know_it():
             ("a", "x"): {"to": "b", "wait": Box(0, 1), "p": Box(0, 1), "weight": 2.0},
             ("b", "y"): {"to": "a", "wait": Box(0, 3), "after": ("x",), "at_most": 2},
         },
-        most=3,
-        least=1,
+        max_events=3,
+        min_events=1,
     )
     space = FeatureSpace({"e": plain})
     assert FeatureSpace.from_json(space.to_json()) == space

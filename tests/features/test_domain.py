@@ -239,7 +239,7 @@ class TestRefused:
             (lambda: Struct({"x": {"y": Box(0, 1)}}), "a dictionary of them goes into Struct"),
             (lambda: Struct([Box(0, 1)]), "as a dictionary of domains"),
             (lambda: Array(Box(0, 1), length=0), "positive integer; got 0"),
-            (lambda: Array(Box(0, 1), length=(3, 1)), r"0 <= least <= most.*got \(3, 1\)"),
+            (lambda: Array(Box(0, 1), length=(3, 1)), r"0 <= shortest <= longest.*got \(3, 1\)"),
             (lambda: Array(Box(0, 1), length=(1, 2, 3)), r"a pair of integers.*got \(1, 2, 3\)"),
             (lambda: Array(Box(0, 1), length=1.5), "positive integer; got 1.5"),
             (lambda: Array(3, length=2), "an Array needs a domain, such as Box.*got 3"),

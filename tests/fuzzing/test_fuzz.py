@@ -22,7 +22,7 @@ TRAFFIC = vj.events.Automaton(
         ("busy", "leave"): {"to": "free", "wait": vj.Box(0.1, 1)},
         ("busy", "horn"): {"wait": vj.Box(0.1, 1)},
     },
-    most=3,
+    max_events=3,
 )
 
 
@@ -78,7 +78,7 @@ def test_the_summary_and_the_corpus_are_of_the_data(run):
     corpus, text = run.corpus, str(run)
     marks = [len(part.names) for part in run.coverage.parts if part.what != "states"]
     # The first to have each mark; the status of a simulation that ended is one more.
-    assert corpus["new_marks"].sum() <= sum(marks) + 1
+    assert corpus["new_coverage"].sum() <= sum(marks) + 1
     assert f"corpus       {len(corpus)} simulations extended coverage" in text
     assert "covered      events: 2 of 2 states" in text
     assert run.replay(int(corpus.index[-1])).trace.length == 12
@@ -101,7 +101,9 @@ def test_a_run_that_is_resumed_counts_on(run, tmp_path):
     assert not half.damage
     whole = vj.resume(half, budget=256)
     assert whole.table.all.equals(run.table.all)
-    np.testing.assert_array_equal(whole.checkpoint["marks.seen"], run.checkpoint["marks.seen"])
+    np.testing.assert_array_equal(
+        whole.checkpoint["coverage.seen"], run.checkpoint["coverage.seen"]
+    )
 
 
 @pytest.mark.thorough

@@ -20,7 +20,7 @@ from verifai_jax.reports import write_report
 from verifai_jax.reports.commands import run_command
 from verifai_jax.reports.markup import data_block, element
 from verifai_jax.reports.provenance import Input, chained
-from verifai_jax.reports.view import MOST_ROWS, numbers_of, view_data
+from verifai_jax.reports.view import MAX_ROWS, numbers_of, view_data
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -188,7 +188,7 @@ def test_a_large_table_is_thinned():
     n = 9000
     data = view_data(large(n, 4), {7: {"label": "row 7"}})
     assert 7 in data["rows"]
-    assert data["shown"] == len(data["rows"]) <= MOST_ROWS
+    assert data["shown"] == len(data["rows"]) <= MAX_ROWS
     assert data["simulations"] == n
     failing = sum(group == 3 for group in data["group"])
     assert 100 < failing < 2 * n // 10

@@ -99,7 +99,7 @@ def test_buffer_is_a_ring_and_gives_back_whole_transitions():
     buffer = empty_buffer(6, size=1, actions=1)
     for start in (0, 2, 4, 6):
         buffer = filled(buffer, rows([start, start + 1]))
-    assert (int(buffer.filled), int(buffer.place)) == (6, 2)
+    assert (int(buffer.filled), int(buffer.index)) == (6, 2)
     np.testing.assert_array_equal(buffer.rows[:, 0], [6, 7, 2, 3, 4, 5])
     drawn = drawn_of(buffer)
     assert set(np.asarray(drawn.observation[:, 0])) == {2, 3, 4, 5, 6, 7}

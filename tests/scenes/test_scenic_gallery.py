@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.thorough, pytest.mark.filterwarnings("ignore")]
 
 GALLERY = sorted((Path(__file__).parent / "gallery").glob("*.scenic"))
 POINTS, THEIRS, OURS = 48, 100, 1500
-LEAST_P = 0.01 / 200
+MIN_P = 0.01 / 200
 """A hundredth, over the number of all comparisons of the gallery (Bonferroni)."""
 
 
@@ -78,4 +78,4 @@ def test_scenes_refusals_and_distribution_are_those_of_scenic(path):
             one = np.round([poses(scene.objects[i])[key] for scene in theirs], 3)
             other = np.round(scenes[name][key][accepted].astype(float), 3)
             if np.ptp(one) > 0:
-                assert ks_2samp(one, other).pvalue > LEAST_P, f"{name}.{key}"
+                assert ks_2samp(one, other).pvalue > MIN_P, f"{name}.{key}"

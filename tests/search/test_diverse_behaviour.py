@@ -12,7 +12,7 @@ import verifai_jax as vj
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.outcomes import OUTCOME, SEGMENTS
 from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.evaluation.steering import Steering, outcome_of
+from verifai_jax.evaluation.guidance import Guidance, outcome_of
 from verifai_jax.mtl import explain, parse
 from verifai_jax.mtl.deciding import deciding_instant, leaves_of
 from verifai_jax.search import CrossEntropy, Diverse, from_json, to_json
@@ -69,10 +69,10 @@ def test_an_outcome_by_hand():
     assert not shape[3].any()
     # The same from the compiled evaluation, which is not asked for it otherwise.
     points = np.full((3, 1), 0.5, np.float32)
-    told = Evaluator(problem, 4, steering=Steering(outcome=True))(points)
-    np.testing.assert_allclose(told.steering, np.tile(outcome, (3, 1)), atol=1e-6)
+    told = Evaluator(problem, 4, guidance=Guidance(outcome=True))(points)
+    np.testing.assert_allclose(told.guidance, np.tile(outcome, (3, 1)), atol=1e-6)
     plain = Evaluator(problem, 4)(points)
-    assert plain.steering is None
+    assert plain.guidance is None
     np.testing.assert_array_equal(plain.rho, told.rho)
     # Fewer samples than parts of the time.
     short = vj.Trace({"x": jnp.array([0.0, 3.0])}, dt=1.0)

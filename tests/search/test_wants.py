@@ -85,7 +85,7 @@ def test_a_search_kept_away_from_failures_wants_what_it_is_around_wants(name):
         assert around.only(FULL)._fields == wants.only(FULL)._fields
 
 
-FULL = Wants(gradient=True, clauses=True, marks=True, outcomes=True).form(CUBE, 4, 2)
+FULL = Wants(gradient=True, clauses=True, coverage_ids=True, outcomes=True).form(CUBE, 4, 2)
 
 
 def test_observations_have_what_is_wanted():
@@ -99,18 +99,18 @@ def test_observations_have_what_is_wanted():
     assert clauses.clauses is not None
     assert clauses.clause_gradients is not None
     assert clauses.gradient is None
-    assert Wants(marks=True).form(CUBE, 4, 2).marks.shape == (4, 2)
+    assert Wants(coverage_ids=True).form(CUBE, 4, 2).coverage_ids.shape == (4, 2)
 
 
 def test_two_searches_want_what_either_does_in_the_smaller_rounds():
     both = Coverage().wants | Bayes().wants
-    assert both == Wants(marks=True, no_verdict_rows=True, max_batch=16)
+    assert both == Wants(coverage_ids=True, no_verdict_rows=True, max_batch=16)
 
 
 def test_parts_of_a_space_get_what_each_wants():
     class Noting(Search):
         seen: ClassVar[list[Observations]] = []
-        wants: ClassVar[Wants] = Wants(marks=True)
+        wants: ClassVar[Wants] = Wants(coverage_ids=True)
 
         def init(self, key, cube, batch):
             return ()
@@ -124,15 +124,15 @@ def test_parts_of_a_space_get_what_each_wants():
 
     cube = Cube((0, 0), names=("x", "y"))
     search = Split({"x": Noting()}, Portfolio())
-    assert search.wants == Wants(clauses=True, clause_gradients=True, marks=True)
+    assert search.wants == Wants(clauses=True, clause_gradients=True, coverage_ids=True)
     plain = Split({"x": Noting()}, CrossEntropy())
     state = plain.init(jax.random.key(0), cube, 4)
     marks = jnp.arange(8).reshape(4, 2)
-    told = Observations(jnp.full((4, 2), 0.25), jnp.ones(4), jnp.ones(4, bool), marks=marks)
+    told = Observations(jnp.full((4, 2), 0.25), jnp.ones(4), jnp.ones(4, bool), coverage_ids=marks)
     plain.tell(state, cube, told)
     (seen,) = Noting.seen
     assert seen.u.shape == (4, 1)
-    np.testing.assert_array_equal(seen.marks, marks)
+    np.testing.assert_array_equal(seen.coverage_ids, marks)
 
 
 def test_what_takes_the_place_of_a_search():

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from verifai_jax.statistics.least_distance import least_change
 from verifai_jax.statistics.max_min import max_min_step
+from verifai_jax.statistics.smallest_change import smallest_change
 from verifai_jax.synthesis.optimize import worst_case
 from verifai_jax.synthesis.parametric import Pairs
 
@@ -26,7 +26,7 @@ def drawn(p, n, seed):
 def test_least_change_is_the_nearest(size):
     p, n, seed = size
     theta, nominal, rho, slopes = drawn(p, n, seed)
-    step = least_change(theta, nominal, rho, slopes, 0.3, free=np.ones(p, bool), bounded=True)
+    step = smallest_change(theta, nominal, rho, slopes, 0.3, free=np.ones(p, bool), bounded=True)
     other = minimize(
         lambda z: np.sum((theta + z - nominal) ** 2),
         nominal - theta,
@@ -62,7 +62,7 @@ def test_coordinates_that_are_not_free_stay():
     theta, nominal, rho, slopes = drawn(3, 2, 1)
     free = np.array([True, False, True])
     assert max_min_step(theta, rho, slopes, 0.2, free=free, bounded=True)[1] == 0
-    step = least_change(theta, nominal, rho, slopes, -9.0, free=free, bounded=True)
+    step = smallest_change(theta, nominal, rho, slopes, -9.0, free=free, bounded=True)
     np.testing.assert_allclose(step, np.where(free, nominal - theta, 0))
 
 
@@ -70,7 +70,7 @@ def test_no_slope_no_step():
     flat = np.zeros((2, 3))
     theta = np.full(3, 0.5)
     assert not max_min_step(theta, np.ones(2), flat, 0.2, free=np.ones(3, bool), bounded=True).any()
-    found = least_change(theta, theta, -np.ones(2), flat, 0, free=np.ones(3, bool), bounded=True)
+    found = smallest_change(theta, theta, -np.ones(2), flat, 0, free=np.ones(3, bool), bounded=True)
     assert found is None
 
 

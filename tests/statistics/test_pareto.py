@@ -41,7 +41,7 @@ def test_continuous_points():
 
 def test_many_points_are_compared_in_parts(monkeypatch):
     points = np.random.default_rng(1).normal(size=(80, 2))
-    monkeypatch.setattr("verifai_jax.statistics.pareto._MOST_PAIRS", 500)
+    monkeypatch.setattr("verifai_jax.statistics.pareto._MAX_PAIRS", 500)
     assert fronts(points).tolist() == brute_force(points.tolist())
 
 

@@ -16,24 +16,24 @@ from jaxtyping import Float
 from verifai_jax.analysis.data.cells import count_occupied, cut
 from verifai_jax.analysis.data.marginals import Marginal, marginals
 from verifai_jax.analysis.data.samples import Samples, Source
-from verifai_jax.analysis.holes import MOST_TREE, largest_hole, uniform_points
+from verifai_jax.analysis.holes import MAX_TREE, largest_hole, uniform_points
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.figure import Drawn
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_features, format_percent
 
-MOST_ROWS = 2000
-MOST_ENTRIES = 8e7
+MAX_ROWS = 2000
+MAX_ENTRIES = 8e7
 """Rows that the discrepancy is computed from, and what their square times the features may be."""
 REPEATS = 8
 """Sets of uniform samples whose dispersion is averaged."""
 ALLOWED = 8192
 """Samples drawn that fulfil a constraint."""
-LEAST_ACCEPTED = 0.005
+MIN_ACCEPTED = 0.005
 """Share of the space that a constraint must leave to be taken into account."""
-MOST_LISTED = 5
+MAX_LISTED = 5
 """Untried values written in words."""
-MOST_NAMED = 8
+MAX_NAMED = 8
 """Features named in words."""
 
 
@@ -83,11 +83,11 @@ class Coverage(Drawn, InNotebook):
             + _describe_evenness(self.discrepancy)
         ]
         if self.hole is not None:
-            where = format_features(dict(list(self.hole.items())[:MOST_NAMED]))
+            where = format_features(dict(list(self.hole.items())[:MAX_NAMED]))
             lines.append(
                 f"largest hole: nothing within {self.dispersion:z.2f} in unit coordinates "
                 f"({self.uniform_dispersion:z.2f} if uniform) around {where}"
-                + (", ..." if len(self.hole) > MOST_NAMED else "")
+                + (", ..." if len(self.hole) > MAX_NAMED else "")
             )
         shares = self.table["occupied"].to_numpy(float)
         if shares.min() < 1:
@@ -96,9 +96,7 @@ class Coverage(Drawn, InNotebook):
                 f"least covered feature: {worst}, {format_percent(shares.min())} of its cells"
             )
         if self.untried_count:
-            shown = [
-                _describe_row(row) for row in self.untried.head(MOST_LISTED).to_dict("records")
-            ]
+            shown = [_describe_row(row) for row in self.untried.head(MAX_LISTED).to_dict("records")]
             more = self.untried_count - len(shown)
             lines.append("never tried: " + "; ".join(shown) + (f"; and {more:,} more" * (more > 0)))
         if self.samples.space is not None and self.samples.space.where is not None:
@@ -152,15 +150,15 @@ def coverage(source: Source, *, cells: int = 10, seed: int = 0) -> Coverage:
         points = _units(samples, ordered)
         if allowed is None:
             among = None
-            repeats = REPEATS if len(ordered) <= MOST_TREE else 1
+            repeats = REPEATS if len(ordered) <= MAX_TREE else 1
             others = [uniform_points(ordered, generator, len(points)) for _ in range(repeats)]
         else:
             among, other = np.array_split(_units(allowed, ordered), 2)
             others = [other[: len(points)]]
-        dispersion, place = largest_hole(points, ordered, seed, among)
+        dispersion, centre = largest_hole(points, ordered, seed, among)
         uniform = float(np.mean([largest_hole(p, ordered, seed, among)[0] for p in others]))
         hole = {
-            part.column.name: part.value(float(u)) for part, u in zip(ordered, place, strict=True)
+            part.column.name: part.value(float(u)) for part, u in zip(ordered, centre, strict=True)
         }
     return Coverage(
         table=table,
@@ -187,7 +185,7 @@ def _units(
 def _allowed(samples: Samples, seed: int) -> Samples | None:
     """Draw samples of the prior that fulfil the constraint of the space; None without one."""
     space = samples.space
-    if space is None or space.where is None or space.check_where() < LEAST_ACCEPTED:
+    if space is None or space.where is None or space.check_where() < MIN_ACCEPTED:
         return None
     import jax
 
@@ -220,11 +218,11 @@ def _discrepancy(
     from scipy.stats import qmc
 
     n, d = unit.shape
-    most = int(min(MOST_ROWS, np.sqrt(MOST_ENTRIES / d)))
+    maximum = int(min(MAX_ROWS, np.sqrt(MAX_ENTRIES / d)))
     if allowed is not None:
-        most = min(most, len(allowed))
-    if n > most:
-        unit, n = unit[generator.choice(n, most, replace=False)], most
+        maximum = min(maximum, len(allowed))
+    if n > maximum:
+        unit, n = unit[generator.choice(n, maximum, replace=False)], maximum
     expected = ((5 / 4) ** d - (13 / 12) ** d) / n
     if allowed is not None:
         expected = qmc.discrepancy(allowed[:n], method="CD")

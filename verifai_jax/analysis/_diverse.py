@@ -22,8 +22,8 @@ from verifai_jax.analysis.data.samples import (
     Scale,
     Source,
     Which,
-    beside,
     distances,
+    with_columns,
 )
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.figure import Drawn
@@ -52,7 +52,7 @@ class Diverse(Drawn):
     def table(self) -> pd.DataFrame:
         """The rows of the error table, with their `distance` (`distance_` if a feature is it)."""
         own = pd.DataFrame({"distance": self.distances}, index=pd.Index(self.rows))
-        return beside(self.samples.at(self.rows), own)
+        return with_columns(self.samples.at(self.rows), own)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -97,21 +97,21 @@ def diverse(
     """
     samples = Samples.of(source, which, columns, space)
     k = min(check_count("k", k), len(samples))
-    place = samples.worst
+    index = samples.worst
     if start is not None:
-        place = int(samples.frame.index.get_indexer(np.array([start]))[0])
-        if place < 0:
+        index = int(samples.frame.index.get_indexer(np.array([start]))[0])
+        if index < 0:
             raise IndexError(f"row {start} is not among the {samples.kind}")
-    placed = samples.place(scale)
+    placed = samples.embed(scale)
     nearest = np.full(len(samples), np.inf)
     chosen, added = [], []
     for _ in range(k):
-        chosen.append(place)
-        added.append(nearest[place])
-        nearest = np.minimum(nearest, distances(placed, (placed[0][place], placed[1][place])))
+        chosen.append(index)
+        added.append(nearest[index])
+        nearest = np.minimum(nearest, distances(placed, (placed[0][index], placed[1][index])))
         # Chosen ones are below the rows that equal them.
-        nearest[place] = -1
-        place = int(np.argmax(nearest))
+        nearest[index] = -1
+        index = int(np.argmax(nearest))
     return Diverse(
         samples, samples.rows[chosen], np.array(added), float(max(nearest.max(initial=0), 0))
     )

@@ -30,7 +30,7 @@ from verifai_jax.core.text import counted, format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
-MOST_COMBINATIONS = 50_000
+MAX_COMBINATIONS = 50_000
 
 
 @dataclass(frozen=True)
@@ -103,8 +103,8 @@ class FrequentPatterns(Drawn):
                 "share": counts / len(self.samples),
             }
         )
-        places = {item.column: i for i, item in reversed(list(enumerate(self.items)))}
-        order = np.lexsort((-counts, [places[item.column] for item in self.items]))
+        order_of = {item.column: i for i, item in reversed(list(enumerate(self.items)))}
+        order = np.lexsort((-counts, [order_of[item.column] for item in self.items]))
         return table.iloc[order].reset_index(drop=True)
 
     @cached_property
@@ -113,16 +113,16 @@ class FrequentPatterns(Drawn):
         first = self.values.drop_duplicates("column")
         return dict(zip(first["column"], first["value"], strict=True))
 
-    def rows(self, place: int) -> Int[np.ndarray, " count"]:
-        """Return the row numbers that the combination in row `place` of `table` covers.
+    def rows(self, index: int) -> Int[np.ndarray, " count"]:
+        """Return the row numbers that the combination in row `index` of `table` covers.
 
         **Raises:** `IndexError` for a place that is not in the table.
         """
-        if not 0 <= place < len(self.combinations):
+        if not 0 <= index < len(self.combinations):
             raise IndexError(
-                f"combination {place} is not among the {len(self.combinations)} in the table"
+                f"combination {index} is not among the {len(self.combinations)} in the table"
             )
-        return self.samples.rows[self._present[list(self.combinations[place])].all(axis=0)]
+        return self.samples.rows[self._present[list(self.combinations[index])].all(axis=0)]
 
     def __str__(self) -> str:
         sizes = [len(one) for one in self.combinations]
@@ -221,8 +221,8 @@ def frequent_patterns(
         _, elsewhere = _items(samples, bins, samples.others("all").frame)
     else:
         elsewhere = np.zeros((len(items), 0), bool)
-    least = max(1, int(np.ceil(minimum * len(samples) - 1e-9)))
-    combinations, counts, expected = _frequent(items, present, elsewhere, least, size)
+    min_count = max(1, int(np.ceil(minimum * len(samples) - 1e-9)))
+    combinations, counts, expected = _frequent(items, present, elsewhere, min_count, size)
     if against == "prior":
         expected = np.array([prod(items[i].prior or 0.0 for i in one) for one in combinations])
     order = sorted(range(len(counts)), key=lambda i: (len(combinations[i]), -counts[i], i))
@@ -249,9 +249,9 @@ def _has_both_verdicts(samples: Samples) -> bool:
 
 
 def _frequent(
-    items: tuple[Item, ...], present: np.ndarray, elsewhere: np.ndarray, least: int, size: int
+    items: tuple[Item, ...], present: np.ndarray, elsewhere: np.ndarray, min_count: int, size: int
 ) -> tuple[list[tuple[int, ...]], np.ndarray, np.ndarray]:
-    """Return all combinations of at most `size` items, of different columns, with `least` rows."""
+    """Return combinations of up to `size` items of different columns with `min_count` rows."""
     combinations: list[tuple[int, ...]] = []
     counts: list[int] = []
     shares: list[float] = []
@@ -262,12 +262,12 @@ def _frequent(
                 continue
             covered = rows & present[i]
             count = int(np.count_nonzero(covered))
-            if count < least:
+            if count < min_count:
                 continue
-            if len(combinations) == MOST_COMBINATIONS:
+            if len(combinations) == MAX_COMBINATIONS:
                 raise ValueError(
-                    f"more than {MOST_COMBINATIONS:,} combinations of up to {size} values are in "
-                    f"{least} rows or more; raise minimum, or lower size"
+                    f"more than {MAX_COMBINATIONS:,} combinations of up to {size} values are in "
+                    f"{min_count} rows or more; raise minimum, or lower size"
                 )
             beyond = others & elsewhere[i]
             combinations.append((*one, i))
@@ -294,12 +294,12 @@ def _items(
             labels, codes, prior = _cells(column, entries.to_numpy(np.float64), bins or 1)
         else:
             labels, codes, prior = column.choices, column.codes(entries), column.prior
-        for place, label in enumerate(labels):
+        for index, label in enumerate(labels):
             text = f"{column.name}={label}"
             if column.ordered and isinstance(label, str):
                 text = f"{column.name} in {label}"
-            items.append(Item(column.name, label, text, prior[place] if prior else None))
-            present.append(codes == place)
+            items.append(Item(column.name, label, text, prior[index] if prior else None))
+            present.append(codes == index)
     return tuple(items), np.array(present).reshape(len(items), len(frame))
 
 

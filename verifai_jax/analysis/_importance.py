@@ -19,22 +19,22 @@ from verifai_jax.core.figure import Drawn
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.progress import shows_progress
 
-MOST_TRAINED = 4000
-MOST_TESTED = 2000
-MOST_PREDICTED = 200_000
+MAX_TRAINED = 4000
+MAX_TESTED = 2000
+MAX_PREDICTED = 200_000
 """Predictions at most, over all features and repetitions."""
-FEWEST = 5
+MIN_OF_A_KIND = 5
 """Rows of each verdict, for training and for measuring, below which nothing is learned."""
-MOST_ONE_HOT = 30
-MOST_ENTRIES = 4_000_000
+MAX_ONE_HOT = 30
+MAX_ENTRIES = 4_000_000
 TREES = 60
-LEAST = {"failing": 0.65, "rho": 0.2}
+MIN_SCORE = {"failing": 0.65, "rho": 0.2}
 """Scores on held-out rows below which the importances mean nothing."""
 NAMES = {"failing": "failing", "rho": "robustness"}
 """Targets of the models, as a person calls them."""
 SCORES = {"failing": "AUC", "rho": "R^2"}
-LEAST_LOSS = 0.01
-MOST_NAMED = 6
+MIN_LOSS = 0.01
+MAX_NAMED = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class Importance(Drawn, InNotebook):
 
     def is_reliable(self, target: str) -> bool:
         """Return whether the model of `"failing"` or `"rho"` predicts rows kept aside."""
-        return self.scores.get(target, -np.inf) >= LEAST[target]
+        return self.scores.get(target, -np.inf) >= MIN_SCORE[target]
 
     @property
     def ranked(self) -> list[str]:
@@ -75,9 +75,9 @@ class Importance(Drawn, InNotebook):
                 lines.append(f"{what}: {self.missing[target]}")
                 continue
             losses = self.table[target].to_numpy(float)
-            order = [i for i in np.argsort(-losses, kind="stable") if losses[i] >= LEAST_LOSS]
+            order = [i for i in np.argsort(-losses, kind="stable") if losses[i] >= MIN_LOSS]
             listed = ", ".join(
-                f"{self.table.index[i]} ({losses[i]:z.2f})" for i in order[:MOST_NAMED]
+                f"{self.table.index[i]} ({losses[i]:z.2f})" for i in order[:MAX_NAMED]
             )
             if self.is_reliable(target):
                 lines.append(f"{what} depends on {listed}; {self.score_words(target)}")
@@ -145,7 +145,7 @@ def importance(
         reasons = "; ".join(f"{NAMES[target]}: {reason}" for target, reason in missing.items())
         raise ValueError(f"no importance can be learned from {samples.name!r}: {reasons}")
     table = pd.DataFrame(columns, index=pd.Index(names, name="feature"))
-    by = max(scores, key=lambda target: (scores[target] >= LEAST[target], target == "failing"))
+    by = max(scores, key=lambda target: (scores[target] >= MIN_SCORE[target], target == "failing"))
     table = table.sort_values(by, ascending=False, kind="stable")
     return Importance(table, scores, missing, samples.name)
 
@@ -153,13 +153,12 @@ def importance(
 def _unlearnable(target: str, values: np.ndarray) -> str:
     """Explain why nothing can be learned; empty if something can."""
     if target == "failing":
-        fewest = int(min(values.sum(), (~values).sum()))
-        if fewest < 2 * FEWEST:
+        smallest = int(min(values.sum(), (~values).sum()))
+        if smallest < 2 * MIN_OF_A_KIND:
             kind = "failing" if values.sum() <= (~values).sum() else "safe"
-            return (
-                f"{fewest or 'no'} {kind} {'row' if fewest < 2 else 'rows'}, too few to learn from"
-            )
-    elif len(values) < 4 * FEWEST:
+            rows = "row" if smallest < 2 else "rows"
+            return f"{smallest or 'no'} {kind} {rows}, too few to learn from"
+    elif len(values) < 4 * MIN_OF_A_KIND:
         rows = "row" if len(values) == 1 else "rows"
         return f"{len(values)} {rows} with a robustness, too few to learn from"
     elif np.ptp(values) == 0:
@@ -171,18 +170,18 @@ def _split(
     values: np.ndarray, generator: np.random.Generator, predictions: int
 ) -> tuple[Int[np.ndarray, " train"], Int[np.ndarray, " test"]]:
     """Return rows to train on and rows to measure on; rare verdicts are kept before others."""
-    most = int(np.clip(MOST_PREDICTED // max(predictions, 1), 200, MOST_TESTED))
+    maximum = int(np.clip(MAX_PREDICTED // max(predictions, 1), 200, MAX_TESTED))
     if values.dtype != bool:
         order = generator.permutation(len(values))
         half = len(values) // 2
-        return order[:half][:MOST_TRAINED], order[half:][:most]
+        return order[:half][:MAX_TRAINED], order[half:][:maximum]
     train, test = [], []
     for part in (values, ~values):
         order = generator.permutation(np.flatnonzero(part))
         half = len(order) // 2
         # Neither score depends on how many rows of each verdict there are.
-        train.append(order[:half][: MOST_TRAINED // 2])
-        test.append(order[half:][: most // 2])
+        train.append(order[:half][: MAX_TRAINED // 2])
+        test.append(order[half:][: maximum // 2])
     return np.concatenate(train), np.concatenate(test)
 
 
@@ -219,7 +218,7 @@ def _losses(
     plain = matrix[test]
     reached = float(scores(plain[None])[0])
     # Several features a call: sklearn takes longer to call a tree than to ask it.
-    together = max(1, int(MOST_ENTRIES // (repeats * plain.size)))
+    together = max(1, int(MAX_ENTRIES // (repeats * plain.size)))
     losses = []
     for begin in range(0, len(groups), together):
         some = groups[begin : begin + together]
@@ -244,7 +243,7 @@ def _encoded(samples: Samples) -> tuple[Float[np.ndarray, "n e"], list[list[int]
         columns.append(absent[:, j].astype(float))
     for codes, column in zip(samples.codes().T, samples.unordered, strict=True):
         choices = len(column.choices)
-        parts = [codes] if choices > MOST_ONE_HOT else [codes == i for i in range(choices)]
+        parts = [codes] if choices > MAX_ONE_HOT else [codes == i for i in range(choices)]
         groups.append(list(range(len(columns), len(columns) + len(parts))))
         columns += [part.astype(float) for part in parts]
     return np.stack(columns, axis=1).astype(np.float32), groups

@@ -28,8 +28,8 @@ from verifai_jax.analysis.data.samples import (
     Seed,
     Source,
     Which,
-    beside,
     generator,
+    with_columns,
 )
 from verifai_jax.core.checks import check_count, check_positive
 from verifai_jax.core.figure import Drawn
@@ -38,7 +38,7 @@ from verifai_jax.core.text import format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
-TOLD = 5
+SHOWN = 5
 """Components that are told, and compared with chance."""
 CHANCE = 0.99
 """Share of tables of unrelated features whose components explain less than a telling one does."""
@@ -86,10 +86,10 @@ class Components(Drawn, InNotebook):
     @cached_property
     def table(self) -> pd.DataFrame:
         """A row for each component: its loadings, its deviation and its share of the variance."""
-        place = pd.RangeIndex(1, len(self.directions) + 1, name="component")
-        table = pd.DataFrame(self.directions, index=place, columns=list(self.names))
-        own = pd.DataFrame({"deviation": self.deviations, "share": self.shares}, index=place)
-        return beside(table, own)
+        index = pd.RangeIndex(1, len(self.directions) + 1, name="component")
+        table = pd.DataFrame(self.directions, index=index, columns=list(self.names))
+        own = pd.DataFrame({"deviation": self.deviations, "share": self.shares}, index=index)
+        return with_columns(table, own)
 
     def project(self, rows: pd.DataFrame | Sequence[int] | None = None) -> pd.DataFrame:
         """Return coordinates along the components, in scaled units, a column each; 0 is the pivot.
@@ -204,7 +204,7 @@ class Components(Drawn, InNotebook):
             f"{len(self.directions)} principal components of {self.samples.kind}, "
             f"over {len(self.names)} ordered columns"
         ]
-        for i, direction in enumerate(self.directions[:TOLD]):
+        for i, direction in enumerate(self.directions[:SHOWN]):
             order = np.argsort(-np.abs(direction), kind="stable")
             parts = [
                 f"{direction[j]:+z.2f} {self.names[j]}" for j in order if _matters(direction[j])
@@ -254,10 +254,10 @@ def pca(
     samples.need_ordered("principal component analysis")
     offset, width = samples.scaling(scale)
     scaled = samples.matrix(scale)
-    most = min(scaled.shape)
-    if components is not None and check_count("components", components) > most:
+    maximum = min(scaled.shape)
+    if components is not None and check_count("components", components) > maximum:
         raise ValueError(
-            f"components must be from 1 to {most}, the lesser of {scaled.shape[0]} rows and "
+            f"components must be from 1 to {maximum}, the lesser of {scaled.shape[0]} rows and "
             f"{scaled.shape[1]} ordered columns; got {components}"
         )
     mean = scaled.mean(axis=0)
@@ -270,7 +270,7 @@ def pca(
     directions = np.where(constant, 0.0, directions[kept][:components])
     largest = np.argmax(np.round(np.abs(directions), 9), axis=1)
     signs = np.sign(np.take_along_axis(directions, largest[:, None], axis=1))
-    telling = min(_telling(scaled - mean, directions), components or TOLD)
+    telling = min(_telling(scaled - mean, directions), components or SHOWN)
     variances, total = variances[kept][:components], variances.sum()
     return Components(
         samples=samples,
@@ -297,14 +297,14 @@ def _telling(moved: Float[np.ndarray, "n k"], directions: Float[np.ndarray, "m k
     drawn = np.random.default_rng(0).normal(size=(_TABLES, k, k)) / np.sqrt(count - 1)
     upper = np.triu(drawn, 1)
     correlations = upper + np.swapaxes(upper, 1, 2) + np.eye(k)
-    for i, direction in enumerate(directions[:TOLD]):
+    for i, direction in enumerate(directions[:SHOWN]):
         deviations = np.sqrt((moved**2).sum(axis=0) / (count - 1))
         chance = np.linalg.eigvalsh(correlations * np.outer(deviations, deviations))[:, -1]
         along = moved @ direction
         if not (along**2).sum() / (count - 1) > np.quantile(chance, CHANCE):
             return i
         moved = moved - np.outer(along, direction)
-    return min(TOLD, len(directions))
+    return min(SHOWN, len(directions))
 
 
 def _accepted(space: FeatureSpace | None, frame: pd.DataFrame) -> np.ndarray:

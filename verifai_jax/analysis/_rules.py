@@ -29,7 +29,7 @@ from verifai_jax.falsification.no_rate import why_no_rate
 from verifai_jax.falsification.run import Run
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
 
-FEWEST = 10
+MIN_FAILURES = 10
 """Failing rows, and safe rows, from which on rules are made and measured."""
 FEW = 100
 """Failing rows below which their number may be why there is no rule."""
@@ -88,7 +88,7 @@ class Rules(Drawn, InNotebook):
 
     **Fields:** `rules`; `coverage` and `precision` of all of them together, 0 and None without a
     rule; `unsupported`: how many further boxes the measured rows do not support; `measured`: how
-    many rows were kept aside; `doubt`: why precision is no rate of failure, empty where it is;
+    many rows were kept aside; `doubt`: why precision is no rate of failure, empty if it is;
     `samples`: all rows with a verdict.
     """
 
@@ -172,7 +172,7 @@ def rules(
     depth: int = 3,
     *,
     cover: float = 0.95,
-    most: int = 6,
+    max_rules: int = 6,
     held_out: float = 0.4,
     seed: int = 0,
 ) -> Rules:
@@ -182,7 +182,7 @@ def rules(
 
     - `source`: a run, its table, a DataFrame, or `Samples` of `"all"` rows.
     - `depth`: features that a rule has conditions on at most.
-    - `cover`: share of the failures to cover; `most` rules at most.
+    - `cover`: share of the failures to cover; `max_rules` rules at most.
     - `held_out`: share of the rows that are kept aside to measure coverage and precision, drawn by
       `seed` among failing and safe rows alike.
     - `seed`: of the rows kept aside.
@@ -202,7 +202,7 @@ def rules(
 
     **Raises:** `ValueError` without failing or without safe rows, or for options out of range.
     """
-    depth, most = check_count("depth", depth), check_count("most", most)
+    depth, max_rules = check_count("depth", depth), check_count("max_rules", max_rules)
     check_fraction("cover", cover, one=True)
     check_fraction("held_out", held_out)
     samples = Samples.of(source, "all")
@@ -215,7 +215,7 @@ def rules(
     values, codes = samples.values(), samples.codes()
     made = ~aside
     regions = _select_regions(
-        values[made], codes[made], failing[made], samples.unordered, depth, cover, most
+        values[made], codes[made], failing[made], samples.unordered, depth, cover, max_rules
     )
     integer = [column.integer for column in samples.ordered]
     regions = [region.round(values[made], codes[made], integer) for region in regions]
@@ -246,19 +246,19 @@ def rules(
 
 
 def _too_few(failing: Bool[np.ndarray, " n"]) -> str:
-    """Say that there are too few failing or safe rows for rules; empty where there are enough."""
+    """Say that there are too few failing or safe rows for rules; empty if there are enough."""
     counts = {"fail": int(failing.sum()), "are safe": int((~failing).sum())}
     for verb, count in counts.items():
-        if count < FEWEST:
+        if count < MIN_FAILURES:
             return (
-                f"only {count} of {len(failing):,} rows {verb}, and rules need {FEWEST} to be made "
-                "from some and measured on others; simulate more"
+                f"only {count} of {len(failing):,} rows {verb}, and rules need {MIN_FAILURES} to "
+                "be made from some and measured on others; simulate more"
             )
     return ""
 
 
 def _doubt(source: Source) -> str:
-    """Explain why the share of failures among rows is not their probability; empty where it is."""
+    """Explain why the share of failures among rows is not their probability; empty if it is."""
     if not isinstance(source, Run):
         return "the rows may not be samples of the prior"
     if not source.prior:
@@ -307,7 +307,7 @@ def _select_regions(
     unordered: tuple[Column, ...],
     depth: int,
     cover: float,
-    most: int,
+    max_rules: int,
 ) -> list[Region]:
     """Select regions that together cover the failures, each from what those before left over."""
     base = failing.mean()
@@ -315,7 +315,7 @@ def _select_regions(
     dense = min(DENSER * base, (1 + base) / 2)
     remaining = np.ones(len(failing), bool)
     found: list[Region] = []
-    while len(found) < most and (failing & remaining).sum() > (1 - cover) * failing.sum():
+    while len(found) < max_rules and (failing & remaining).sum() > (1 - cover) * failing.sum():
 
         def score(region: Region, left: Bool[np.ndarray, " n"] = remaining) -> float:
             inside = region.covers(values, codes) & left
@@ -403,7 +403,7 @@ def _doubt_allowed(region: Region, looser: Region, samples: Samples) -> float:
 def _measured(
     inside: Bool[np.ndarray, " n"], failing: Bool[np.ndarray, " n"]
 ) -> tuple[float, Rate] | None:
-    """Measure coverage and precision on rows kept aside; None where these do not support it."""
+    """Measure coverage and precision on rows kept aside; None if these do not support it."""
     hits = int((inside & failing).sum())
     if hits < SUPPORT:
         return None

@@ -44,10 +44,10 @@ class Between:
 
 @dataclass(frozen=True)
 class OneOf:
-    """Choices that are at the `places` of a column's `choices`."""
+    """Choices that are at the `indices` of a column's `choices`."""
 
     column: Column
-    places: tuple[int, ...]
+    indices: tuple[int, ...]
 
     @property
     def feature(self) -> str:
@@ -56,14 +56,14 @@ class OneOf:
 
     def matches(self, frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
         """Return the rows that fulfil the condition."""
-        return np.isin(self.column.codes(frame[self.feature]), self.places)
+        return np.isin(self.column.codes(frame[self.feature]), self.indices)
 
     def __str__(self) -> str:
         choices = self.column.choices
-        others = [i for i in range(len(choices)) if i not in self.places]
-        excluded = len(others) < len(self.places)
-        named = ", ".join(str(choices[i]) for i in (others if excluded else self.places))
-        several = len(others if excluded else self.places) > 1
+        others = [i for i in range(len(choices)) if i not in self.indices]
+        excluded = len(others) < len(self.indices)
+        named = ", ".join(str(choices[i]) for i in (others if excluded else self.indices))
+        several = len(others if excluded else self.indices) > 1
         verb = ("is none of" if several else "is not") if excluded else "is"
         return f"{self.feature} {verb} {'one of ' * (several and not excluded)}{named}"
 
@@ -113,11 +113,11 @@ class Region:
             upto=_put(self.upto, j, min(self.upto[j], upto)),
         )
 
-    def restrict(self, j: int, places: frozenset[int]) -> "Region":
+    def restrict(self, j: int, indices: frozenset[int]) -> "Region":
         """Return the part of the region with these choices of unordered column `j` only."""
         before = self.allowed[j]
-        places = places if before is None else before & places
-        return replace(self, allowed=_put(self.allowed, j, places))
+        indices = indices if before is None else before & indices
+        return replace(self, allowed=_put(self.allowed, j, indices))
 
     def loosen(self) -> list["Region"]:
         """Return the regions with one bound or restriction less."""
@@ -179,30 +179,30 @@ def everywhere(ordered: int, unordered: int) -> Region:
     return Region((-np.inf,) * ordered, (np.inf,) * ordered, (None,) * unordered)
 
 
-def short_number(least: float, below: float, near: float) -> float:
+def short_number(lowest: float, below: float, near: float) -> float:
     """Return the number with fewest decimals in `[least, below)`, of those the closest to `near`.
 
     >>> short_number(0.3071, 0.3164, 0.31175)
     0.31
     """
-    if not least < below:
-        return least
-    first = int(np.floor(np.log10(max(abs(least), abs(below))))) + 1
+    if not lowest < below:
+        return lowest
+    first = int(np.floor(np.log10(max(abs(lowest), abs(below))))) + 1
     for decimals in range(-first, 18 - first):
         number = round(near, decimals)
-        if least <= number < below:
+        if lowest <= number < below:
             return number + 0.0  # No negative zero.
-    return least
+    return lowest
 
 
 def _between_values(end: float, values: Float[np.ndarray, " n"], integer: bool) -> float:
     """Return a short number that divides values as `end` does."""
-    place = int(np.searchsorted(values, end, side="right"))
-    if place in (0, len(values)):
+    index = int(np.searchsorted(values, end, side="right"))
+    if index in (0, len(values)):
         # All values are on one side: no bound at all, as far as these rows can tell.
-        return -np.inf if place == 0 else np.inf
-    least, below = float(values[place - 1]), float(values[place])
-    return float(np.floor(least)) if integer else short_number(least, below, (least + below) / 2)
+        return -np.inf if index == 0 else np.inf
+    lowest, below = float(values[index - 1]), float(values[index])
+    return float(np.floor(lowest)) if integer else short_number(lowest, below, (lowest + below) / 2)
 
 
 def _put(entries: tuple, j: int, entry: object) -> tuple:

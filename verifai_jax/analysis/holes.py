@@ -15,7 +15,7 @@ PROBES = 4096
 """Points at which the distance to the nearest point is computed."""
 REFINEMENTS = 4
 """Rounds of closer probes around the best one."""
-MOST_TREE = 8
+MAX_TREE = 8
 """Dimensions up to which a tree finds neighbours faster than brute force."""
 BLOCK = 4096
 """Points that distances are computed from at once."""
@@ -43,13 +43,13 @@ def largest_hole(
     from scipy.stats import qmc
 
     k = points.shape[1]
-    if among is not None and k <= MOST_TREE:
+    if among is not None and k <= MAX_TREE:
         distance = np.asarray(KDTree(points).query(among)[0])
         return float(distance.max()), among[int(np.argmax(distance))]
-    probes = qmc.Sobol(k, rng=seed).random(PROBES if k <= MOST_TREE else PROBES // 4)
+    probes = qmc.Sobol(k, rng=seed).random(PROBES if k <= MAX_TREE else PROBES // 4)
     probes = np.stack([part.snap(probes[:, j]) for j, part in enumerate(parts)], axis=1)
     probes = probes if among is None else among[: len(probes)]
-    if k <= MOST_TREE:
+    if k <= MAX_TREE:
         tree = KDTree(points)
         distance = np.asarray(tree.query(probes)[0])
         best, radius = int(np.argmax(distance)), float(distance.max())
@@ -71,8 +71,8 @@ def largest_hole(
             squares = own[:, None] + np.sum(block**2, axis=1) - 2 * single @ block.T
             nearest = np.minimum(nearest, squares.min(axis=1))
         distance = np.sqrt(np.maximum(nearest, 0))
-    place = int(np.argmax(distance))
-    return float(distance[place]), probes[place]
+    index = int(np.argmax(distance))
+    return float(distance[index]), probes[index]
 
 
 def uniform_points(

@@ -22,9 +22,9 @@ from verifai_jax.analysis.data.samples import (
     Seed,
     Source,
     Which,
-    beside,
     distances,
     generator,
+    with_columns,
 )
 from verifai_jax.analysis.tightest import tightest
 from verifai_jax.core.checks import check_count
@@ -40,7 +40,7 @@ class Neighbours(Drawn):
 
     **Fields:** `rows` `[k]`: row numbers of the table; `distances` `[k]` of each from the centre,
     in the coordinates of `samples.points`, NaN for rows drawn at random; `centre`: the row around
-    which they lie, None if that is no row; `how`: how they were chosen, in words.
+    which they lie, None if that is no row; `how`: how they were chosen, as text.
     """
 
     _picture = "neighbours", "plot_neighbours"
@@ -56,7 +56,7 @@ class Neighbours(Drawn):
     def table(self) -> pd.DataFrame:
         """The rows of the error table, with their `distance` (`distance_` if a feature is it)."""
         own = pd.DataFrame({"distance": self.distances}, index=pd.Index(self.rows))
-        return beside(self.samples.at(self.rows), own)
+        return with_columns(self.samples.at(self.rows), own)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -96,7 +96,7 @@ def k_closest(
     samples = Samples.of(source, which, columns, space)
     n = len(samples)
     k = n if k is None else min(check_count("k", k), n)
-    rows = samples.place(scale)
+    rows = samples.embed(scale)
     centre = tightest(*rows, k) if k < n else _middle(rows)
     far = distances(rows, (rows[0][centre], rows[1][centre]))
     # The centre comes first, also among rows that equal it.
@@ -147,8 +147,8 @@ def nearest(
         check_names("feature", samples.names, map(str, values))
         frame = pd.DataFrame([{name: values[name] for name in samples.names}])
         what = "the point"
-    coordinates, codes = samples.place(scale, frame)
-    far = distances(samples.place(scale), (coordinates[0], codes[0]))
+    coordinates, codes = samples.embed(scale, frame)
+    far = distances(samples.embed(scale), (coordinates[0], codes[0]))
     group = np.argsort(far, kind="stable")[:k]
     centre = int(point) if isinstance(point, int | np.integer) else None
     return Neighbours(

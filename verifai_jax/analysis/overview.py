@@ -2,7 +2,7 @@
 
 found = analyze(run)
 print(found)
-found["rules"]                      the result of one of them; None where it was skipped
+found["rules"]                      the result of one of them; None if it was skipped
 found.plot("overview.png")
 found.save("report")                report.md and a picture of each
 """
@@ -25,19 +25,19 @@ from verifai_jax.analysis._rules import rules
 from verifai_jax.analysis.clustering.clusters import clusters
 from verifai_jax.analysis.data.samples import Samples
 from verifai_jax.analysis.data.verdicts import unconfirmed
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.figure import Drawn
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.core.text import format_features, one_line, printable
-from verifai_jax.core.whole_files import replacing
 from verifai_jax.falsification.no_rate import why_no_rate
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.table import ErrorTable
 
-FEWEST = 4
-MOST_TO_CLUSTER = 2000
-MOST_NAMED = 6
-MOST_REPRESENTATIVES = 6
+MIN_FAILURES = 4
+MAX_TO_CLUSTER = 2000
+MAX_NAMED = 6
+MAX_REPRESENTATIVES = 6
 TITLES = {
     "failures": "Failures",
     "rules": "Where it fails",
@@ -51,7 +51,7 @@ TITLES = {
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """An analysis: `name`, `words` of it, `result`; None where it was skipped."""
+    """An analysis: `name`, `words` of it, `result`; None if it was skipped."""
 
     name: str
     words: str
@@ -80,7 +80,7 @@ class Analysis(Drawn):
     samples: Samples | None
 
     def __getitem__(self, name: str) -> Any:
-        """Return the result of an analysis by name; None where it was skipped.
+        """Return the result of an analysis by name; None if it was skipped.
 
         **Raises:** `UnknownNameError` for a name that is not one of the parts'.
         """
@@ -108,11 +108,11 @@ class Analysis(Drawn):
 
         **Raises:** `FileExistsError` where the folder's name is that of a file.
         """
-        place = Path(folder)
-        place.mkdir(parents=True, exist_ok=True)
+        path = Path(folder)
+        path.mkdir(parents=True, exist_ok=True)
         lines = [f"# {html.escape(one_line(self.name))}", ""]
         if self.samples is not None:
-            self.plot(place / "overview.png")
+            self.plot(path / "overview.png")
             lines += ["![overview](overview.png)", ""]
         for part in self.parts:
             # Names of features and values are text of others: nothing in it ends the block.
@@ -120,9 +120,9 @@ class Analysis(Drawn):
             fence = "`" * max(3, 1 + max(map(len, re.findall("`+", words)), default=0))
             lines += [f"## {part.title}", "", f"{fence}text", words, fence, ""]
             if hasattr(part.result, "plot"):
-                part.result.plot(place / f"{part.name}.png")
+                part.result.plot(path / f"{part.name}.png")
                 lines += [f"![{part.title.lower()}]({part.name}.png)", ""]
-        report = place / "report.md"
+        report = path / "report.md"
         with replacing(report) as partial:
             partial.write_text("\n".join(lines))
         return report
@@ -214,13 +214,13 @@ def _describe_failures(source: object, samples: Samples) -> str:
             else f"failure rate not given: {why_no_rate(source)}"
         )
     if np.isfinite(samples.rho).any():
-        place = samples.worst
-        row = samples.frame.iloc[place]
-        where = format_features({name: row[name] for name in samples.names[:MOST_NAMED]})
-        more = ", ..." if len(samples.names) > MOST_NAMED else ""
+        index = samples.worst
+        row = samples.frame.iloc[index]
+        where = format_features({name: row[name] for name in samples.names[:MAX_NAMED]})
+        more = ", ..." if len(samples.names) > MAX_NAMED else ""
         lines.append(
-            f"{'worst' if failures else 'nearest'}: row {samples.rows[place]}, "
-            f"robustness {samples.rho[place]:z.4g} at {where}{more}"
+            f"{'worst' if failures else 'nearest'}: row {samples.rows[index]}, "
+            f"robustness {samples.rho[index]:z.4g} at {where}{more}"
         )
     return "\n".join(lines)
 
@@ -233,17 +233,17 @@ def _thinned(samples: Samples, seed: int) -> Samples:
     from dataclasses import replace
 
     failing = _failing(samples)
-    if len(failing) <= MOST_TO_CLUSTER:
+    if len(failing) <= MAX_TO_CLUSTER:
         return failing
     generator = np.random.default_rng(seed)
-    kept = np.sort(generator.choice(len(failing), MOST_TO_CLUSTER, replace=False))
+    kept = np.sort(generator.choice(len(failing), MAX_TO_CLUSTER, replace=False))
     return replace(failing, frame=failing.frame.iloc[kept])
 
 
 def _too_few(failures: int) -> str:
     if not failures:
         return "no row fails"
-    if failures >= FEWEST:
+    if failures >= MIN_FAILURES:
         return ""
     return f"only {failures} rows fail" if failures > 1 else "only one row fails"
 
@@ -264,8 +264,8 @@ def _features(found: Analysis) -> pd.DataFrame:
     if found.samples is not None and found.samples.failing.any():
         failing = found.samples.frame.loc[found.samples.failing]
         for column in found.samples.ordered:
-            table.loc[column.name, "least_failing"] = failing[column.name].min()
-            table.loc[column.name, "most_failing"] = failing[column.name].max()
+            table.loc[column.name, "min_failing"] = failing[column.name].min()
+            table.loc[column.name, "max_failing"] = failing[column.name].max()
     if names and (covered := found["coverage"]) is not None:
         table["occupied"] = covered.table["occupied"]
     return table

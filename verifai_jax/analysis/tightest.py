@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-_MOST_DIMENSIONS = 20
+_MAX_DIMENSIONS = 20
 """Dimensions beyond which a k-d tree looks at nearly every point."""
 _ENTRIES = 20_000_000
 """Entries of the arrays of a block at most."""
@@ -67,30 +67,30 @@ def _within(
     other groups at a distance of 1.
     """
     n = len(weights)
-    tree = _tree(coordinates) if n > 1 and coordinates.shape[1] <= _MOST_DIMENSIONS else None
-    most = min(k, n)
-    size = max(1, min(1024, _ENTRIES // (most if tree is not None else n)))
+    tree = _tree(coordinates) if n > 1 and coordinates.shape[1] <= _MAX_DIMENSIONS else None
+    count = min(k, n)
+    size = max(1, min(1024, _ENTRIES // (count if tree is not None else n)))
     bounds, exact = np.empty(n), np.empty(n, bool)
     for start in range(0, n, size):
         some = np.arange(start, min(start + size, n))
         if tree is None:
-            far, which = _nearest_of_all(coordinates, np.zeros((n, 0), np.int64), some, most)
+            far, which = _nearest_of_all(coordinates, np.zeros((n, 0), np.int64), some, count)
         else:
             far, which = tree.query(
-                coordinates[some], k=np.arange(1, most + 1), workers=-1 if n > 10_000 else 1
+                coordinates[some], k=np.arange(1, count + 1), workers=-1 if n > 10_000 else 1
             )
         taken = _taken(weights[which], k)
-        least = far if alone else np.minimum(far, 1.0)
+        lowest = far if alone else np.minimum(far, 1.0)
         lacking = k - taken.sum(axis=1)
-        bounds[some] = (least * taken).sum(axis=1) + lacking
-        exact[some] = (lacking == 0) & ~((far > least) & (taken > 0)).any(axis=1)
+        bounds[some] = (lowest * taken).sum(axis=1) + lacking
+        exact[some] = (lacking == 0) & ~((far > lowest) & (taken > 0)).any(axis=1)
     return bounds, exact
 
 
 def _taken(weights: Int[np.ndarray, "n k"], k: int) -> Int[np.ndarray, "n k"]:
     """Count how many of each neighbour, the nearest first, are among the `k` nearest rows."""
-    behind = np.cumsum(weights, axis=1) - weights
-    return np.clip(k - behind, 0, weights)
+    before = np.cumsum(weights, axis=1) - weights
+    return np.clip(k - before, 0, weights)
 
 
 def _tree(coordinates: np.ndarray) -> Any:

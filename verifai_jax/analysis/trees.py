@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, Int
 from verifai_jax.analysis.conditions import Region
 from verifai_jax.analysis.data.columns import Column
 
-MOST_ONE_HOT = 30
-MOST_ENTRIES = 500_000
+MAX_ONE_HOT = 30
+MAX_ENTRIES = 500_000
 """Rows times columns that a tree is made from."""
 
 
@@ -36,7 +36,7 @@ def propose_regions(
     matrix, meanings = _encoded(values, codes, failing, unordered)
     if not matrix.shape[1]:
         return []
-    rows = _limit_rows(failing, int(MOST_ENTRIES // matrix.shape[1]))
+    rows = _limit_rows(failing, int(MAX_ENTRIES // matrix.shape[1]))
     leaf = int(np.clip(failing[rows].sum() // 10, 1, 5))
     regions: list[Region] = []
     for weight in (None, "balanced"):
@@ -57,13 +57,13 @@ def propose_regions(
     return regions
 
 
-def _limit_rows(failing: Bool[np.ndarray, " n"], most: int) -> Int[np.ndarray, " k"]:
-    """Return rows to make trees from, `most` at most; rare verdicts are kept."""
-    if len(failing) <= most:
+def _limit_rows(failing: Bool[np.ndarray, " n"], maximum: int) -> Int[np.ndarray, " k"]:
+    """Return rows to make trees from, `maximum` at most; rare verdicts are kept."""
+    if len(failing) <= maximum:
         return np.arange(len(failing))
     parts = []
     for part in (np.flatnonzero(failing), np.flatnonzero(~failing)):
-        parts.append(part[:: max(1, -(-2 * len(part) // most))])
+        parts.append(part[:: max(1, -(-2 * len(part) // maximum))])
     return np.concatenate(parts)
 
 
@@ -88,10 +88,10 @@ def _encoded(
         ranks = np.argsort(np.argsort(bad / np.maximum(counts, 1), kind="stable"), kind="stable")
         columns.append(np.where(present, ranks[np.maximum(codes[:, j], 0)], -1).astype(float))
         meanings.append((j, ranks))
-        if count <= MOST_ONE_HOT:
-            for place in range(count):
-                columns.append((codes[:, j] == place).astype(float))
-                meanings.append((j, (np.arange(count) == place).astype(int)))
+        if count <= MAX_ONE_HOT:
+            for index in range(count):
+                columns.append((codes[:, j] == index).astype(float))
+                meanings.append((j, (np.arange(count) == index).astype(int)))
     return np.stack(columns, axis=1) if columns else values, meanings
 
 

@@ -65,7 +65,7 @@ class Addition:
     - `rows`: a DataFrame with the columns of the space; for transformed inputs, of those that they
       were made from.
     - `rendered`: inputs that had to be rendered to choose these, themselves included.
-    - `why`: the reason, in words, why they are fewer than asked for; empty where they are not.
+    - `why`: the reason why they are fewer than asked for; empty if they are not.
     - `transformed`: True for inputs of the initial set that are to be transformed.
     """
 
@@ -192,7 +192,7 @@ Generator = Callable[[Key[Array, ""], int], pd.DataFrame]
 
 
 def _pca_generator(base: Base) -> Generator | str:
-    """Return a generator of features; or the reason, in words, why there is none."""
+    """Return a generator of features; or the reason why there is none."""
     if not len(base.counterexamples):
         return _few(base)
     try:
@@ -229,10 +229,10 @@ def _rules_generator(base: Base) -> Generator | str:
 def _kept(base: Base, generate: Generator | str) -> Addition:
     if isinstance(generate, str):
         return _nothing(base, generate)
-    most = GENERATED * base.added
+    maximum = GENERATED * base.added
     parts, generated, found = [base.features(base.table.iloc[:0])], 0, 0
     key = base.key
-    while found < base.added and generated < most:
+    while found < base.added and generated < maximum:
         key, now = jax.random.split(key)
         rows = generate(now, base.added)
         if not len(rows):

@@ -42,10 +42,10 @@ class Examples:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def take(self, places: Any) -> "Examples":
+    def take(self, indices: Any) -> "Examples":
         """Return the examples at these places, in this order."""
-        inputs, labels = jax.tree.map(lambda leaf: leaf[places], (self.inputs, self.labels))
-        return Examples(self.rows.iloc[places].reset_index(drop=True), inputs, labels)
+        inputs, labels = jax.tree.map(lambda leaf: leaf[indices], (self.inputs, self.labels))
+        return Examples(self.rows.iloc[indices].reset_index(drop=True), inputs, labels)
 
     def join(self, other: "Examples") -> "Examples":
         """Return these examples followed by others."""
@@ -64,7 +64,7 @@ class Judgement:
     """The judgement of a network's predictions.
 
     - `wrongness` `[n]`: positive where a prediction is wrong.
-    - `present`, `detected` `[n]`: what there is to be found, and what is found; None where the task
+    - `present`, `detected` `[n]`: what there is to be found, and what is found; None if the task
       does not say.
     """
 

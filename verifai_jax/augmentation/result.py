@@ -19,13 +19,13 @@ from verifai_jax.augmentation.keys import choice_key
 from verifai_jax.augmentation.outcome import Outcome
 from verifai_jax.augmentation.summary import summarize
 from verifai_jax.augmentation.task import SupervisedTask, Weights
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.core.figure import Figure
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.locks import write_lock
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.precision import reproducible_settings
-from verifai_jax.core.whole_files import replacing
 from verifai_jax.statistics.paired import PairedDifference
 
 TABLE, ADDED, SUMMARY = "table.parquet", "added.parquet", "summary.txt"
@@ -157,7 +157,7 @@ class Augmentation(InNotebook):
 
         **Raises:** as `compare`.
         """
-        draw = late("verifai_jax.plotting.augmentation", "plot_arms")
+        draw = lazy_import("verifai_jax.plotting.augmentation", "plot_arms")
         return draw(self, path, metric, reference)
 
     def montage(
@@ -180,7 +180,7 @@ class Augmentation(InNotebook):
         **Raises:** as `examples`; `ValueError` for inputs that are no images, or an arm that added
         nothing.
         """
-        draw = late("verifai_jax.plotting.augmentation", "plot_montage")
+        draw = lazy_import("verifai_jax.plotting.augmentation", "plot_montage")
         return draw(self, path, arm, seed, count)
 
     def save(self, folder: str | Path) -> Path:
@@ -188,17 +188,17 @@ class Augmentation(InNotebook):
 
         **Raises:** `FolderInUse` where another process writes it.
         """
-        place = Path(folder)
-        place.mkdir(parents=True, exist_ok=True)
-        with write_lock(place):
-            with replacing(place / TABLE) as partial:
+        path = Path(folder)
+        path.mkdir(parents=True, exist_ok=True)
+        with write_lock(path):
+            with replacing(path / TABLE) as partial:
                 self.table.to_parquet(partial)
             mixed = [n for n in self.added.columns if self.added[n].dtype == object]
-            with replacing(place / ADDED) as partial:
+            with replacing(path / ADDED) as partial:
                 self.added.astype(dict.fromkeys(mixed, str)).to_parquet(partial)
-            with replacing(place / SUMMARY) as partial:
+            with replacing(path / SUMMARY) as partial:
                 partial.write_text(f"{self.summary()}\n")
-        return place
+        return path
 
     def __str__(self) -> str:
         return self.summary()

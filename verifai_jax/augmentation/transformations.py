@@ -86,24 +86,24 @@ def shift(pixels: int) -> Transformation:
     return apply
 
 
-def brightness(most: float) -> Transformation:
+def brightness(max_change: float) -> Transformation:
     """Return a transformation that multiplies images by factors of `1 - most` to `1 + most`.
 
     **Arguments:**
 
-    - `most`: change of brightness at most, a share.
+    - `max_change`: change of brightness at most, a share.
 
     **Raises:** `ValueError` for a share out of range.
     """
-    return _scaled(most, jnp.zeros_like)
+    return _scaled(max_change, jnp.zeros_like)
 
 
-def contrast(most: float) -> Transformation:
+def contrast(max_change: float) -> Transformation:
     """Return a transformation that scales images around their mean by `1 - most` to `1 + most`.
 
     **Arguments:**
 
-    - `most`: change of contrast at most, a share.
+    - `max_change`: change of contrast at most, a share.
 
     **Raises:** `ValueError` for a share out of range.
     """
@@ -111,16 +111,18 @@ def contrast(most: float) -> Transformation:
     def mean(images: Array) -> Array:
         return images.mean(axis=tuple(range(1, images.ndim)), keepdims=True)
 
-    return _scaled(most, mean)
+    return _scaled(max_change, mean)
 
 
-def _scaled(most: float, middle: Callable[[Array], Array]) -> Transformation:
+def _scaled(max_change: float, middle: Callable[[Array], Array]) -> Transformation:
     """Return a transformation that scales images around a middle, and keeps them in [0, 1]."""
-    check_fraction("most", most)
+    check_fraction("max_change", max_change)
 
     def apply(inputs: Inputs, labels: Labels, key: Key[Array, ""]) -> tuple[Inputs, Labels]:
         images = _images(inputs)
-        factor = jax.random.uniform(key, images.shape[:1], minval=1 - most, maxval=1 + most)
+        factor = jax.random.uniform(
+            key, images.shape[:1], minval=1 - max_change, maxval=1 + max_change
+        )
         around = middle(images)
         return jnp.clip(around + (images - around) * _each(factor, images), 0.0, 1.0), labels
 

@@ -33,7 +33,7 @@ LANES = 64
 """Samples of a policy in one block."""
 SETTLED = 3.0
 """Over `tie`: about as many samples as name a leader that never fails."""
-MOST_KEPT = 1000
+MAX_KEPT = 1000
 """Counterexamples of a policy that are kept, the worst ones."""
 ROWS = 256
 """Rows whose features are computed at a time, so that one shape compiles."""
@@ -123,7 +123,7 @@ def certify(
     stopped, margins = "decided", np.full(len(policies), np.nan)
     try:
         attack_policies(blocks, attacked, attacker, rounds, report.attacked)
-        margins = np.array([one.least for one in attacked])
+        margins = np.array([one.lowest for one in attacked])
         stopped = _sample(blocks, sampled, allocation, margins, report)
     except KeyboardInterrupt:
         stopped = "interrupted"
@@ -238,17 +238,17 @@ def _worst_rows(
         return float("nan"), None, {}
     u = np.concatenate(points)
     verdicts = [each for record in both for each in record.verdicts]
-    rho = np.concatenate([each.least for each in verdicts])
+    rho = np.concatenate([each.lowest for each in verdicts])
     failing = np.concatenate([each.violated for each in verdicts])
     order = np.argsort(rho, kind="stable")  # NaN come last.
-    kept = order[failing[order]][:MOST_KEPT]
+    kept = order[failing[order]][:MAX_KEPT]
     shown = np.concatenate([order[:1], kept])
     columns = _columns(space, u[shown])
     found = {name: values[1:] for name, values in columns.items()} | {"rho": rho[kept]}
-    least = float(rho[order[0]])
-    if np.isnan(least):
-        return least, None, found
-    return least, {name: values[0] for name, values in columns.items()}, found
+    lowest = float(rho[order[0]])
+    if np.isnan(lowest):
+        return lowest, None, found
+    return lowest, {name: values[0] for name, values in columns.items()}, found
 
 
 def _columns(space: FeatureSpace, u: np.ndarray) -> dict[str, np.ndarray]:
@@ -296,20 +296,20 @@ def _check(
         raise ValueError("there is no policy to certify")
     for name, value in (("p", p), ("confidence", confidence)):
         check_fraction(name, value)
-    for name, value, least in (
+    for name, value, minimum in (
         ("samples", samples, 1),
         ("seed", seed, 0),
         ("attack_simulations", attack_simulations, 0),
     ):
-        check_count(name, value, least)
+        check_count(name, value, minimum)
     if tie is not None:
         check_fraction("tie", tie, zero=True)
-    least = len(policies) * samples
+    minimum = len(policies) * samples
     if budget is None:
-        return 4 * least
-    if budget < least:
+        return 4 * minimum
+    if budget < minimum:
         raise ValueError(
             f"{len(policies)} policies with {samples} samples each need a budget of at least "
-            f"{least}; got {budget!r}"
+            f"{minimum}; got {budget!r}"
         )
     return budget

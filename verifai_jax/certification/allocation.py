@@ -118,9 +118,9 @@ class Allocation:
         - `margins`: what decides between equals who leads; see `find_leader`.
         """
         k, n = np.asarray(failures), np.asarray(simulations)
-        least = np.maximum(-(-(self.samples - n) // self.block), 0)
-        if least.any():
-            return least
+        lowest = np.maximum(-(-(self.samples - n) // self.block), 0)
+        if lowest.any():
+            return lowest
         left = (self.budget - int(n.sum())) // self.block
         if left <= 0:
             return np.zeros(len(n), np.int64)
@@ -176,8 +176,8 @@ class Allocation:
         if not len(where):
             return blocks
         more = self._missing(k[where], n[where], len(n))
-        for place in np.argsort(more, kind="stable"):
-            i, missing = where[place], more[place]
+        for index in np.argsort(more, kind="stable"):
+            i, missing = where[index], more[index]
             if not math.isfinite(missing) or missing > left * self.block:
                 break
             # What it shows on the way may change what is missing.
@@ -196,16 +196,16 @@ class Allocation:
         from scipy.special import betaincinv
 
         limit = required_evidence(self.confidence, among)
-        most = max(self.budget, 2 * self.block)
-        steps = np.geomspace(self.block, most, 32)
-        fewest = np.full(len(failures), np.inf)
+        maximum = max(self.budget, 2 * self.block)
+        steps = np.geomspace(self.block, maximum, 32)
+        smallest = np.full(len(failures), np.inf)
         k, n = failures[:, None].astype(float), simulations[:, None] + steps
         for evidence, level in ((evidence_below, 0.25), (evidence_above, 0.75)):
             rates = betaincinv(k + 0.5, simulations[:, None] - k + 0.5, level)
             found = evidence(k + rates * steps, n, np.full(n.shape, self.p)) > limit
             first = np.where(found.any(axis=1), steps[np.argmax(found, axis=1)], np.inf)
-            fewest = np.minimum(fewest, first)
-        return fewest
+            smallest = np.minimum(smallest, first)
+        return smallest
 
 
 def _within(blocks: Int[np.ndarray, " n"], left: int) -> Int[np.ndarray, " n"]:

@@ -2,7 +2,7 @@
 
     records = [PolicyRecord() for _ in policies]
     attack_policies(blocks, records, CrossEntropy(), rounds=4, report=report)
-    records[3].least                                    # the least robustness that it met
+    records[3].lowest                                  # the least robustness that it met
 
 Each policy has a search of its own; their simulations go through one program. What a search finds
 says that a policy can fail, never how likely it is: points that it chose are no samples.
@@ -49,17 +49,17 @@ class PolicyRecord:
         self.failures += int(np.sum(verdicts.violated))
         self.not_finite += int(np.sum(~verdicts.proper))
 
-    def take_out(self, block: int, place: int) -> None:
+    def take_out(self, block: int, index: int) -> None:
         """Leave a row out of the counterexamples and the least robustness, but in the counts."""
         verdicts = self.verdicts[block]
         rho, violated = verdicts.rho.copy(), verdicts.violated.copy()
-        rho[place], violated[place] = np.nan, False
+        rho[index], violated[index] = np.nan, False
         self.verdicts[block] = verdicts._replace(rho=rho, violated=violated)
 
     @property
-    def least(self) -> float:
+    def lowest(self) -> float:
         """The least robustness; NaN where nothing had a verdict."""
-        values = [verdicts.least[verdicts.proper] for verdicts in self.verdicts]
+        values = [verdicts.lowest[verdicts.proper] for verdicts in self.verdicts]
         return float(min((np.min(rho) for rho in values if len(rho)), default=np.nan))
 
 
@@ -112,8 +112,8 @@ def attack_policies(
                 chosen.append((number, points))
             else:
                 attacker.tell_refused()
-        for place, verdicts in blocks.attack(chosen, round_, repr(search)):
-            number, points = chosen[place]
+        for index, verdicts in blocks.attack(chosen, round_, repr(search)):
+            number, points = chosen[index]
             records[number].add(points, verdicts, round_ * blocks.lanes)
-            attackers[number].tell(verdicts.least, verdicts.proper, None)
+            attackers[number].tell(verdicts.lowest, verdicts.proper, None)
             report(len(points))

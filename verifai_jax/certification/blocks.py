@@ -42,7 +42,7 @@ STREAM = 0x5AFE
 """Sets the random numbers of a certificate apart from those of a training with the same seed."""
 DRAWN = 4096
 """Samples drawn from the prior at a time."""
-MOST_BARREN = 1000
+MAX_BARREN = 1000
 """Such draws in a row without one that the constraint accepts, after which it is given up."""
 
 
@@ -134,8 +134,8 @@ class Blocks:
                 simulator = shared_simulator(problem_of, group, lanes, self.space.dim, devices)
             for number in numbers:
                 self._owner[number] = len(self._simulators)
-            places = {number: place for place, number in enumerate(numbers)}
-            self._simulators.append((simulator, places))
+            indices = {number: index for index, number in enumerate(numbers)}
+            self._simulators.append((simulator, indices))
         root = jax.random.fold_in(jax.random.key(seed, impl="threefry2x32"), STREAM)
         self.attack_key, points_key, self._simulation_key, self._attacked_key = jax.random.split(
             root, 4
@@ -149,13 +149,13 @@ class Blocks:
     def notes(self) -> tuple[str, ...]:
         """Decisions and errors that a user should know of."""
         notes = list(self._notes)
-        for simulator, places in self._simulators:
+        for simulator, indices in self._simulators:
             if isinstance(simulator, SeparateSimulators | ExecutorSimulator):
                 messages = simulator.messages
                 notes += [
-                    f"a simulation of policy {number} raised {messages[place]}"
-                    for number, place in places.items()
-                    if place in messages
+                    f"a simulation of policy {number} raised {messages[index]}"
+                    for number, index in indices.items()
+                    if index in messages
                 ]
         return tuple(notes)
 
@@ -207,15 +207,15 @@ class Blocks:
         """
 
         def compute() -> dict[str, np.ndarray]:
-            simulator, places = self._simulators[self._owner[policy]]
+            simulator, indices = self._simulators[self._owner[policy]]
             key = self._attacked_key if of_attack else self._simulation_key
-            members = [places[policy]] * len(points)
+            members = [indices[policy]] * len(points)
             with truncate_silently():
                 found = simulator(members, points[:, None], numbers.astype(np.int32), key)
             self.simulated += 1
-            least = [each.least[0] if each.proper[0] else np.nan for each in found]
+            lowest = [each.lowest[0] if each.proper[0] else np.nan for each in found]
             failing = np.array([bool(each.violated[0]) for each in found])
-            return {"again": np.array(least, np.float32), "failing": failing}
+            return {"again": np.array(lowest, np.float32), "failing": failing}
 
         kind, rows = "attack" if of_attack else "sample", "-".join(map(str, numbers.tolist()))
         kind = f"{kind}/{attempt}"
@@ -232,17 +232,17 @@ class Blocks:
         # Those of one program after another.
         order = sorted(range(len(blocks)), key=lambda i: self._owner[blocks[i].policy])
         ready: dict[int, Verdicts] = {}
-        for place, i in enumerate(order):
+        for index, i in enumerate(order):
             block = blocks[i]
 
-            def compute(place: int = place, i: int = i) -> dict[str, np.ndarray]:
+            def compute(index: int = index, i: int = i) -> dict[str, np.ndarray]:
                 if i not in ready:
                     owner = self._owner[blocks[i].policy]
                     simulator, _ = self._simulators[owner]
-                    most = simulator.blocks_per_call()
+                    maximum = simulator.blocks_per_call()
                     some = [
                         j
-                        for j in order[place : place + most]
+                        for j in order[index : index + maximum]
                         if self._owner[blocks[j].policy] == owner and j not in ready
                     ]
                     found = self._simulate(owner, [blocks[j] for j in some], key)
@@ -253,10 +253,10 @@ class Blocks:
 
     @truncate_silently()
     def _simulate(self, owner: int, blocks: list[Block], key: Any) -> list[Verdicts]:
-        simulator, places = self._simulators[owner]
+        simulator, indices = self._simulators[owner]
         self.simulated += len(blocks)
         u = np.stack([_fill_block(block.points, self.lanes) for block in blocks])
-        members = [places[block.policy] for block in blocks]
+        members = [indices[block.policy] for block in blocks]
         first = np.array([block.first for block in blocks], np.int32)
         found = simulator(members, u, first, key)
         for block, verdicts in zip(blocks, found, strict=True):
@@ -266,10 +266,10 @@ class Blocks:
         return found
 
     def _take_in(self, policy: int, verdicts: Verdicts) -> None:
-        simulator, places = self._simulators[self._owner[policy]]
+        simulator, indices = self._simulators[self._owner[policy]]
         messages = verdicts.messages
         if messages is None and isinstance(simulator, ExecutorSimulator):
-            messages = [simulator.messages.get(places[policy], "")]
+            messages = [simulator.messages.get(indices[policy], "")]
         self._raising.add(verdicts.status, messages)
         self._tried.add(policy)
 
@@ -277,9 +277,9 @@ class Blocks:
         """End the work where a simulation of each policy raises, too: one may be broken alone."""
         for policy, owner in self._owner.items():
             if policy not in self._tried and self._raising.always:
-                simulator, places = self._simulators[owner]
+                simulator, indices = self._simulators[owner]
                 first = np.array([block.first], np.int32)
-                (verdicts,) = simulator([places[policy]], block.points[None, :1], first, key)
+                (verdicts,) = simulator([indices[policy]], block.points[None, :1], first, key)
                 self._take_in(policy, verdicts)
         self._raising.check(self.problem.name)
 
@@ -336,9 +336,9 @@ class _Samples:
             if self._space.where is not None:
                 u = u[self.accepted(u)]
             barren = 0 if len(u) else barren + 1
-            if barren >= MOST_BARREN:
+            if barren >= MAX_BARREN:
                 raise ValueError(
-                    f"where accepted none of {MOST_BARREN * DRAWN:,} samples of the space in a row"
+                    f"where accepted none of {MAX_BARREN * DRAWN:,} samples of the space in a row"
                 )
             self._points = np.concatenate([self._points, u])
         return self._points[first : first + count]
@@ -348,8 +348,8 @@ class _Samples:
 
 
 def _to_memo(verdicts: Verdicts) -> dict[str, np.ndarray]:
-    least = np.where(verdicts.proper, verdicts.least, np.nan).astype(np.float32)
-    return {"rho": least, "failing": verdicts.violated, "proper": verdicts.proper}
+    lowest = np.where(verdicts.proper, verdicts.lowest, np.nan).astype(np.float32)
+    return {"rho": lowest, "failing": verdicts.violated, "proper": verdicts.proper}
 
 
 def _from_memo(known: Arrays, count: int) -> Verdicts:

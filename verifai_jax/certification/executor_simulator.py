@@ -38,9 +38,9 @@ from verifai_jax.problem.problem import Problem
 
 AT_FIRST = 4
 """Blocks that a worker gets at a time, before it is known how long one takes."""
-MOST = 64
+MAX_BLOCKS_PER_SECOND = 64
 """Blocks that a worker gets at a time at most, for a second of work."""
-MOST_KEPT = 64
+MAX_KEPT = 64
 """Groups of policies by themselves whose problems a worker keeps."""
 
 
@@ -105,18 +105,18 @@ class ExecutorSimulator:
             )  # fmt: skip
         found: dict[int, list[Verdicts]] = {}
 
-        def ended(place: int, result: dict[str, Any]) -> None:
+        def ended(index: int, result: dict[str, Any]) -> None:
             arrays = zip(result["rho"], result["status"], result["violated"], strict=True)
-            found[place] = [Verdicts(*block) for block in arrays]
+            found[index] = [Verdicts(*block) for block in arrays]
             for number, message in result["messages"].items():
                 self.messages.setdefault(number, message)
-            each = result["seconds"] / max(len(found[place]), 1)
+            each = result["seconds"] / max(len(found[index]), 1)
             wanted = seconds_per_block(self._executor)
-            most = MOST * max(1, int(wanted / SECONDS))
-            self._each = max(1, min(most, int(wanted / max(each, 1e-9))))
+            maximum = MAX_BLOCKS_PER_SECOND * max(1, int(wanted / SECONDS))
+            self._each = max(1, min(maximum, int(wanted / max(each, 1e-9))))
 
         gather(futures, ended)
-        return [verdicts for place in range(len(parts)) for verdicts in found[place]]
+        return [verdicts for index in range(len(parts)) for verdicts in found[index]]
 
 
 @truncate_silently()
@@ -139,16 +139,16 @@ def simulate_blocks(
 
     **Returns:** `rho`, `status` and `violated` of each block; `messages` by policy; `seconds`.
     """
-    places = {number: place for place, (number, _) in enumerate(policies)}
+    indices = {number: index for index, (number, _) in enumerate(policies)}
     weights = tuple(policy for _, policy in policies)
     if structure is not None:
-        group = PolicyGroup(tuple(places), weights, structure)
+        group = PolicyGroup(tuple(indices), weights, structure)
         simulator: Any = shared_simulator(shipment.thing, group, lanes, dim)
     else:
         simulator = _separate(shipment, policies, lanes, name)
-        places = {number: number for number in places}
+        indices = {number: number for number in indices}
     started = time.perf_counter()
-    verdicts = simulator([places[member] for member in members], points, first, as_key(words))
+    verdicts = simulator([indices[member] for member in members], points, first, as_key(words))
     return {
         "rho": [each.rho for each in verdicts],
         "status": [each.status for each in verdicts],
@@ -168,7 +168,7 @@ def _separate(
     if name not in shipment.made:
         problems: dict[int, Problem] = {}
         shipment.made[name] = problems, SeparateSimulators(problems, lanes)
-        for other in list(shipment.made)[:-MOST_KEPT]:
+        for other in list(shipment.made)[:-MAX_KEPT]:
             del shipment.made[other]
     problems, simulators = shipment.made[name]
     for number, policy in policies:

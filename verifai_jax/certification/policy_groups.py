@@ -20,7 +20,7 @@ import numpy as np
 from verifai_jax.core.shapes import power_of_two
 from verifai_jax.rl import Policy
 
-LEAST_WIDTH = 64
+MIN_WIDTH = 64
 """Hidden layers up to this width share a program; wider ones go to the next power of two."""
 
 
@@ -82,7 +82,7 @@ def padded(policy: Any) -> Any:
 
 def shared_width(width: int) -> int:
     """Return the width that a hidden layer of `width` units is padded to."""
-    return max(LEAST_WIDTH, power_of_two(width))
+    return max(MIN_WIDTH, power_of_two(width))
 
 
 def structure_of(policy: Any) -> str:

@@ -31,19 +31,22 @@ def repeat_failures(
     - `policy`: its number.
     - `sampled`, `attacked`: its simulations, of which verdicts are replaced.
 
-    **Returns:** what that says of the system; empty where all came again.
+    **Returns:** what that says of the system; empty if all came again.
     """
     rows = [
-        (float(verdicts.least[place]), record, block, place)
+        (float(verdicts.lowest[index]), record, block, index)
         for record in (sampled, attacked)
         for block, verdicts in enumerate(record.verdicts)
-        for place in np.flatnonzero(verdicts.violated).tolist()
+        for index in np.flatnonzero(verdicts.violated).tolist()
     ]
     rows.sort(key=lambda row: row[0])
     found = Repetitions()
-    begin, most = 0, max(REPEATED, (sampled.simulations + attacked.simulations) // SHARE_REPEATED)
-    while begin < min(len(rows), most):
-        part = rows[begin : min(begin + REPEATED, most)]
+    begin, maximum = (
+        0,
+        max(REPEATED, (sampled.simulations + attacked.simulations) // SHARE_REPEATED),
+    )
+    while begin < min(len(rows), maximum):
+        part = rows[begin : min(begin + REPEATED, maximum)]
         begin += len(part)
         rho = np.array([row[0] for row in part])
         again, failing = _again(blocks, policy, attacked, part, 0)
@@ -59,11 +62,11 @@ def repeat_failures(
         verdicts = np.where(lost, "fragile", "confirmed").astype(object)
         found = found.joined(Repetitions.count(rho, again, verdicts))
         for i in np.flatnonzero(lost).tolist():
-            _, record, block, place = part[i]
-            record.take_out(block, place)
+            _, record, block, index = part[i]
+            record.take_out(block, index)
             attacked.failures -= record is attacked
         if found.moved:
-            most = LIMIT
+            maximum = LIMIT
     return str(found)
 
 
@@ -80,7 +83,7 @@ def _again(
         own = [i for i, row in enumerate(rows) if (row[1] is attacked) == of_attack]
         if own:
             taken = [rows[i][1:] for i in own]
-            points = np.stack([record.points[block][place] for record, block, place in taken])
-            numbers = np.array([record.first[block] + place for record, block, place in taken])
+            points = np.stack([record.points[block][index] for record, block, index in taken])
+            numbers = np.array([record.first[block] + index for record, block, index in taken])
             again[own], failing[own] = blocks.again(policy, points, numbers, of_attack, attempt)
     return again, failing

@@ -28,7 +28,7 @@ from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.verdicts import Verdicts, violations
 from verifai_jax.problem.problem import Problem
 
-MOST_BLOCKS = 64
+MAX_BLOCKS = 64
 """Blocks of a device in one call at most."""
 SLICE_SECONDS = 1.0
 """Seconds that a call lasts at most, about: between calls one can stop."""
@@ -92,9 +92,9 @@ class SharedSimulator:
         key: Key[Array, ""],
     ) -> list[Verdicts]:
         verdicts: list[Verdicts] = []
-        most = self._program.capacity * len(self._program.devices)
-        for start in range(0, len(members), most):
-            part = slice(start, start + most)
+        maximum = self._program.capacity * len(self._program.devices)
+        for start in range(0, len(members), maximum):
+            part = slice(start, start + maximum)
             verdicts += self._call(members[part], points[part], first[part], key)
         return verdicts
 
@@ -110,10 +110,10 @@ class SharedSimulator:
         flat = rho.reshape(-1, rho.shape[2])
 
         def holds() -> Bool[np.ndarray, "rows formulas"]:
-            places = np.flatnonzero(np.any(rho == 0, axis=(1, 2)))
+            indices = np.flatnonzero(np.any(rho == 0, axis=(1, 2)))
             every = np.ones(rho.shape, bool)
-            some = [policies[i] for i in places]
-            (every[places],) = self._program("holds", some, points[places], first[places], key)
+            some = [policies[i] for i in indices]
+            (every[indices],) = self._program("holds", some, points[indices], first[indices], key)
             return every.reshape(flat.shape)
 
         violated = violations(flat, status.ravel(), holds).reshape(status.shape)
@@ -158,7 +158,7 @@ class _Program:
         devices: tuple[Device, ...],
     ) -> None:
         self.problem_of, self.lanes, self.dim, self.devices = problem_of, lanes, dim, devices
-        self.capacity = MOST_BLOCKS
+        self.capacity = MAX_BLOCKS
         self._seconds: float | None = None  # Of a block, on one device.
         self._executables: dict[Mode, jax.stages.Compiled] = {}
 
@@ -183,18 +183,18 @@ class _Program:
         count, devices = len(policies), len(self.devices)
         share = -(-count // devices)
         # Device i works on blocks i * share and following, which lie at the start of its part.
-        place = np.arange(count)
-        place = place // share * self.capacity + place % share
+        index = np.arange(count)
+        index = index // share * self.capacity + index % share
         whole = devices * self.capacity
         # Weights are stacked block by block: the program does not know how many policies there are.
-        weights = jax.tree.map(lambda *leaves: _spread(leaves, place, whole), *policies)
-        u = _spread(points, place, whole)
-        numbers = _spread(first, place, whole)
+        weights = jax.tree.map(lambda *leaves: _spread(leaves, index, whole), *policies)
+        u = _spread(points, index, whole)
+        numbers = _spread(first, index, whole)
         counts = np.clip(count - np.arange(devices) * share, 0, share).astype(np.int32)
         executable = self._executable(mode, policies[0])
         began = time.perf_counter()
         results = executable(weights, u, numbers, counts, key)
-        results = [np.asarray(result)[place] for result in results]
+        results = [np.asarray(result)[index] for result in results]
         self._seconds = (time.perf_counter() - began) / share
         return results
 
@@ -247,13 +247,13 @@ def _one_by_one(devices: Sequence[Device]) -> bool:
 
 
 def _spread(
-    rows: ArrayLike | Sequence[ArrayLike], places: Int[np.ndarray, " n"], whole: int
+    rows: ArrayLike | Sequence[ArrayLike], indices: Int[np.ndarray, " n"], whole: int
 ) -> np.ndarray:
     """Return an array of `whole` rows with these at their places, and the first one elsewhere."""
     given = np.asarray(rows)
     spread = np.empty((whole, *given.shape[1:]), given.dtype)
     spread[:] = given[0]
-    spread[places] = given
+    spread[indices] = given
     return spread
 
 

@@ -103,7 +103,7 @@ def run_check(
     """
     __tracebackhide__ = True
     now = current_session()
-    outcome = now.settings(check).run(problem, now.place(corpus), target)
+    outcome = now.settings(check).run(problem, now.corpus_folder(corpus), target)
     now.outcomes.append(outcome)
     if outcome.failed:
         raise CounterexampleFound(outcome)
@@ -114,16 +114,16 @@ def run_check(
 
 
 @functools.cache
-def problems_of(place: str) -> dict[str, Problem]:
+def problems_of(path: str) -> dict[str, Problem]:
     """Return the problems that a file defines, by name; it is run once for all tests."""
-    return definitions(place, Problem)
+    return definitions(path, Problem)
 
 
 @functools.cache
 def load(target: str) -> Problem:
     """Return the problem that `FILE.py:NAME` names, the same one for all tests."""
-    place, colon, name = target.rpartition(":")
-    problems = problems_of(place if colon else target)
+    path, colon, name = target.rpartition(":")
+    problems = problems_of(path if colon else target)
     if colon and name in problems:
         return problems[name]
     if not colon and len(problems) == 1:

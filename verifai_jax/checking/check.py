@@ -67,11 +67,12 @@ class Check:
         if self.max_failure_probability is None:
             return
         check_fraction("max_failure_probability", self.max_failure_probability)
-        least = least_budget(self.max_failure_probability, self.confidence)
-        if self.budget < least:
+        minimum = min_budget(self.max_failure_probability, self.confidence)
+        if self.budget < minimum:
             raise ValueError(
                 f"a budget of {self.budget:,} simulations cannot show a failure probability of at "
-                f"most {format_percent(self.max_failure_probability)}: if none fails, {least:,} do"
+                f"most {format_percent(self.max_failure_probability)}: if none fails, {minimum:,} "
+                "do"
             )
 
     def run(
@@ -113,7 +114,7 @@ class Check:
         outcome = CheckOutcome(problem.name, self, target, replayed, run)
         if corpus is None or not outcome.refuted or not run.table.counts.claimed:
             return outcome
-        saved = save_counterexamples(run, corpus, most=1, budget=SHRINKING)
+        saved = save_counterexamples(run, corpus, max_count=1, budget=SHRINKING)
         return CheckOutcome(problem.name, self, target, replayed, run, tuple(saved))
 
 
@@ -124,8 +125,8 @@ class CheckOutcome:
     - `problem`: its name.
     - `check`: the settings.
     - `target`: the command line's name of the problem, where it is known.
-    - `replayed`: the corpus; None where there is none.
-    - `run`: what the budget was spent on; None where the corpus failed already.
+    - `replayed`: the corpus; None if there is none.
+    - `run`: what the budget was spent on; None if the corpus failed already.
     - `saved`: files that were added to the corpus.
     """
 
@@ -181,7 +182,7 @@ class CheckOutcome:
             result["vj_counterexamples"] = counts.claimed
             result["vj_without_verdict"] = counts.without_verdict
             if counts.without_verdict < self.run.simulations:
-                result["vj_least_robustness"] = counts.least
+                result["vj_least_robustness"] = counts.lowest
         if self.rate is not None:
             result["vj_failure_rate_low"] = self.rate.low
             result["vj_failure_rate_high"] = self.rate.high
@@ -244,7 +245,7 @@ def _short(value: object) -> str:
     return f"{value:z.6g}" if isinstance(value, float) else str(value)
 
 
-def least_budget(probability: float, confidence: float) -> int:
+def min_budget(probability: float, confidence: float) -> int:
     """Return the simulations without a failure that show a failure probability."""
     low, high = 0, 1
     while anytime_interval(0, high, confidence).high > probability:

@@ -34,11 +34,11 @@ class Session:
         seed = check.seed if self.seed is None else self.seed
         return replace(check, budget=budget, seed=seed)
 
-    def place(self, corpus: str | Path | None) -> Path:
+    def corpus_folder(self, corpus: str | Path | None) -> Path:
         """Return the folder of a corpus: that of the test, or the usual one."""
-        place = self.root / (self.corpus if corpus is None else corpus)
+        path = self.root / (self.corpus if corpus is None else corpus)
         # What is printed and typed again is the path from where one stands.
-        return place.relative_to(Path.cwd()) if place.is_relative_to(Path.cwd()) else place
+        return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
 _SESSION: ContextVar[Session | None] = ContextVar("verifai_jax_session", default=None)

@@ -16,6 +16,6 @@ def analyze(folder: Path, target: str | None, into: Path | None) -> None:
     """Report rules, importance, kinds of failures and coverage of the run in RUN."""
     analysis = load_judged_run(folder, target).analyze()
     click.echo(str(analysis))
-    place = analysis.save((into or folder) / "analysis")
-    click.echo(f"  written      {place}")
-    give_result(text=str(analysis), report=place)
+    path = analysis.save((into or folder) / "analysis")
+    click.echo(f"  written      {path}")
+    give_result(text=str(analysis), report=path)

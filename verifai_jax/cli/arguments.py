@@ -250,18 +250,18 @@ def read_record(folder: Path) -> dict[str, Any]:
     try:
         return record.read_record(folder)
     except FileNotFoundError as missing:
-        raise FileNotFoundError(_describe_place(folder, record.RECORD, str(missing))) from None
+        raise FileNotFoundError(_describe_folder(folder, record.RECORD, str(missing))) from None
 
 
-def _describe_place(folder: Path, record: str, missing: str) -> str:
+def _describe_folder(folder: Path, record: str, missing: str) -> str:
     """Say what a folder without a run is; `missing` says that its record is."""
     if folder.is_file():
         what = "it is a file; give the folder that verifai-jax falsify has written"
         return f"no run in {folder}: {what}"
     if not folder.exists():
-        beside = folder.parent
-        runs = sorted(path.name for path in beside.glob("*") if (path / record).is_file())
-        there = f"; in {beside} there are {', '.join(runs)}" if runs else ""
+        parent = folder.parent
+        runs = sorted(path.name for path in parent.glob("*") if (path / record).is_file())
+        there = f"; in {parent} there are {', '.join(runs)}" if runs else ""
         return f"no run in {folder}: there is no such folder{there}"
     if is_sweep(folder):
         goes_on = f"{resuming('sweep', folder, None, {})} goes on with it"

@@ -28,18 +28,20 @@ CORPUS = "counterexamples"
     show_default=True,
     help="Folder of the files, made for version control.",
 )
-@click.option("--most", type=int, default=5, show_default=True, help="Counterexamples at most.")
+@click.option(
+    "--max-count", type=int, default=5, show_default=True, help="Counterexamples at most."
+)
 @click.option("--shrink/--no-shrink", default=True, show_default=True, help="Shrink each first.")
 @click.option(
     "--budget", type=int, default=1000, show_default=True, help="Simulations to shrink one with."
 )
 @PROBLEM
 def save_counterexamples(
-    folder: Path, into: Path, most: int, shrink: bool, budget: int, target: str | None
+    folder: Path, into: Path, max_count: int, shrink: bool, budget: int, target: str | None
 ) -> None:
     """Write counterexamples of the run in RUN as small files that can be replayed for ever."""
     run = load_judged_run(folder, target)
-    paths = run.save_counterexamples(into, most=most, shrink=shrink, budget=budget)
+    paths = run.save_counterexamples(into, max_count=max_count, shrink=shrink, budget=budget)
     give_result(problem=run.name, files=paths)
     for path in paths:
         click.echo(str(path))

@@ -197,11 +197,11 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _within(version: str | None, least: str | None, below: str | None) -> bool:
+def _within(version: str | None, minimum: str | None, below: str | None) -> bool:
     if version is None:
         return False
     number = _number(version)
-    return (least is None or number >= _number(least)) and (
+    return (minimum is None or number >= _number(minimum)) and (
         below is None or number < _number(below)
     )
 

@@ -36,7 +36,7 @@ Exit codes:
 """
 """What `--help` says of them."""
 
-_MOST_OF_AN_ERROR = 4000
+_MAX_ERROR_LENGTH = 4000
 """Characters of an error that are printed: it may quote a file, or the message of a system."""
 
 USAGE_ERRORS = (
@@ -71,7 +71,7 @@ def check_again(finding: str, even_if_changed: bool) -> None:
 
     **Arguments:**
 
-    - `finding`: what differs, in words; empty where nothing does.
+    - `finding`: what differs, as text; empty if nothing does.
     - `even_if_changed`: whether the user has said that another model is meant.
     """
     if finding and not even_if_changed:
@@ -86,7 +86,7 @@ def command_error(error: BaseException, show_traceback: bool = False) -> Command
     """
     from verifai_jax.core.text import printable
 
-    message, code = _told(error)
+    message, code = _message_and_code(error)
     if show_traceback or not message:
         sys.stderr.write(printable("".join(traceback.format_exception(error))))
     if not message:
@@ -94,10 +94,10 @@ def command_error(error: BaseException, show_traceback: bool = False) -> Command
             f"{type(error).__name__}: {error}\nThis is a bug of verifai_jax; please report it "
             "with the lines above"
         )
-    return CommandError(printable(message, _MOST_OF_AN_ERROR), code)
+    return CommandError(printable(message, _MAX_ERROR_LENGTH), code)
 
 
-def _told(error: BaseException) -> tuple[str, int]:
+def _message_and_code(error: BaseException) -> tuple[str, int]:
     """Return the message and the exit code of an error; no message for a bug."""
     if isinstance(error, USAGE_ERRORS):
         return str(error), WRONG_USAGE

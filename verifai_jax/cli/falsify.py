@@ -172,7 +172,7 @@ def falsify(
         problem = load_problem(target, only)
         earlier = None if warm_start is None else read_run(warm_start)
         with (
-            given_or_next(folder, "runs", problem.name) as place,
+            given_or_next(folder, "runs", problem.name) as path,
             on_cluster(cluster) as executor,
         ):
             run = falsification.falsify(
@@ -181,7 +181,7 @@ def falsify(
                 10_000 if budget is None else budget,
                 stop_when=stop_when,
                 warm_start=earlier,
-                folder=place,
+                folder=path,
                 diverse=diverse_by or diverse,
                 target=target,
                 executor=executor,
@@ -207,14 +207,14 @@ def _simulate_shard(
 
     part = Shard.parse(shard)
     parts = Path("runs") / f"{folder_name(problem.name)}-parts"
-    place = parts / f"{part.number}-of-{part.of}" if folder is None else folder
-    simulations = simulate_shard(problem, part, search, budget, folder=place, **options)
+    path = parts / f"{part.number}-of-{part.of}" if folder is None else folder
+    simulations = simulate_shard(problem, part, search, budget, folder=path, **options)
     click.echo(f"part {part} of {problem.name}: {simulations:,} of {budget:,} simulations")
     give_result(
-        problem=problem.name, part=str(part), simulations=simulations, budget=budget, folder=place
+        problem=problem.name, part=str(part), simulations=simulations, budget=budget, folder=path
     )
-    click.echo(f"  part         {place}")
-    click.echo(f"  merge        verifai-jax merge {shlex.quote(str(place.parent))}/*")
+    click.echo(f"  part         {path}")
+    click.echo(f"  merge        verifai-jax merge {shlex.quote(str(path.parent))}/*")
 
 
 def _resumed_target(folder: Path) -> str:

@@ -59,8 +59,8 @@ def fuzz(
 
     chosen = {name: _cells(name, text) for name, text in split_pairs("--cells", cells)}
     problem = load_problem(target)
-    with given_or_next(folder, "runs", problem.name) as place:
-        run = run_fuzz(problem, cells=chosen or None, folder=place, target=target, **options)
+    with given_or_next(folder, "runs", problem.name) as path:
+        run = run_fuzz(problem, cells=chosen or None, folder=path, target=target, **options)
     ends = {"--max-seconds": options["max_seconds"], "--stop-after": options["stop_after"]}
     print_run(run, pictures, ends)
     parts = [

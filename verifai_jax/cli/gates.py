@@ -76,7 +76,7 @@ def fail_on(**gates: str) -> Callable[[Command], Command]:
 
     **Arguments:**
 
-    - `gates`: when each fails, in words, by name; `rate` has a bound, `rate>P`.
+    - `gates`: when each fails, as text, by name; `rate` has a bound, `rate>P`.
     """
     words = "; ".join(f"{'rate>P' if name == RATE else name}: {t}" for name, t in gates.items())
     return click.option("--fail-on", type=GateType(tuple(gates)), help=f"End with code 1. {words}.")

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 
 @command(name="list")
-@click.argument("place", required=False)
-def list_targets(place: str | None) -> None:
+@click.argument("location", required=False)
+def list_targets(location: str | None) -> None:
     """List the problems and studies of a file or folder (PLACE, by default specs/).
 
     Its Python files are run for that, those of inner folders are not.
@@ -27,8 +27,8 @@ def list_targets(place: str | None) -> None:
     from verifai_jax.search import names
     from verifai_jax.sweeps.study import Study
 
-    path = Path(place or "specs")
-    if place is None and not path.exists():
+    path = Path(location or "specs")
+    if location is None and not path.exists():
         raise TargetError(_no_specs())
     files = sorted(path.glob("[!_]*.py")) if path.is_dir() else [path]
     inner = [folder for folder in sorted(path.glob("*/")) if any(folder.glob("[!_]*.py"))]
@@ -90,8 +90,8 @@ def _print_target(target: "Problem | Study") -> None:
 def _no_specs() -> str:
     """Say that there is no folder of problems here, and what there is."""
     files = sorted(file.name for file in Path().glob("[!_]*.py"))
-    beside = f". Python files here: {', '.join(files)}" if files else ""
+    others = f". Python files here: {', '.join(files)}" if files else ""
     return (
         "there is no folder specs/ here; verifai-jax list FILE.py (or FOLDER) lists the problems "
-        f"of a file or folder{beside}"
+        f"of a file or folder{others}"
     )

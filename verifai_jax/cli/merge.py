@@ -53,7 +53,7 @@ def merge(
             remedy="--problem specs/FILE.py:NAME",
         )
     problem = load_problem(target, only)
-    with given_or_next(folder, "runs", problem.name) as place:
-        run = merge_parts(folders, problem, folder=place, progress=progress)
+    with given_or_next(folder, "runs", problem.name) as path:
+        run = merge_parts(folders, problem, folder=path, progress=progress)
     print_run(run, pictures)
     check_run(run, fail_on)

@@ -24,7 +24,7 @@ from verifai_jax.cli.json_output import command, show_result
 @click.option("--budget", type=int, default=50_000, show_default=True, help="Simulations at most.")
 @click.option("--confidence", type=float, default=0.95, show_default=True)
 @click.option(
-    "--least-share",
+    "--min-share",
     type=float,
     default=0.001,
     show_default=True,

@@ -65,13 +65,13 @@ def monitor_stream(
                 )
             _refuse_nan(sample, now)
             state, bounds = step(state, sample.signals)
-            low, high, least, most = (float(bound) for bound in bounds)
-            if least > 0 or most < 0:
+            low, high, lowest, maximum = (float(bound) for bound in bounds)
+            if lowest > 0 or maximum < 0:
                 verdict = f"holds, with robustness at least {low:z.10g}"
-                if most < 0:
+                if maximum < 0:
                     verdict = f"fails, with robustness at most {high:z.10g}"
                 show(f"whatever follows {format_time(now, 10)} s, it {verdict}")
-                return least > 0
+                return lowest > 0
         rho, holds = (float(value) for value in finish(state))
     show(
         f"undecided at the end: with the last of {count} sample{'s' * (count != 1)} held, it "

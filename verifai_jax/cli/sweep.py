@@ -35,7 +35,7 @@ _RESUMES = (
 """Options that go with `--resume`; the cache of the sweep has fixed the others."""
 _NOTED = ("target", "configurations", "given", "options", "nominal")
 """Entries of the command in the cache."""
-_MOST_ROWS = 12
+_MAX_ROWS = 12
 """Rows of the table that are printed."""
 
 
@@ -126,10 +126,10 @@ def sweep(
     }
     keywords = _keywords(given, options)
     with (
-        given_or_next(folder, "sweeps", study.name) as place,
+        given_or_next(folder, "sweeps", study.name) as path,
         on_cluster(cluster) as executor,
     ):
-        folder = place
+        folder = path
         result = run_sweep(
             study,
             configurations=configurations,
@@ -191,36 +191,36 @@ def _keywords(given: Mapping[str, Any], options: tuple[str, ...]) -> dict[str, A
     return keywords
 
 
-def _read_command(place: Path) -> dict[str, Any]:
+def _read_command(folder: Path) -> dict[str, Any]:
     """Read the command of an interrupted sweep from its cache."""
     from verifai_jax.core.cache import Cache, CacheError, cache_file
 
-    if not cache_file(place).exists():
-        raise FileNotFoundError(f"no sweep to resume in {place}{_describe_place(place)}")
-    with Cache(place) as cache:
+    if not cache_file(folder).exists():
+        raise FileNotFoundError(f"no sweep to resume in {folder}{_describe_folder(folder)}")
+    with Cache(folder) as cache:
         note = cache.note("command")
     if note is None:
         raise CacheError(
-            f"the sweep in {place} was begun in Python, and Python has to go on with it: call "
-            f"vj.sweep(study, ..., folder={str(place)!r}) again"
+            f"the sweep in {folder} was begun in Python, and Python has to go on with it: call "
+            f"vj.sweep(study, ..., folder={str(folder)!r}) again"
         )
     if (
         not isinstance(note, dict)
         or not {*_NOTED} <= note.keys()
         or not isinstance(note["given"], dict)
     ):
-        raise CacheError(f"the sweep in {place} is damaged in its note 'command'")
+        raise CacheError(f"the sweep in {folder} is damaged in its note 'command'")
     return note
 
 
-def _describe_place(place: Path) -> str:
+def _describe_folder(folder: Path) -> str:
     """Say what a place without finished work is."""
-    if (place / "run.json").is_file():
-        goes_on = resuming("falsify", place, None, {})
+    if (folder / "run.json").is_file():
+        goes_on = resuming("falsify", folder, None, {})
         return f": it is the folder of a run; {goes_on} goes on with it"
-    if is_sweep(place):
+    if is_sweep(folder):
         return ": its finished work is elsewhere; name it, --cache FOLDER, as when it began"
-    if not place.exists():
+    if not folder.exists():
         return ": there is no such folder"
     return ": verifai-jax sweep has not written it"
 
@@ -236,7 +236,7 @@ def _format_table(result: "Sweep") -> str:
     names = [n for n in result.hyperparameters if n in table and n != "steps"]
     columns = ["steps", *names, "nominal_return", "failures", "simulations", "failure_high"]
     columns += ["worst_robustness", "verdict", "status"]
-    some: Any = table.iloc[order[:_MOST_ROWS]][columns]
+    some: Any = table.iloc[order[:_MAX_ROWS]][columns]
     if (some["status"] == "trained").all():
         some = some.drop(columns="status")
     text = some.to_string(float_format=lambda value: f"{value:z.4g}", max_colwidth=40)

@@ -41,7 +41,7 @@ def synthesize(
         "without_verdict", "held_out", "stopped", "seed", "sources",
     )  # fmt: skip
     if table is not None:
-        from verifai_jax.core.whole_files import replacing
+        from verifai_jax.core.atomic_files import replacing
 
         with replacing(table) as partial:
             result.candidates.to_csv(partial, index=False)

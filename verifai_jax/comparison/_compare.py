@@ -35,7 +35,7 @@ from verifai_jax.statistics.paired_rates import PairedRates, paired_rates
 
 BLOCK = 1024
 """Points of the cube that are drawn at once."""
-FIRST, MOST = 64, 4096
+FIRST, MAX_SAMPLES = 64, 4096
 """Pairs between two looks, at first and at most; each time twice as many."""
 BATCH = 512
 """Simulations at once."""
@@ -161,7 +161,7 @@ def _compare(
                 if judge(tallies[name].rates(each), margin) != UNDECIDED:
                     open_ones.discard(name)
             first += size
-            size = min(2 * size, MOST)
+            size = min(2 * size, MAX_SAMPLES)
         else:
             stopped = "decided"
     except KeyboardInterrupt:
@@ -266,9 +266,9 @@ def _check(
     if not 0 <= margin < 1:
         raise ValueError(f"margin must be a probability, from 0 to below 1; got {margin}")
     check_fraction("confidence", confidence)
-    least = 1 + len(candidates)
-    if check_count("budget", budget) < least:
-        raise ValueError(f"budget must be {least} at least, one simulation of each; got {budget}")
+    minimum = 1 + len(candidates)
+    if check_count("budget", budget) < minimum:
+        raise ValueError(f"budget must be {minimum} at least, one simulation of each; got {budget}")
     baseline.check()
     for name, problem in candidates.items():
         problem.check()

@@ -40,7 +40,7 @@ NUDGE = 2.0**-22
 in single precision. Simulations run in double precision, whose own rounding is far smaller."""
 GROWTH = 3.0
 """Times that growth which a gap must exceed: moves in other directions may grow more."""
-STILL, LEAST = 1e-3, 1e-9
+STILL, TINY = 1e-3, 1e-9
 """Least unit of a signal, as a part of its greatest value and by itself."""
 
 
@@ -227,7 +227,7 @@ class _Pairs:
             row = {name: values[i] for name, values in columns.items()}
             row |= {"searched": searched, "proper": proper}
             for letter, verdicts in zip("ab", sides, strict=True):
-                row[f"robustness_{letter}"] = float(verdicts.least[i])
+                row[f"robustness_{letter}"] = float(verdicts.lowest[i])
                 row[f"violated_{letter}"] = bool(verdicts.violated[i])
             traces = [_trace(v, i) for v in sides]
             if proper and traces[0] is not None and traces[1] is not None:
@@ -299,9 +299,9 @@ class _Pairs:
         y = np.log(gap)
         shares = {}
         for label, values in zip(self.space.coordinates, u.T, strict=True):
-            places = np.argsort(np.argsort(values, kind="stable")) * parts // n
-            means = np.array([np.mean(y[places == k]) for k in range(parts)])
-            share = float(np.var(means[places]) / np.var(y))
+            bins = np.argsort(np.argsort(values, kind="stable")) * parts // n
+            means = np.array([np.mean(y[bins == k]) for k in range(parts)])
+            share = float(np.var(means[bins]) / np.var(y))
             chance = (parts - 1) / (n - 1)
             shares[str(label)] = max(0.0, (share - chance) / (1 - chance))
         return dict(sorted(shares.items(), key=lambda item: -item[1]))
@@ -358,7 +358,7 @@ def _scales(sides: Sequence[Verdicts]) -> dict[str, float]:
         values = values[np.isfinite(values)]
         size = float(np.max(np.abs(values), initial=0.0))
         # What hardly moves is in units of its size, lest its rounding look like a motion.
-        scales[name] = max(float(np.ptp(values)) if len(values) else 0.0, STILL * size, LEAST)
+        scales[name] = max(float(np.ptp(values)) if len(values) else 0.0, STILL * size, TINY)
     return scales
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from verifai_jax.core.keys import run_keys, simulation_key
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook, picture_html
 from verifai_jax.core.text import format_percent
 from verifai_jax.core.trace import Trace
@@ -34,7 +34,7 @@ class Compared:
     - `discordant`: the pairs in which only one fails, a row each with the features; `worse` is true
       where it is the candidate. Its index is the number of the pair, of which
       `Comparison.random_key` is the key.
-    - `pairs`: features of all pairs, and `worse` and `better`; None where they were not kept.
+    - `pairs`: features of all pairs, and `worse` and `better`; None if they were not kept.
     """
 
     name: str
@@ -56,8 +56,8 @@ class Compared:
         **Raises:** `ValueError` where there is no such pair.
         """
         rows = self.pairs.assign(violated=self.pairs["worse"]).drop(columns=["worse", "better"])
-        samples = late("verifai_jax.analysis.data.samples", "Samples")
-        return late("verifai_jax.analysis", "rules")(
+        samples = lazy_import("verifai_jax.analysis.data.samples", "Samples")
+        return lazy_import("verifai_jax.analysis", "rules")(
             samples.of(rows, "all", list(self.space.columns), self.space), **options
         )
 
@@ -136,7 +136,7 @@ class Comparison(InNotebook):
 
         **Returns:** the path.
         """
-        return late("verifai_jax.reports", "write_report")(self, path, **options)
+        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
 
     def __str__(self) -> str:
         confidence = self.candidates[0].rates.confidence
@@ -218,8 +218,8 @@ class Transfer(InNotebook):
         """
         rows: Any = self.table[self.table["proper"]]
         rows = rows.assign(violated=rows.index.isin(self.flips.index), rho=-rows["gap"])
-        samples = late("verifai_jax.analysis.data.samples", "Samples")
-        return late("verifai_jax.analysis", "rules")(
+        samples = lazy_import("verifai_jax.analysis.data.samples", "Samples")
+        return lazy_import("verifai_jax.analysis", "rules")(
             samples.of(rows, "all", list(self.space.columns), self.space), **options
         )
 
@@ -232,7 +232,7 @@ class Transfer(InNotebook):
 
         **Returns:** the figure.
         """
-        return late("verifai_jax.plotting.transfer", "plot_transfer")(self, path)
+        return lazy_import("verifai_jax.plotting.transfer", "plot_transfer")(self, path)
 
     def _notebook_parts(self) -> Iterable[str]:
         yield picture_html(self.plot())
@@ -243,10 +243,10 @@ class Transfer(InNotebook):
         a, b = self.names
         lines = [f"the same policy in {a} and in {b}"]
         if not self.differs:
-            most = table["gap"].max()
+            largest = table["gap"].max()
             lines.append(
                 f"  no difference beyond rounding in {len(table):,} pairs, {len(found):,} of them "
-                f"searched: traces part by {most:z.1g} of a signal's range at most"
+                f"searched: traces part by {largest:z.1g} of a signal's range at most"
             )
         else:
             lines += self._differences(sampled, found)

@@ -14,7 +14,7 @@ import pandas as pd
 
 from verifai_jax.compositional.region import FAILS_ANYWAY, NO_VERDICT, SAFE, UNCERTAIN
 from verifai_jax.core.figure import Figure
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_features, format_percent
 from verifai_jax.evaluation.replay import Replay
@@ -36,11 +36,11 @@ class Compositional(InNotebook):
       with the worst perception too, `"fails anyway"`, `"no verdict"`); `best` and `worst`, the
       robustness with either perception; `severity`, the least error with which it fails, and
       `erring`, the number of instants at which the perception errs then, NaN unless uncertain.
-    - `images`: the run that looked for images; None where nothing is uncertain.
+    - `images`: the run that looked for images; None if nothing is uncertain.
     - `simulations`: a run of one simulation for each candidate that was simulated.
     - `candidates`: a row for each image on which the network errs: features; `image`, how far it
       errs (minus the robustness of `error`); `simulated`, the status of its simulation with the
-      network, empty where there was none; `rho` and `fails` of it; `rendered`, the images rendered
+      network, empty if there was none; `rho` and `fails` of it; `rendered`, the images rendered
       until then, in all.
     - `images_per_simulation`: rendered in one simulation.
     - `budget`, `search`, `seed`: as it was called.
@@ -103,7 +103,7 @@ class Compositional(InNotebook):
         known = self.region["kind"].isin([UNCERTAIN, SAFE])
         columns = list(self.problem.space.columns)
         table = self.region.loc[known, columns].assign(rho=self.region.loc[known, "worst"])
-        return late("verifai_jax.analysis", "rules")(table, **options)
+        return lazy_import("verifai_jax.analysis", "rules")(table, **options)
 
     def plot(
         self, path: str | Path | None = None, features: tuple[str, str] | None = None
@@ -119,7 +119,7 @@ class Compositional(InNotebook):
 
         **Raises:** `UnknownNameError` for a column that the table has not.
         """
-        draw = late("verifai_jax.plotting.compositional", "plot_region")
+        draw = lazy_import("verifai_jax.plotting.compositional", "plot_region")
         return draw(self, path, features)
 
     def summary(self) -> str:

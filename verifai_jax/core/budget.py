@@ -12,18 +12,18 @@ class Budget:
     **Arguments:**
 
     - `spent()`: simulations so far.
-    - `most`: simulations at most.
+    - `maximum`: simulations at most.
     - `until`: a time of `time.perf_counter` in seconds, or None.
     """
 
     spent: Callable[[], int]
-    most: int
+    maximum: int
     until: float | None = None
 
     @property
     def left(self) -> int:
         """Simulations left, none after the time."""
-        return 0 if self.timed_out else max(0, self.most - self.spent())
+        return 0 if self.timed_out else max(0, self.maximum - self.spent())
 
     @property
     def exhausted(self) -> bool:
@@ -42,7 +42,7 @@ class Budget:
 
     def slice(self, simulations: int) -> "Budget":
         """Return the budget of a part of the work that may make `simulations` from now on."""
-        return replace(self, most=min(self.most, self.spent() + simulations))
+        return replace(self, maximum=min(self.maximum, self.spent() + simulations))
 
 
 SEARCH_SHARE = 0.8

@@ -190,7 +190,7 @@ class Cache:
             raise CacheError(f"{self.path} is damaged in its note {name!r}: {error}") from error
 
     def get(self, name: str) -> Arrays | None:
-        """Return the arrays of a finished computation; None where it is not, or is damaged."""
+        """Return the arrays of a finished computation; None if it is not, or is damaged."""
         with self._transaction(reading=True):
             row = self._base.execute(
                 "SELECT form, checksum, bytes FROM work WHERE name=?", (name,)
@@ -313,21 +313,21 @@ def cache_file(path: Path, kind: str = "sweep") -> Path:
 
 
 @contextlib.contextmanager
-def locked_cache(place: str | Path | None, kind: str = "sweep") -> Iterator[None]:
+def locked_cache(folder: str | Path | None, kind: str = "sweep") -> Iterator[None]:
     """Be the only one who writes to a cache; None is none on disk.
 
     **Raises:** `FolderInUse`, which names the process that writes to it; `CacheError` where it
     cannot be written.
     """
     with contextlib.ExitStack() as held:
-        if place is not None:
-            path = Path(place)
+        if folder is not None:
+            path = Path(folder)
             file = cache_file(path, kind)
             try:
                 file.parent.mkdir(parents=True, exist_ok=True)
                 held.enter_context(write_lock(file if file == path else path))
             except OSError as error:
-                raise CacheError(f"{place} cannot be written: {error}") from error
+                raise CacheError(f"{folder} cannot be written: {error}") from error
         yield
 
 
@@ -361,14 +361,14 @@ def _decode(forms: list[list[Any]], data: bytes) -> Arrays:
     return arrays
 
 
-def _differences(one: object, other: object, place: str = "") -> Iterable[str]:
+def _differences(one: object, other: object, path: str = "") -> Iterable[str]:
     """Write the differences of two fingerprints: `trainer.steps is 64, in the cache 32`."""
     if isinstance(one, dict) and isinstance(other, dict):
         for name in dict.fromkeys((*one, *other)):
-            inner = f"{place}.{name}" if place else name
+            inner = f"{path}.{name}" if path else name
             yield from _differences(one.get(name), other.get(name), inner)
     elif one != other:
-        yield f"{place} is {_abbreviate(one)}, in the cache {_abbreviate(other)}"
+        yield f"{path} is {_abbreviate(one)}, in the cache {_abbreviate(other)}"
 
 
 def _abbreviate(value: object) -> str:

@@ -94,7 +94,7 @@ def check_positive(
 
 
 def check_count(
-    name: str, value: object, least: int = 1, *, error: type[ValueError] = ValueError
+    name: str, value: object, minimum: int = 1, *, error: type[ValueError] = ValueError
 ) -> int:
     """Check an integer that counts something.
 
@@ -102,12 +102,12 @@ def check_count(
 
     - `name`: name of the argument in the error message.
     - `value`: value to check; NumPy's integers are welcome, truth values and floats are not.
-    - `least`: smallest value allowed.
+    - `minimum`: smallest value allowed.
     - `error`: type of the error to raise.
 
     **Returns:** the value as a Python integer.
 
-    **Raises:** `error` for anything but an integer of at least `least`.
+    **Raises:** `error` for anything but an integer of at least `minimum`.
     """
     count = None
     if isinstance(value, SupportsIndex) and not isinstance(value, bool | np.bool_):
@@ -115,6 +115,6 @@ def check_count(
             count = operator.index(value)
         except TypeError:  # An array of floats, or of several numbers.
             count = None
-    if count is None or count < least:
-        raise error(f"{name} must be an integer of at least {least}; got {value!r}")
+    if count is None or count < minimum:
+        raise error(f"{name} must be an integer of at least {minimum}; got {value!r}")
     return count

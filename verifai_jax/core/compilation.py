@@ -8,7 +8,7 @@
 What a program computes does not depend on when it was compiled, so neither do results.
 
 XLA spends most of its time on making a program fast. One that runs a few dozen times is done sooner
-with less of that (`Effort`): it is compiled in a half to a fifth of the time.
+with less of that (`XlaOptimization`): it is compiled in a half to a fifth of the time.
 """
 
 import gc
@@ -26,12 +26,12 @@ import numpy as np
 from verifai_jax.core.cores import available_cores
 from verifai_jax.core.devices import enable_compile_cache
 
-Effort = Literal["most", "little", "least"]
+XlaOptimization = Literal["most", "little", "least"]
 """How much XLA does to make a program fast on a processor. `little` computes what `most` does, on
 some processors to the last bit, in programs without long chains of products and sums; `least`
 rounds each product."""
 
-_OPTIONS: dict[Effort, dict[str, Any]] = {
+_OPTIONS: dict[XlaOptimization, dict[str, Any]] = {
     "most": {},
     "little": {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1},
     "least": {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0},
@@ -58,9 +58,11 @@ class Compilation:
     - `name`: of the program, for people.
     """
 
-    def __init__(self, name: str, lowered: jax.stages.Lowered, effort: Effort = "most") -> None:
+    def __init__(
+        self, name: str, lowered: jax.stages.Lowered, effort: XlaOptimization = "most"
+    ) -> None:
         self.name = name
-        self._effort: Effort = effort
+        self._effort: XlaOptimization = effort
         self._lowered: jax.stages.Lowered | None = lowered
         self._future: Future[jax.stages.Compiled] = _pool().submit(_compiled, name, lowered, effort)
         self._program: jax.stages.Compiled | None = None
@@ -108,7 +110,9 @@ def _count_waiting(seconds: float) -> None:
         _waited += seconds
 
 
-def compile_soon(name: str, lowered: jax.stages.Lowered, effort: Effort = "most") -> Compilation:
+def compile_soon(
+    name: str, lowered: jax.stages.Lowered, effort: XlaOptimization = "most"
+) -> Compilation:
     """Compile a program in the background.
 
     **Arguments:**
@@ -157,22 +161,22 @@ def tracing(name: str = "") -> Iterator[None]:
 @contextmanager
 def _said(name: str) -> Iterator[None]:
     """Return a context in which this thread is said to compile the program."""
-    place = threading.get_ident()
+    index = threading.get_ident()
     with _lock:
-        before = _running.get(place)
-        _running[place] = (name, time.perf_counter())
+        before = _running.get(index)
+        _running[index] = (name, time.perf_counter())
     try:
         yield
     finally:
         with _lock:
             if before is None:
-                del _running[place]
+                del _running[index]
             else:
-                _running[place] = before
+                _running[index] = before
 
 
 def describe_compilation() -> str:
-    """Say what is being compiled and for how long so far; empty where nothing is."""
+    """Say what is being compiled and for how long so far; empty if nothing is."""
     with _lock:
         running = list(_running.values())
     if not running:
@@ -193,15 +197,17 @@ def _cancel_waiting() -> None:
     _pool.cache_clear()
 
 
-def _compiled(name: str, lowered: jax.stages.Lowered, effort: Effort) -> jax.stages.Compiled:
+def _compiled(
+    name: str, lowered: jax.stages.Lowered, effort: XlaOptimization
+) -> jax.stages.Compiled:
     with _said(name):
         options = options_of(effort)
         return lowered.compile(compiler_options=options) if options else lowered.compile()
 
 
 @cache
-def options_of(effort: Effort) -> dict[str, Any] | None:
-    """Return XLA's options for this effort; None where it does the most."""
+def options_of(effort: XlaOptimization) -> dict[str, Any] | None:
+    """Return XLA's options for this effort; None if it does the most."""
     options = _OPTIONS[effort]
     if not options or jax.default_backend() != "cpu":
         return None

@@ -17,7 +17,7 @@ class Cube:
 
     - `levels`: 0 if it is continuous, or the number `n >= 1` of its cells, inside which points
       mean the same.
-    - `weights`: the probabilities of its cells, which are their widths; None where they are equal.
+    - `weights`: the probabilities of its cells, which are their widths; None if they are equal.
     - `ordered`: whether its cells have an order; all of them when left out.
     - `names`: what it is called, such as `cars[0].x`; nothing when left out.
 
@@ -83,18 +83,18 @@ class Cube:
             for i in self.discrete
         )
 
-    def take(self, places: tuple[int, ...]) -> "Cube":
+    def take(self, indices: tuple[int, ...]) -> "Cube":
         """Return the cube of these coordinates alone."""
         return Cube(
-            levels=tuple(self.levels[i] for i in places),
-            weights=tuple(self.weights[i] for i in places),
-            ordered=tuple(self.ordered[i] for i in places),
-            names=tuple(self.names[i] for i in places),
-            lengths=tuple(j for j, i in enumerate(places) if i in self.lengths),
+            levels=tuple(self.levels[i] for i in indices),
+            weights=tuple(self.weights[i] for i in indices),
+            ordered=tuple(self.ordered[i] for i in indices),
+            names=tuple(self.names[i] for i in indices),
+            lengths=tuple(j for j, i in enumerate(indices) if i in self.lengths),
             signals=tuple(
-                tuple(places.index(i) for i in signal)
+                tuple(indices.index(i) for i in signal)
                 for signal in self.signals
-                if set(signal) <= set(places)
+                if set(signal) <= set(indices)
             ),
         )
 
@@ -104,8 +104,8 @@ class Cube:
         counts = np.array([self.levels[i] for i in self.discrete], np.int32)
         found = jnp.clip((points * counts).astype(jnp.int32), 0, counts - 1)
         for j, edges in self._edges:
-            place = jnp.searchsorted(edges[1:-1], points[..., j], side="right")
-            found = found.at[..., j].set(place.astype(jnp.int32))
+            index = jnp.searchsorted(edges[1:-1], points[..., j], side="right")
+            found = found.at[..., j].set(index.astype(jnp.int32))
         return found
 
     def centres(self, cells: Int[Array | np.ndarray, "*n k"]) -> Float[Array, "*n k"]:

@@ -20,7 +20,7 @@ class UnknownNameError(ValueError):
 
 
 def nearest_names(name: object, known: Iterable[str]) -> str:
-    """Write the known names nearest to `name` as a question; empty where none is near."""
+    """Write the known names nearest to `name` as a question; empty if none is near."""
     near = difflib.get_close_matches(str(name), list(known), n=2, cutoff=0.5)
     return f"; did you mean {' or '.join(map(repr, near))}?" if near else ""
 

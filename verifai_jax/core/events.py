@@ -39,13 +39,13 @@ class Events:
     # JAX rebuilds the class with placeholders and with batches, which have other shapes.
     __no_type_check__ = True
 
-    kinds: Int[Array | np.ndarray, " places"]
-    waits: Float[Array | np.ndarray, " places"]
+    kinds: Int[Array | np.ndarray, " slots"]
+    waits: Float[Array | np.ndarray, " slots"]
     parameters: dict[str, Any]
     names: tuple[str, ...] = field(metadata={"static": True})
 
     @property
-    def mask(self) -> Bool[Array | np.ndarray, " places"]:
+    def mask(self) -> Bool[Array | np.ndarray, " slots"]:
         """True at the places that hold an event."""
         return self.kinds >= 0
 
@@ -55,7 +55,7 @@ class Events:
         return self.mask.sum(axis=-1)
 
     @property
-    def times(self) -> Float[Array | np.ndarray, " places"]:
+    def times(self) -> Float[Array | np.ndarray, " slots"]:
         """Seconds from the start to each event; infinite where there is none."""
         xp = _library(self.waits)
         return xp.where(self.mask, xp.cumsum(self.waits, axis=-1), np.inf)
@@ -68,14 +68,14 @@ class Events:
             raise unknown_name("parameter of events", name, self.parameters)
         return self.parameters[name]
 
-    def are(self, *names: str) -> Bool[Array | np.ndarray, " places"]:
+    def are(self, *names: str) -> Bool[Array | np.ndarray, " slots"]:
         """Return the places that hold an event of one of these names; of any without names."""
         if not names:
             return self.mask
-        chosen = [self._place(name) for name in names]
+        chosen = [self._kind_of(name) for name in names]
         found = self.kinds == chosen[0]
-        for place in chosen[1:]:
-            found = found | (self.kinds == place)
+        for index in chosen[1:]:
+            found = found | (self.kinds == index)
         return found
 
     def count(self, time: Real[Array | np.ndarray, "*times"] | float, *names: str) -> Any:
@@ -85,16 +85,16 @@ class Events:
     def active(self, time: Real[Array | np.ndarray, "*times"] | float, *names: str) -> Any:
         """Return the place of the latest event of these names at `time`; -1 before the first."""
         past = self._past(time, names)
-        places = past.shape[-1]
+        indices = past.shape[-1]
         xp = _library(past)
-        return xp.max(xp.where(past, np.arange(places), -1), axis=-1)
+        return xp.max(xp.where(past, np.arange(indices), -1), axis=-1)
 
     def since(self, time: Real[Array | np.ndarray, "*times"] | float, *names: str) -> Any:
         """Return the seconds since the latest event of these names; infinite before the first."""
-        place = self.active(time, *names)
+        index = self.active(time, *names)
         xp = _library(self.waits)
-        elapsed = time - self.times[xp.maximum(place, 0)]
-        return xp.where(place >= 0, elapsed, np.inf)
+        elapsed = time - self.times[xp.maximum(index, 0)]
+        return xp.where(index >= 0, elapsed, np.inf)
 
     def within(
         self, name: str, time: Real[Array | np.ndarray, "*times"] | float, seconds: Any
@@ -118,10 +118,10 @@ class Events:
         otherwise: Any = 0.0,
     ) -> Any:
         """Return a parameter of the latest event of these names; `otherwise` before the first."""
-        values, place = self[parameter], self.active(time, *names)
+        values, index = self[parameter], self.active(time, *names)
         xp = _library(self.waits)
-        chosen = xp.asarray(values)[xp.maximum(place, 0)]
-        there = xp.reshape(place >= 0, np.shape(place) + (1,) * (np.ndim(chosen) - np.ndim(place)))
+        chosen = xp.asarray(values)[xp.maximum(index, 0)]
+        there = xp.reshape(index >= 0, np.shape(index) + (1,) * (np.ndim(chosen) - np.ndim(index)))
         return xp.where(there, chosen, otherwise)
 
     def listed(self) -> list[dict[str, Any]]:
@@ -136,7 +136,7 @@ class Events:
             for i in range(count)
         ]
 
-    def _place(self, name: str) -> int:
+    def _kind_of(self, name: str) -> int:
         if name not in self.names:
             raise unknown_name("event", name, self.names)
         return self.names.index(name)

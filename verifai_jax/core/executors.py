@@ -122,18 +122,18 @@ def gather(
     count = len(waiting)
     try:
         while waiting:
-            finished = [place for place, future in waiting.items() if future.done()]
+            finished = [index for index, future in waiting.items() if future.done()]
             if not finished:
                 _wait(list(waiting.values()))
                 continue
             failure = None
-            for place in finished:
+            for index in finished:
                 try:
-                    result = waiting.pop(place).result()
+                    result = waiting.pop(index).result()
                 except Exception as error:
                     failure = failure or error
                     continue
-                ended(place, result)
+                ended(index, result)
             if failure is not None:
                 raise _explained(failure) from failure
             more = further()
@@ -287,6 +287,6 @@ def _send_targets_as_code() -> None:
 
     for name in ("cloudpickle", "ray.cloudpickle"):
         if (pickler := sys.modules.get(name)) is not None:
-            for place, module in list(sys.modules.items()):
-                if place.startswith("_target_"):
+            for module_name, module in list(sys.modules.items()):
+                if module_name.startswith("_target_"):
                     pickler.register_pickle_by_value(module)

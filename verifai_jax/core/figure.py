@@ -5,7 +5,7 @@ import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes as Axes
@@ -33,7 +33,7 @@ class Drawn:
         **Returns:** the Matplotlib figure.
         """
         module, function = self._picture
-        return late(f"verifai_jax.plotting.{module}", function)(self, path)
+        return lazy_import(f"verifai_jax.plotting.{module}", function)(self, path)
 
 
 def new_figure(**options: Any) -> Figure:

@@ -1,7 +1,7 @@
 """The identity of a traced function: all of what it computes, and of how it is differentiated.
 
     traced = jax.jit(function).trace(*arguments)
-    fingerprint(traced.jaxpr)                           # a hash, or None where one cannot be taken
+    fingerprint(traced.jaxpr)                           # a hash, or None if one cannot be taken
 
 Two functions of equal fingerprints compute the same, and so do all programs that are derived from
 them by the same rules, such as their derivatives. A user's code itself cannot be read for that:
@@ -40,7 +40,7 @@ def fingerprint(program: Any, derivatives: bool = True) -> str | None:
     - `derivatives`: whether rules of derivatives are read too. They are traced for that, and only
       programs that differentiate this one depend on them.
 
-    **Returns:** the hash in hexadecimal digits; None where a part of the function is opaque, such
+    **Returns:** the hash in hexadecimal digits; None if a part of the function is opaque, such
     as a call of Python from the device.
     """
     reader = _Reader(derivatives)
@@ -55,7 +55,7 @@ def fingerprint(program: Any, derivatives: bool = True) -> str | None:
 def identity(*values: object) -> str | None:
     """Return a hash of plain values: numbers, texts, arrays, tuples, and dataclasses of them.
 
-    **Returns:** the hash in hexadecimal digits; None where one of them is something else.
+    **Returns:** the hash in hexadecimal digits; None if one of them is something else.
     """
     reader = _Reader()
     try:
@@ -105,16 +105,16 @@ class _Reader:
         elif isinstance(value, (np.dtype, jax.core.ShapedArray)):
             add(_form(value) if isinstance(value, jax.core.ShapedArray) else str(value))
         elif isinstance(value, (enum.Enum, type)):
-            add(f"{_place(value if isinstance(value, type) else type(value))} {value}")
-        elif type(value).__name__ in _NAMED and _place(type(value)).startswith("jax"):
-            add(f"{_place(type(value))} {value}")
+            add(f"{_module_path(value if isinstance(value, type) else type(value))} {value}")
+        elif type(value).__name__ in _NAMED and _module_path(type(value)).startswith("jax"):
+            add(f"{_module_path(type(value))} {value}")
         elif hasattr(type(value), "__dataclass_fields__"):
-            add(_place(type(value)))
+            add(_module_path(type(value)))
             for name in type(value).__dataclass_fields__:
                 add(name)
                 self.read(getattr(value, name))
         else:
-            raise _Unknown(_place(type(value)))
+            raise _Unknown(_module_path(type(value)))
 
     def _array(self, value: Any) -> None:
         if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
@@ -178,21 +178,21 @@ class _Reader:
         if step.params.get("symbolic_zeros"):
             raise _Unknown("a derivative that depends on which tangents are zero")
         call, inputs = as_function(program, step)
-        places = [i for i, v in enumerate(inputs) if jnp.issubdtype(v.aval.dtype, jnp.inexact)]
-        if not places:
+        indices = [i for i, v in enumerate(inputs) if jnp.issubdtype(v.aval.dtype, jnp.inexact)]
+        if not indices:
             return
         forms = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in inputs]
 
         def derivative(arguments: Any, directions: Any) -> Any:
-            function = of_some(call, arguments, places)
-            values = [arguments[i] for i in places]
+            function = of_some(call, arguments, indices)
+            values = [arguments[i] for i in indices]
             if step.primitive.name == "custom_jvp_call":
                 return jax.jvp(function, values, directions)
             results, pull = jax.vjp(function, *values)
             return pull([jnp.ones_like(result) for result in results])
 
         # Only of these: the derivative of all else follows from what it computes.
-        traced = jax.make_jaxpr(derivative)(forms, [forms[i] for i in places])
+        traced = jax.make_jaxpr(derivative)(forms, [forms[i] for i in indices])
         self._program(traced.jaxpr, traced.consts, derived=True)
 
 
@@ -210,5 +210,5 @@ def _form(value: Any) -> str:
     return f"{value.dtype}{value.shape}{getattr(value, 'weak_type', False)}"
 
 
-def _place(kind: type) -> str:
+def _module_path(kind: type) -> str:
     return f"{kind.__module__}.{kind.__qualname__}"

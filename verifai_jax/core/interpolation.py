@@ -71,9 +71,12 @@ def clamped(value: Any, one: Any, other: Any, xp: Any) -> Any:
     Between two knots at the end of their domain a sum may be rounded to a value outside. The
     derivative is that of the value, also where both numbers are the same.
     """
-    least, most = xp.minimum(one, other), xp.maximum(one, other)
+    lowest, maximum = xp.minimum(one, other), xp.maximum(one, other)
     if xp is np:
-        return np.clip(value, least, most)
-    least, most, zero = *jax.lax.stop_gradient((least, most)), value - jax.lax.stop_gradient(value)
-    value = jnp.where(value < least, least + zero, value)
-    return jnp.where(value > most, most + zero, value)
+        return np.clip(value, lowest, maximum)
+    lowest, maximum, zero = (
+        *jax.lax.stop_gradient((lowest, maximum)),
+        value - jax.lax.stop_gradient(value),
+    )
+    value = jnp.where(value < lowest, lowest + zero, value)
+    return jnp.where(value > maximum, maximum + zero, value)

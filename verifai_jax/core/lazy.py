@@ -1,11 +1,11 @@
 """Late binding: names that are imported when they are first used.
 
-    plot_replay = late("verifai_jax.plotting.replay", "plot_replay")
+    plot_replay = lazy_import("verifai_jax.plotting.replay", "plot_replay")
     plot_replay(replay, path)                           # the module is imported now, not before
 
-A result lies below the pictures and analyses of it. Its methods reach them through `late`, so that
-imports point downwards and a reader finds every exception by its name. `attach` does the same for
-all names of a package.
+A result lies below the pictures and analyses of it. Its methods reach them through `lazy_import`,
+so that imports point downwards and a reader finds every exception by its name. `attach` does the
+same for all names of a package.
 """
 
 import importlib
@@ -15,7 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 
-def late(module: str, name: str) -> Any:
+def lazy_import(module: str, name: str) -> Any:
     """Import `module` now and return what it calls `name`."""
     return getattr(importlib.import_module(module), name)
 
@@ -50,7 +50,7 @@ def attach(
         if module == package:
             value = importlib.import_module(f"{package}.{name}")
         else:
-            value = late(module, name)
+            value = lazy_import(module, name)
         setattr(sys.modules[package], name, value)
         return value
 

@@ -28,7 +28,7 @@ class LiftedNumbers:
     """The numbers of one program, and their places in its argument."""
 
     def __init__(self) -> None:
-        self._places: dict[tuple[int, str], int] = {}
+        self._indices: dict[tuple[int, str], int] = {}
         self._owners: list[object] = []  # Kept, so that their identities stay theirs.
         self._values: list[float] = []
 
@@ -46,16 +46,16 @@ class LiftedNumbers:
         vector[: len(self._values)] = self._values
         return vector
 
-    def place(self, name: str, owner: object, values: np.ndarray) -> int | None:
-        """Return where these numbers begin in the vector; None where there is no room for them."""
+    def index_of(self, name: str, owner: object, values: np.ndarray) -> int | None:
+        """Return where these numbers begin in the vector; None if there is no room for them."""
         key = (id(owner), name)
-        if key not in self._places:
+        if key not in self._indices:
             if len(self._values) + values.size > CAPACITY:
                 return None
-            self._places[key] = len(self._values)
+            self._indices[key] = len(self._values)
             self._owners.append(owner)
             self._values.extend(np.ravel(values).tolist())
-        return self._places[key]
+        return self._indices[key]
 
 
 _current: ContextVar[tuple[LiftedNumbers, Any] | None] = ContextVar("lifted numbers", default=None)
@@ -95,9 +95,9 @@ def lifted(owner: object, **values: np.ndarray) -> tuple[Any, ...]:
     found = []
     for name, value in values.items():
         same = value.dtype == vector.dtype
-        place = numbers.place(name, owner, value) if same else None
-        if place is None:
+        index = numbers.index_of(name, owner, value) if same else None
+        if index is None:
             found.append(value)
         else:
-            found.append(jnp.reshape(vector[place : place + value.size], value.shape))
+            found.append(jnp.reshape(vector[index : index + value.size], value.shape))
     return tuple(found)

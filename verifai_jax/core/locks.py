@@ -61,21 +61,21 @@ def returning_once() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def write_lock(place: Path | None) -> Iterator[None]:
+def write_lock(folder: Path | None) -> Iterator[None]:
     """Be the only one who writes to a place; None is no place.
 
     **Arguments:**
 
-    - `place`: a folder that exists, or a file in one.
+    - `folder`: a folder that exists, or a file in one.
 
     **Raises:** `FolderInUse`, which names the process that has the lock; `OSError` where the file
     of the lock cannot be written.
     """
-    if place is None or fcntl is None:
+    if folder is None or fcntl is None:
         yield
         return
-    path = place / LOCK if place.is_dir() else place.with_name(f"{place.name}.lock")
-    file, owner = _acquire(path, place), os.getpid()
+    path = folder / LOCK if folder.is_dir() else folder.with_name(f"{folder.name}.lock")
+    file, owner = _acquire(path, folder), os.getpid()
     try:
         yield
     finally:
@@ -91,7 +91,7 @@ def _release(file: FileIO, path: Path) -> None:
     file.close()
 
 
-def _acquire(path: Path, place: Path) -> FileIO:
+def _acquire(path: Path, folder: Path) -> FileIO:
     assert fcntl is not None
     while True:
         file = FileIO(path, "r+", opener=_open)
@@ -100,7 +100,7 @@ def _acquire(path: Path, place: Path) -> FileIO:
         except BlockingIOError:
             owner = file.read(200).decode(errors="replace")
             file.close()
-            raise FolderInUse(_in_use(place, owner)) from None
+            raise FolderInUse(_in_use(folder, owner)) from None
         except OSError as error:
             if error.errno not in _NO_LOCKS:
                 file.close()
@@ -121,7 +121,7 @@ def _open(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
 
 
-def _in_use(place: Path, owner: str) -> str:
+def _in_use(folder: Path, owner: str) -> str:
     process, _, host = owner.partition(" ")
     if not (process.isdecimal() and host.isprintable()):
         who = "another process"
@@ -129,4 +129,4 @@ def _in_use(place: Path, owner: str) -> str:
         who = f"this process ({process}) already"
     else:
         who = f"process {process} on {host}"
-    return f"{str(place)!r} is being written by {who}; wait until that ends, or give another place"
+    return f"{str(folder)!r} is being written by {who}; wait until that ends, or give another place"

@@ -16,7 +16,7 @@ from verifai_jax.core.text import printable
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST_ROWS = 10
+MAX_ROWS = 10
 """Rows of a table that are shown."""
 
 
@@ -60,7 +60,7 @@ def rows_html(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def frame_html(frame: "pd.DataFrame") -> str:
     """Write the first rows of a table of pandas as HTML, numbers with four digits."""
-    return frame.head(MOST_ROWS).to_html(float_format=lambda x: f"{x:z.4g}", border=0)
+    return frame.head(MAX_ROWS).to_html(float_format=lambda x: f"{x:z.4g}", border=0)
 
 
 def picture_html(figure: Figure) -> str:

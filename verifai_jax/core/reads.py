@@ -83,13 +83,13 @@ def _note_open(event: str, path: object, mode: object = None, flags: object = 0)
     module = _reader(sys._getframe(2))
     if module is None:
         return
-    place = os.path.abspath(text)
+    absolute = os.path.abspath(text)
     # What lies in a folder with a dot is a cache, or settings.
-    hidden = f"{os.sep}." in place or place.startswith(_OF_THE_MACHINE)
-    if not hidden and os.path.isfile(place) and is_user_file(place):
+    hidden = f"{os.sep}." in absolute or absolute.startswith(_OF_THE_MACHINE)
+    if not hidden and os.path.isfile(absolute) and is_user_file(absolute):
         files = _read.setdefault(module, set())
         if len(files) < MAX_FILES:
-            files.add(place)
+            files.add(absolute)
 
 
 def _note_import(text: str) -> None:
@@ -102,12 +102,12 @@ def _note_import(text: str) -> None:
         frame = frame.f_back
     if frame is None:
         return
-    place = importlib.util.source_from_cache(text) if text.endswith(".pyc") else text
-    place = os.path.abspath(place)
-    if os.path.isfile(place) and is_user_file(place):
+    absolute = importlib.util.source_from_cache(text) if text.endswith(".pyc") else text
+    absolute = os.path.abspath(absolute)
+    if os.path.isfile(absolute) and is_user_file(absolute):
         files = _loaded.setdefault(os.path.abspath(frame.f_code.co_filename), set())
         if len(files) < MAX_FILES:
-            files.add(place)
+            files.add(absolute)
 
 
 def _writes(mode: object, flags: object) -> bool:

@@ -7,7 +7,7 @@ To trace the derivative of a simulation takes ten times as long as to trace the 
 what comes out depends on nothing else. So a simulation is traced afresh in each process, and where
 it is the same as in an earlier one, so is its derivative: that is read from a file, in a form that
 JAX exports and that can compute nothing but arrays. A file that is missing, damaged, or of another
-version of JAX or of this package is one that there is not.
+version of JAX or of this package is one that does not exist.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from verifai_jax.core.devices import cache_folder
 from verifai_jax.core.fingerprint import identity
 
-MOST_BYTES = 64 * 2**20
+MAX_BYTES = 64 * 2**20
 """Size of a program that is kept at most."""
 
 SEAL = 32
@@ -54,7 +54,7 @@ def remembered_as(kind: str, *values: object) -> str | None:
     - `kind`: of the program, for people who look into the folder.
     - `values`: all that the program follows from, beside this package and JAX; see `identity`.
 
-    **Returns:** the name; None where it cannot be said, or nothing is kept on disk.
+    **Returns:** the name; None if it cannot be said, or nothing is kept on disk.
     """
     if cache_folder() is None or None in values:
         return None
@@ -106,7 +106,7 @@ def lower_or_recall(
         except (ValueError, NotImplementedError, ImportError):
             # Such as calls of libraries that JAX does not promise to keep.
             return jax.jit(function).trace(*arguments).lower()
-        if len(data) <= MOST_BYTES:
+        if len(data) <= MAX_BYTES:
             _write(path, data)
 
     def recalled(*arguments: Any) -> Any:

@@ -74,10 +74,10 @@ def load_at_revision(target: str, kind: type[Kind]) -> Iterator[Kind]:
         tree = folder / "tree"
         _write_files(commit, root, folder / "index", tree)
         inner = Path.cwd().resolve().relative_to(root)
-        place = Path(plain.partition(".py")[0])
-        if place.is_absolute():
-            place = place.resolve().relative_to(root / inner)
-            plain = f"{place}.py{plain.partition('.py')[2]}"
+        file = Path(plain.partition(".py")[0])
+        if file.is_absolute():
+            file = file.resolve().relative_to(root / inner)
+            plain = f"{file}.py{plain.partition('.py')[2]}"
         try:
             with _imported_from(root, tree, inner):
                 loaded = load_target(plain, kind)
@@ -139,16 +139,16 @@ def _lies_in(module: object, folder: Path) -> bool:
     if file is None:
         # A folder without an `__init__.py` is a package of several places.
         try:
-            places = [str(path) for path in getattr(module, "__path__", ())]
+            paths = [str(path) for path in getattr(module, "__path__", ())]
         except KeyError:
             return False  # Its parent is gone: an import that failed has left it behind.
-        return bool(places) and all(Path(path).is_relative_to(folder) for path in places)
+        return bool(paths) and all(Path(path).is_relative_to(folder) for path in paths)
     return is_user_file(file) and Path(file).resolve().is_relative_to(folder)
 
 
 def _moved(path: str, root: Path, tree: Path) -> str:
     """Return the entry of `sys.path` in the other tree, where it is one of the project's code."""
-    place = Path(path or ".").resolve()
-    if not place.is_relative_to(root) or not is_user_file(str(place / "module.py")):
+    target = Path(path or ".").resolve()
+    if not target.is_relative_to(root) or not is_user_file(str(target / "module.py")):
         return path
-    return str(tree / place.relative_to(root))
+    return str(tree / target.relative_to(root))

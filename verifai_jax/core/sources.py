@@ -207,7 +207,7 @@ class Sources:
         return tuple(found)
 
     def other_versions(self, now: "Sources") -> tuple[str, ...]:
-        """Return packages whose version is another one now, in words."""
+        """Return packages whose version is another one now, as text."""
         return tuple(
             f"{name} {was} then, {now.versions[name]} now"
             for name, was in self.versions.items()
@@ -215,8 +215,8 @@ class Sources:
         )
 
     def _on_disk(self, name: str) -> str | None:
-        places = [Path(name), Path(self.root) / name]
-        return next((file_hash(place) for place in places if place.is_file()), None)
+        paths = [Path(name), Path(self.root) / name]
+        return next((file_hash(path) for path in paths if path.is_file()), None)
 
 
 def _same_name(name: str, others: Mapping[str, Source]) -> str | None:
@@ -248,11 +248,11 @@ def made_here() -> tuple[Maker, ...]:
         if is_user_file(file):
             role = PROBLEM if not found else CALLER
             # A cell, or what is executed as text, belongs to no file.
-            place = os.path.abspath(file) if os.path.isfile(file) else ""
-            if place not in found:
+            path = os.path.abspath(file) if os.path.isfile(file) else ""
+            if path not in found:
                 owner = frame.f_globals.get("__spec__") or frame.f_globals
-                sha256 = _as_imported(owner, place) if place else ""
-                found[place] = Maker(place, sha256, role)
+                sha256 = _as_imported(owner, path) if path else ""
+                found[path] = Maker(path, sha256, role)
         frame = frame.f_back
     return tuple(found.values())
 
@@ -423,14 +423,14 @@ def _search_path(top: str, program: str) -> list[Path]:
         return [tree, Path(program).parent]
     module = sys.modules.get(top)
     if module is not None:
-        folders = [Path(place).parent for place in getattr(module, "__path__", ())]
+        folders = [Path(path).parent for path in getattr(module, "__path__", ())]
         file = getattr(module, "__file__", None)
         return folders or ([] if file is None else [Path(file).parent])
     spec = importlib.machinery.PathFinder.find_spec(top)
     if spec is None:
         return []
     if spec.submodule_search_locations:
-        return [Path(place).parent for place in spec.submodule_search_locations]
+        return [Path(path).parent for path in spec.submodule_search_locations]
     return [Path(spec.origin).parent] if spec.origin else []
 
 
@@ -508,8 +508,8 @@ def _tree_of(file: str) -> Path | None:
 
 def _shown(file: str) -> str:
     """Return the name of a file: from the working directory, or absolute where it is elsewhere."""
-    place = Path(file)
+    path = Path(file)
     for root in (_tree_of(file), Path.cwd(), Path.cwd().resolve()):
-        if root is not None and place.is_relative_to(root):
-            return place.relative_to(root).as_posix()
-    return place.as_posix()
+        if root is not None and path.is_relative_to(root):
+            return path.relative_to(root).as_posix()
+    return path.as_posix()

@@ -72,7 +72,7 @@ def as_function(program: Any, step: Any) -> tuple[Callable[..., list[Any]], list
 
 
 def of_some(
-    call: Callable[..., list[Any]], values: Sequence[Any], places: Sequence[int]
+    call: Callable[..., list[Any]], values: Sequence[Any], indices: Sequence[int]
 ) -> Callable[..., list[Any]]:
     """Return a function of some arguments of another, to be differentiated.
 
@@ -80,14 +80,14 @@ def of_some(
 
     - `call`: the other function, of arrays.
     - `values`: all of its arguments.
-    - `places`: numbers of those that the function takes; the others keep their values.
+    - `indices`: numbers of those that the function takes; the others keep their values.
 
     **Returns:** the function, which returns those results that can have a derivative.
     """
 
     def function(*some: Any) -> list[Any]:
         whole = list(values)
-        for i, value in zip(places, some, strict=True):
+        for i, value in zip(indices, some, strict=True):
             whole[i] = value
         return [each for each in call(*whole) if jnp.issubdtype(each.dtype, jnp.inexact)]
 

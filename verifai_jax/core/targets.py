@@ -38,12 +38,12 @@ class NothingDefined(TargetError):
     """A file or module without an object of the kind that was looked for."""
 
 
-def definitions(place: str, *kinds: type[Kind]) -> dict[str, Kind]:
+def definitions(location: str, *kinds: type[Kind]) -> dict[str, Kind]:
     """Return the objects of some classes that a file or module defines.
 
     **Arguments:**
 
-    - `place`: file (`specs/cartpole.py`) or module (`specs.cartpole`); it is run.
+    - `location`: file (`specs/cartpole.py`) or module (`specs.cartpole`); it is run.
     - `kinds`: classes to look for.
 
     **Returns:** the objects in the order of their definition, by their names; by their variables,
@@ -52,17 +52,17 @@ def definitions(place: str, *kinds: type[Kind]) -> dict[str, Kind]:
     **Raises:** `TargetError` where there is no such file or module, or it cannot be run;
     `NothingDefined` where it defines no such object.
     """
-    return _by_name(_variables(place, *kinds))
+    return _by_name(_variables(location, *kinds))
 
 
-def _variables(place: str, *kinds: type[Kind]) -> dict[str, Kind]:
+def _variables(location: str, *kinds: type[Kind]) -> dict[str, Kind]:
     """Return the objects of some classes that a file or module defines, by their variables."""
     variables = {
-        name: value for name, value in vars(_import(place)).items() if isinstance(value, kinds)
+        name: value for name, value in vars(_import(location)).items() if isinstance(value, kinds)
     }
     if not variables:
         nouns = " and no ".join(kind.__name__ for kind in kinds)
-        raise NothingDefined(f"{place} defines no {nouns}")
+        raise NothingDefined(f"{location} defines no {nouns}")
     return variables
 
 
@@ -91,10 +91,10 @@ def load_target(target: str, kind: type[Kind]) -> Kind:
     **Raises:** `TargetError` where there is no such file or module, or no single object to take;
     `UnknownNameError` for a name that the file does not define, with those that it does.
     """
-    place, colon, name = target.rpartition(":")
+    location, colon, name = target.rpartition(":")
     if not colon:
-        place, name = target, ""
-    variables = _variables(place, kind)
+        location, name = target, ""
+    variables = _variables(location, kind)
     objects = _by_name(variables)
     noun = kind.__name__.lower()
     if name in objects:
@@ -102,13 +102,13 @@ def load_target(target: str, kind: type[Kind]) -> Kind:
     if name in variables:
         return variables[name]
     if name:
-        raise unknown_name(f"{noun} in {place}", name, dict.fromkeys((*objects, *variables)))
+        raise unknown_name(f"{noun} in {location}", name, dict.fromkeys((*objects, *variables)))
     if len(objects) == 1:
         return next(iter(objects.values()))
     plural = noun.removesuffix("y") + "ies" if noun.endswith("y") else f"{noun}s"
     raise TargetError(
-        f"{place} has {len(objects)} {plural}; name one: "
-        + ", ".join(f"{place}:{known}" for known in objects)
+        f"{location} has {len(objects)} {plural}; name one: "
+        + ", ".join(f"{location}:{known}" for known in objects)
     )
 
 
@@ -132,8 +132,8 @@ def target_of_project(target: object, folder: Path, *, kind: str, remedy: str) -
     **Raises:** `TargetError` for any other target.
     """
     if isinstance(target, str):
-        place, colon, _ = target.rpartition(":")
-        if _is_of_project(place if colon else target, folder.resolve()):
+        location, colon, _ = target.rpartition(":")
+        if _is_of_project(location if colon else target, folder.resolve()):
             return target
     raise TargetError(
         f"{folder} does not say which {kind} of this project it is of; give it: {remedy}"
@@ -145,49 +145,49 @@ RESULTS = ("runs", "sweeps")
 _OF_RESULTS = ("run.json", "sweep.json", "sweep.sqlite")
 
 
-def _is_of_project(place: str, folder: Path) -> bool:
+def _is_of_project(location: str, folder: Path) -> bool:
     """Return whether a place is a Python file of the project, and of no folder of results."""
     here = Path.cwd().resolve()
     # Anything else than an existing file would be imported as a module, from wherever it lies.
-    if not place.endswith(".py") or "\0" in place or not Path(place).is_file():
+    if not location.endswith(".py") or "\0" in location or not Path(location).is_file():
         return False
-    file = Path(place).resolve()
+    file = Path(location).resolve()
     if not file.is_relative_to(here) or file.is_relative_to(folder):
         return False
     folders = file.relative_to(here).parts[:-1]
     if any(name in RESULTS for name in folders):
         return False
     # What came with the folder, as from one archive, lies beside it.
-    beside = folder.relative_to(here).parts[:1] if folder.is_relative_to(here) else ()
-    if beside and beside == folders[:1]:
+    inside = folder.relative_to(here).parts[:1] if folder.is_relative_to(here) else ()
+    if inside and inside == folders[:1]:
         return False
     inner = file.parents[: len(folders)]
     return not any((each / name).exists() for each in inner for name in _OF_RESULTS)
 
 
-def _import(place: str) -> ModuleType:
+def _import(location: str) -> ModuleType:
     # The file's own imports (`from envs import cartpole`) start where the user stands.
     if sys.path[0] != str(Path.cwd()):
         sys.path.insert(0, str(Path.cwd()))
-    path = Path(place)
-    if not (place.endswith(".py") or path.exists()):
+    path = Path(location)
+    if not (location.endswith(".py") or path.exists()):
         try:
-            return importlib.import_module(place)
+            return importlib.import_module(location)
         except ModuleNotFoundError as error:
-            if error.name is not None and place.startswith(error.name):
+            if error.name is not None and location.startswith(error.name):
                 raise TargetError(
-                    f"no file and no module {place!r}; give FILE.py:NAME, "
+                    f"no file and no module {location!r}; give FILE.py:NAME, "
                     "such as specs/cartpole.py:balance"
                 ) from error
             raise
     if path.is_dir():
-        raise TargetError(f"{place} is a folder; give a file in it: {_python_files(path)}")
+        raise TargetError(f"{location} is a folder; give a file in it: {_python_files(path)}")
     if not path.exists():
-        raise TargetError(f"no file {place}; {path.parent}/ has {_python_files(path.parent)}")
+        raise TargetError(f"no file {location}; {path.parent}/ has {_python_files(path.parent)}")
     name = f"_target_{path.resolve().stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
-        raise TargetError(f"{place} is not a Python file")
+        raise TargetError(f"{location} is not a Python file")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:
@@ -195,11 +195,11 @@ def _import(place: str) -> ModuleType:
     except MissingExtra:
         raise
     except SyntaxError as error:
-        raise TargetError(f"{place} is not Python: {error}") from error
+        raise TargetError(f"{location} is not Python: {error}") from error
     except KeyboardInterrupt:
         raise
     except BaseException as error:
-        raise TargetError(f"{place} cannot be run: {explain_user_error(error)}") from error
+        raise TargetError(f"{location} cannot be run: {explain_user_error(error)}") from error
     return module
 
 

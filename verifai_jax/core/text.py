@@ -74,7 +74,7 @@ def format_seconds(seconds: float, digits: int = 6) -> str:
     return f"{'-' * (seconds < 0)}{' '.join(parts)}"
 
 
-MOST_ENTRIES = 4
+MAX_ENTRIES = 4
 """Numbers of one feature that are written one by one; of more, their range."""
 
 
@@ -82,7 +82,7 @@ def format_features(features: Mapping[str, object], labels: Mapping[str, str] | 
     """Write features with four digits: `x0=0.1353, alg=sac, wind=16 values from -1 to 0.93`.
 
     Of columns `wind[0]`, `wind[1]`, ... that are more than four only the range is written; parts of
-    items that there are not, such as `cars[3].x`, are left out.
+    items that do not exist, such as `cars[3].x`, are left out.
 
     **Arguments:**
 
@@ -99,11 +99,11 @@ def format_features(features: Mapping[str, object], labels: Mapping[str, str] | 
     parts = []
     for stem, columns in entries.items():
         there = [value for _, value in columns if value == value]
-        if len(columns) <= MOST_ENTRIES or not there:
+        if len(columns) <= MAX_ENTRIES or not there:
             parts += [f"{labels.get(n, n)}={_format_value(value)}" for n, value in columns]
             continue
         values = np.array([value for _, value in columns], float)
-        values = values[~np.isnan(values)]  # Items that there are not.
+        values = values[~np.isnan(values)]  # Items that do not exist.
         low, high = (_format_value(float(end(values))) for end in (np.min, np.max))
         span = f"all {low}" if low == high else f"from {low} to {high}"
         parts.append(f"{stem}={len(values)} values {span}")
@@ -120,23 +120,27 @@ def _format_value(value: object) -> str:
 
 def format_error(error: BaseException) -> str:
     """Write an exception in one line: its type and the first line of its message, shortened."""
-    first = shorten((storable(error).splitlines() or [""])[0], MOST_OF_A_MESSAGE)
+    first = shorten((storable(error).splitlines() or [""])[0], MAX_MESSAGE_LENGTH)
     return f"{type(error).__name__}: {first}" if first else type(error).__name__
 
 
-def shorten(text: str, most: int = 60) -> str:
+def shorten(text: str, maximum: int = 60) -> str:
     """Shorten a text to at most so many characters by leaving out some before its end.
 
     The end of a name says more than its middle.
     """
-    return text if len(text) <= most else f"{text[: most // 3]}...{text[len(text) - most // 2 :]}"
+    return (
+        text
+        if len(text) <= maximum
+        else f"{text[: maximum // 3]}...{text[len(text) - maximum // 2 :]}"
+    )
 
 
-MOST_OF_A_MESSAGE = 500
+MAX_MESSAGE_LENGTH = 500
 """Characters of a message of somebody's system that are printed; the table has all of it."""
 
 
-def printable(text: str, most: int | None = None) -> str:
+def printable(text: str, maximum: int | None = None) -> str:
     r"""Write characters that steer a terminal as escapes: `\x1b[2J`, `\u202e`.
 
     Texts of systems, tables and files could otherwise clear the screen, or reorder what is on it.
@@ -145,15 +149,15 @@ def printable(text: str, most: int | None = None) -> str:
     **Arguments:**
 
     - `text`: the text.
-    - `most`: characters that are kept, of its begin and its end; all when left out.
+    - `maximum`: characters that are kept, of its begin and its end; all when left out.
     """
-    text = text if most is None else shorten(text, most)
+    text = text if maximum is None else shorten(text, maximum)
     if text.isascii() and text.isprintable():
         return text
     return "".join(_escaped(each) if _steers(each) else each for each in text)
 
 
-def storable(text: object, most: int = 2000) -> str:
+def storable(text: object, maximum: int = 2000) -> str:
     r"""Return a text of somebody's code as files and sockets can hold it, of bounded length.
 
     A lone surrogate, which UTF-8 cannot hold, becomes its escape: `\ud800`.
@@ -161,7 +165,7 @@ def storable(text: object, most: int = 2000) -> str:
     **Arguments:**
 
     - `text`: the text; anything else is written by `str`.
-    - `most`: characters that are kept, of its beginning and its end.
+    - `maximum`: characters that are kept, of its beginning and its end.
     """
     try:
         written = text if isinstance(text, str) else str(text)
@@ -169,7 +173,7 @@ def storable(text: object, most: int = 2000) -> str:
         if isinstance(error, KeyboardInterrupt):
             raise
         written = f"({type(text).__name__} whose text cannot be written)"
-    return shorten(written, most).encode("utf-8", "backslashreplace").decode("utf-8")
+    return shorten(written, maximum).encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def _steers(character: str) -> bool:
@@ -183,9 +187,9 @@ def _escaped(character: str) -> str:
     return character.encode("unicode_escape").decode("ascii")
 
 
-def one_line(text: str, most: int = MOST_OF_A_MESSAGE) -> str:
+def one_line(text: str, maximum: int = MAX_MESSAGE_LENGTH) -> str:
     """Write a text in one line of at most so many characters, safe for a terminal."""
-    return printable(" ".join(shorten(text, most).split()))
+    return printable(" ".join(shorten(text, maximum).split()))
 
 
 def folder_name(text: str) -> str:

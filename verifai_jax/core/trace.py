@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Int, Real
 
 from verifai_jax.core.checks import check_name, is_number
 from verifai_jax.core.gaps import known_times, with_gaps
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_seconds
 
@@ -178,7 +178,7 @@ class Trace(InNotebook):
         **Raises:** `ValueError` for a frame without rows, numbers or sample times, and for times
         that do not increase.
         """
-        return late("verifai_jax.mtl.recording", "read")(frame, time=time, dt=dt)
+        return lazy_import("verifai_jax.mtl.recording", "read")(frame, time=time, dt=dt)
 
     @property
     def length(self) -> int:
@@ -330,10 +330,10 @@ def check_period(dt: Any) -> float:
         dt = float(dt)
     if not dt > 0:
         raise ValueError(f"the sampling period dt must be positive; got {dt}")
-    least = float(np.finfo(np.float32).tiny)
-    if not least <= dt < math.inf:
+    minimum = float(np.finfo(np.float32).tiny)
+    if not minimum <= dt < math.inf:
         raise ValueError(
-            f"the sampling period dt must be a finite number of seconds, at least {least:z.3g}, "
+            f"the sampling period dt must be a finite number of seconds, at least {minimum:z.3g}, "
             f"the least in single precision; got {dt}"
         )
     return dt
@@ -382,7 +382,7 @@ def _is_known(value: Leaf) -> bool:
 
 
 def _range(signal: Samples, valid: Leaf) -> str:
-    """Return the shape of a signal and its range where it counts, in words."""
+    """Return the shape of a signal and its range where it counts, as text."""
     shape: tuple[int, ...] = signal.shape
     text = "" if len(shape) == 1 else f"[{', '.join(map(str, shape[1:]))}]  "
     if not _is_known(signal):

@@ -1,4 +1,4 @@
-"""Errors that code of a user raises, in words, with the line of the user's own file.
+"""Messages for errors that user code raises, with the line of the user's own file.
 
     try:
         system(features, key)
@@ -28,15 +28,15 @@ from verifai_jax.core.text import storable
 from verifai_jax.core.user_files import is_notebook_cell, is_user_file
 from verifai_jax.core.waveform import IS_CALLED
 
-MOST_CODE = 80
+MAX_CODE = 80
 """Characters of a line of code that a message quotes."""
-MOST_MESSAGE = 300
+MAX_MESSAGE = 300
 """Characters of what a library or a simulator says."""
-MOST_READ = 4 * MOST_MESSAGE
+MAX_READ = 4 * MAX_MESSAGE
 """Characters of a message that are read at all: one of megabytes costs no time."""
-MOST_TRACEBACK = 100_000
+MAX_TRACEBACK = 100_000
 """The same of a message that ends with what was raised, behind its traceback."""
-MOST_NAMES = 12
+MAX_NAMES = 12
 """Names that a message lists."""
 
 ONCE_FOR_ALL = "JAX traces the code once for all simulations, so its values are not known yet"
@@ -114,7 +114,7 @@ class UserLine(NamedTuple):
     - `file`: its path, relative where it lies below the working directory.
     - `line`: its number.
     - `function`: name of the function around it.
-    - `code`: the text of the line; empty where the file cannot be read.
+    - `code`: the text of the line; empty if the file cannot be read.
     """
 
     file: str
@@ -134,7 +134,7 @@ def user_line(error: BaseException) -> UserLine | None:
 
 
 def defined_at(function: Callable[..., object] | None) -> str:
-    """Write where a function is defined, ` (sim.py, line 3)`; empty where it is not known."""
+    """Write where a function is defined, ` (sim.py, line 3)`; empty if it is not known."""
     code = getattr(getattr(function, "__wrapped__", function), "__code__", None)
     if not isinstance(code, CodeType) or not is_user_file(code.co_filename):
         return ""
@@ -149,7 +149,7 @@ def check_called_with(
     **Arguments:**
 
     - `role`: what the function is, for the message: "dynamics".
-    - `function`: what was given; None where nothing was.
+    - `function`: what was given; None if nothing was.
     - `arguments`: names of the arguments.
 
     **Raises:** `ValueError`, with what it takes and where it is defined.
@@ -171,7 +171,7 @@ def check_called_with(
 
 
 def source_line(traceback: object) -> str | None:
-    """Return the user's line at which JAX recorded an operation; None where it is not known.
+    """Return the user's line at which JAX recorded an operation; None if it is not known.
 
     **Arguments:**
 
@@ -199,7 +199,7 @@ def explain_user_error(
     if step is None:
         return _said(error)
     line = _line(step.tb_frame.f_code, step.tb_lineno)
-    code = f" (`{storable(line.code, MOST_CODE)}`)" if line.code else ""
+    code = f" (`{storable(line.code, MAX_CODE)}`)" if line.code else ""
     kept = isinstance(error, jax.errors.UnexpectedTracerError)
     more = (
         (AS_NATIVE if native else AS_PYTHON)
@@ -238,9 +238,9 @@ def _sentence(error: BaseException, step: TracebackType, features: object) -> st
 def _advice_on_tracing(error: BaseException) -> str:
     """Write what to do about an error that comes of tracing; empty for others."""
     # NumPy raises an error of its own from that of JAX.
-    for told in (error, error.__cause__):
+    for each in (error, error.__cause__):
         for kind, advice in TRACING:
-            if isinstance(told, kind):
+            if isinstance(each, kind):
                 return WRITES if "array element" in storable(error) else advice
     if not isinstance(error, TypeError | IndexError):
         return ""
@@ -250,7 +250,7 @@ def _advice_on_tracing(error: BaseException) -> str:
 
 
 def _missing_key(key: object, step: TracebackType, features: object) -> str:
-    """Write which mapping lacks a key, and what it has; empty where that is not known."""
+    """Write which mapping lacks a key, and what it has; empty if that is not known."""
     text, mapping = _subscripted(step)
     if mapping is None:
         # Without the text of the line: features that the function holds are the likeliest.
@@ -265,8 +265,8 @@ def _missing_key(key: object, step: TracebackType, features: object) -> str:
 
 
 def _known(begin: str, name: object, names: list[str]) -> str:
-    more = f", ... ({len(names)} in all)" if len(names) > MOST_NAMES else ""
-    listing = f"{begin} {', '.join(names[:MOST_NAMES])}{more}" if names else "It has none"
+    more = f", ... ({len(names)} in all)" if len(names) > MAX_NAMES else ""
+    listing = f"{begin} {', '.join(names[:MAX_NAMES])}{more}" if names else "It has none"
     return f"{nearest_names(name, names) or '.'} {listing}"
 
 
@@ -300,9 +300,9 @@ def _value(node: ast.expr, frame: FrameType) -> object:
 
 def _source_of_instruction(code: CodeType, offset: int) -> str:
     """Return the text of the expression that an instruction belongs to; empty if unknown."""
-    places = [*code.co_positions()]
+    spans = [*code.co_positions()]
     # An instruction takes two bytes.
-    first, last, begin, end = places[offset // 2] if offset // 2 < len(places) else (None,) * 4
+    first, last, begin, end = spans[offset // 2] if offset // 2 < len(spans) else (None,) * 4
     if first is None or last is None or begin is None or end is None:
         return ""
     lines = [linecache.getline(code.co_filename, n, None) for n in range(first, last + 1)]
@@ -326,14 +326,14 @@ def raised_in_callback(error: BaseException) -> str | None:
     """
     if type(error).__name__ not in ("JaxRuntimeError", "XlaRuntimeError"):
         return None
-    text = storable(error, MOST_TRACEBACK)
+    text = storable(error, MAX_TRACEBACK)
     head, _, traceback = text.partition("Traceback (most recent call last):")
     lines = traceback.strip().splitlines()
     if "allback" not in head or not lines:
         return None
-    places = re.findall(r'File "([^"]+)", line (\d+)', traceback)
-    where = f" ({_shown_file(places[-1][0])}, line {places[-1][1]})" if places else ""
-    return f"{storable(lines[-1].strip(), MOST_MESSAGE)}{where}"
+    frames = re.findall(r'File "([^"]+)", line (\d+)', traceback)
+    where = f" ({_shown_file(frames[-1][0])}, line {frames[-1][1]})" if frames else ""
+    return f"{storable(lines[-1].strip(), MAX_MESSAGE)}{where}"
 
 
 def _said(error: BaseException) -> str:
@@ -341,11 +341,11 @@ def _said(error: BaseException) -> str:
     if (raised := raised_in_callback(error)) is not None:
         return raised
     # JAX appends advice about its own tracebacks.
-    said = storable(error, MOST_READ)
+    said = storable(error, MAX_READ)
     words = " ".join(said.partition("\n------")[0].split())
-    if len(words) > MOST_MESSAGE:
-        words = f"{words[: MOST_MESSAGE - 3]}..."
-    kind = storable(type(error).__name__, MOST_CODE)
+    if len(words) > MAX_MESSAGE:
+        words = f"{words[: MAX_MESSAGE - 3]}..."
+    kind = storable(type(error).__name__, MAX_CODE)
     return f"{kind}: {words}" if words else kind
 
 
@@ -374,5 +374,5 @@ def _is_of_user(frame: FrameType) -> bool:
 def _shown_file(file: str) -> str:
     if is_notebook_cell(file):
         return "a notebook cell"
-    place, here = Path(file), Path(os.getcwd())
-    return str(place.relative_to(here)) if place.is_relative_to(here) else str(place)
+    path, here = Path(file), Path(os.getcwd())
+    return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)

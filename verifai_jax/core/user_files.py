@@ -29,10 +29,10 @@ def is_user_file(file: str) -> bool:
         return False
     if "ipykernel_" in file:
         return True
-    place = Path(file).absolute()
-    if any(name in place.parts for name in _INSTALLED):
+    path = Path(file).absolute()
+    if any(name in path.parts for name in _INSTALLED):
         return False
-    return not any(place.is_relative_to(folder) for folder in _libraries())
+    return not any(path.is_relative_to(folder) for folder in _libraries())
 
 
 @cache

@@ -109,19 +109,19 @@ class Waveform:
             return self._held(knots, time, 1, xp)
         if count == 1:
             return knots[0]
-        left, share = self._place(time, count, xp)
+        left, share = self._position(time, count, xp)
         share = share.astype(knots.dtype)
         if self.hold == "linear":
             return between(knots[left], knots[left + 1], share, xp)
         gaps = np.ones(count - 1) if self.times is None else np.diff(self.times)
         return monotone_cubic(knots, gaps, left, share, xp)
 
-    def _place(self, time: Any, count: int, xp: Any) -> tuple[Any, Any]:
+    def _position(self, time: Any, count: int, xp: Any) -> tuple[Any, Any]:
         """Return the index of the control point before a time, and the share of the way on."""
         if self.times is None:
-            place = xp.clip(time / self.duration, 0.0, 1.0) * (count - 1)
-            left = xp.clip(xp.floor(place).astype(np.int32), 0, count - 2)
-            return left, place - left
+            position = xp.clip(time / self.duration, 0.0, 1.0) * (count - 1)
+            left = xp.clip(xp.floor(position).astype(np.int32), 0, count - 2)
+            return left, position - left
         starts, gaps = (xp.asarray(a, time.dtype) for a in (self.times, np.diff(self.times)))
         left = xp.clip(_last_not_after(starts, time, xp), 0, count - 2)
         return left, xp.clip((time - starts[left]) / gaps[left], 0.0, 1.0)
@@ -137,16 +137,16 @@ class Waveform:
             starts = xp.asarray(self.times, time.dtype)
             gap = _shortest(self.times)
             rounding = 4 * float(jnp.finfo(time.dtype).eps) * self.times[-1]
-            late = time + sign * max(1e-5 * gap, rounding)
-            piece = xp.clip(_last_not_after(starts, late, xp), 0, count - 1)
-            since, width = late - starts[piece], gap / 2 if self.width is None else self.width
+            later = time + sign * max(1e-5 * gap, rounding)
+            piece = xp.clip(_last_not_after(starts, later, xp), 0, count - 1)
+            since, width = later - starts[piece], gap / 2 if self.width is None else self.width
         else:
             if count == 1 and self.hold == "constant":
                 return knots[0]
             assert self.duration is not None
-            place = time / self.duration * count + sign * _slack(knots)
-            piece = xp.clip(xp.floor(place).astype(np.int32), 0, count - 1)
-            since = place - piece
+            position = time / self.duration * count + sign * _slack(knots)
+            piece = xp.clip(xp.floor(position).astype(np.int32), 0, count - 1)
+            since = position - piece
             width = 0.5 if self.width is None else self.width * count / self.duration
         if self.hold == "constant":
             return knots[piece]
@@ -216,8 +216,8 @@ class WaveformWithinStep(Waveform):
         # Another time (a delay) moves with the stages as well: behind the beginning of the step, a
         # piece that begins just there belongs to the next step.
         before = (self.now > self.begin) & ~inside
-        place = jnp.where(inside, self.begin, time).astype(knots.dtype)
-        return self._held(knots, place, jnp.where(before, -1, 1).astype(knots.dtype), jnp)
+        position = jnp.where(inside, self.begin, time).astype(knots.dtype)
+        return self._held(knots, position, jnp.where(before, -1, 1).astype(knots.dtype), jnp)
 
 
 def _slack(knots: Any) -> float:
@@ -239,7 +239,7 @@ IS_CALLED = (
     "a Signal is a function of time and not a number: call it with a time in seconds, as in "
     "features['wind'](time); its control points are its .knots"
 )
-"""Advice for who takes a function of time for a number."""
+"""Advice for users who take a function of time for a number."""
 
 
 def _refuse(self: Waveform, *_: object) -> None:

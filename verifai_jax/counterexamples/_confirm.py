@@ -36,7 +36,7 @@ def confirm(
     row: None = None,
     *,
     simulator: Simulator = None,
-    most: int | None = None,
+    max_rows: int | None = None,
     progress: bool | None = None,
 ) -> Confirmations: ...
 @overload
@@ -45,7 +45,7 @@ def confirm(
     row: int | np.integer | pd.Series | Mapping[str, Any],
     *,
     simulator: Simulator = None,
-    most: int | None = None,
+    max_rows: int | None = None,
     progress: bool | None = None,
 ) -> Confirmation: ...
 @suggests_options
@@ -55,7 +55,7 @@ def confirm(
     row: Row = None,
     *,
     simulator: Simulator = None,
-    most: int | None = None,
+    max_rows: int | None = None,
     progress: bool | None = None,
 ) -> Confirmation | Confirmations:
     """Replay counterexamples more finely than they were found, and decide which are real.
@@ -67,8 +67,8 @@ def confirm(
       counterexamples of the table when left out.
     - `simulator`: another system for the same features and signals, a problem with one, or the
       name of another backend, that has to agree.
-    - `most`: how many rows are replayed at least, by default 256, and more where a row takes few
-      replays; of more, the worst and those nearest to zero, until the rest
+    - `max_rows`: how many rows are replayed at least, by default 256, and more where a row takes
+      few replays; of more, the worst and those nearest to zero, until the rest
       is far from it (see `evaluation.confirmer.Confirmer`).
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
@@ -86,7 +86,7 @@ def confirm(
         )
     # On the backend of the run, whose verdicts these are.
     problem = resolved(run.problem, wanted=run.backend).problem
-    confirmer = Confirmer(problem, run.precision, run.seed, simulator=simulator, most=most)
+    confirmer = Confirmer(problem, run.precision, run.seed, simulator=simulator, max_rows=max_rows)
     known = run.table.counts.repetitions
     confirmer.wavers, confirmer.flips = known.moved > 0, known.lost > 0
     if row is None:

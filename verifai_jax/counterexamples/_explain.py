@@ -66,9 +66,11 @@ class Explained(Drawn, InNotebook):
     @property
     def matter(self) -> tuple[Influence, ...]:
         """The features whose influence is 5 % or more of the greatest, the greatest first."""
-        most = max((abs(self.effect(i)) for i in self.influences), default=0.0)
+        maximum = max((abs(self.effect(i)) for i in self.influences), default=0.0)
         return tuple(
-            i for i in self.influences if i.gone or abs(self.effect(i)) > MATTERS * max(most, 1e-12)
+            i
+            for i in self.influences
+            if i.gone or abs(self.effect(i)) > MATTERS * max(maximum, 1e-12)
         )
 
     def __str__(self) -> str:
@@ -128,8 +130,8 @@ def explain(
     groups = at.groups
     singles = list(range(len(u)))
     points = np.repeat(u[None], 1 + len(groups) + len(singles), axis=0)
-    for point, (_, places) in zip(points[1:], groups, strict=False):
-        point[places] = at.u[places]
+    for point, (_, coordinates) in zip(points[1:], groups, strict=False):
+        point[coordinates] = at.u[coordinates]
     for point, i in zip(points[1 + len(groups) :], singles, strict=True):
         point[i] = at.u[i]
     rho, failing = candidates(points if known else points[:1])
@@ -154,24 +156,24 @@ def explain(
     notes += candidates.notes
     duration = replayed.duration or 0.0
     influences = []
-    for n, (name, places) in enumerate(groups, start=1):
-        one = 1 + len(groups) + places
+    for n, (name, coordinates) in enumerate(groups, start=1):
+        one = 1 + len(groups) + coordinates
         values, usual = values_of(problem.space, name, u), values_of(problem.space, name, at.u)
         safe = ~failing & np.isfinite(rho)
         influences.append(
             Influence(
                 name=name,
-                coordinates=tuple(at.names[i] for i in places),
+                coordinates=tuple(at.names[i] for i in coordinates),
                 value=values,
                 nominal=usual if known else (),
                 spans=spans_of(problem.space.domains[name], duration),
                 reverted=float(rho[n]),
                 gone=bool(safe[n]),
-                departs=bool(at.departs(u[None])[0, places].any()),
+                departs=bool(at.departs(u[None])[0, coordinates].any()),
                 each=rho[one],
                 each_gone=tuple(bool(gone) for gone in safe[one]),
-                gradient=gradient[places],
-                slopes=slopes[places],
+                gradient=gradient[coordinates],
+                slopes=slopes[coordinates],
             )
         )
     explained = Explained(

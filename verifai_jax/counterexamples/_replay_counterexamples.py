@@ -50,7 +50,7 @@ class ReplayedCounterexample:
       problem"`.
     - `robustness`: the least now; NaN without one.
     - `before`: the least when it was saved.
-    - `note`: what has changed, or what is wrong, in words.
+    - `note`: what has changed, or what is wrong, as text.
     - `changed`: whether the model is another one than that which it was saved with.
     """
 
@@ -67,12 +67,12 @@ class CorpusReplay(InNotebook):
     """The files of a corpus, replayed against a problem, as `replay_counterexamples` returns them.
 
     - `problem`: its name.
-    - `place`: the folder or file.
+    - `folder`: the folder or file.
     - `replayed`: a `ReplayedCounterexample` for each file.
     """
 
     problem: str
-    place: Path
+    folder: Path
     replayed: tuple[ReplayedCounterexample, ...]
 
     def of(self, state: str) -> tuple[ReplayedCounterexample, ...]:
@@ -112,7 +112,7 @@ class CorpusReplay(InNotebook):
         states = (FAILING, FIXED, WITHOUT_VERDICT, INVALID)
         counts = ", ".join(f"{len(self.of(state))} {state}" for state in states if self.of(state))
         plural = "s" * (count != 1)
-        lines = [f"{self.problem}: {count} counterexample{plural} in {self.place}"]
+        lines = [f"{self.problem}: {count} counterexample{plural} in {self.folder}"]
         lines[0] += f": {counts}" if count else ""
         if changed := sum(one.changed for one in self.replayed):
             lines.append(f"  the model has changed since {changed} of them were saved")
@@ -164,12 +164,12 @@ def replay_counterexamples(
     batches: dict[tuple[int, str, str | None], _Batch] = {}
     for path, entry in entries.items():
         if entry.problem != problem.name:
-            results[path] = ReplayedCounterexample(path, OTHER, np.nan, _least(entry))
+            results[path] = ReplayedCounterexample(path, OTHER, np.nan, _lowest(entry))
             continue
         columns = renamed(entry.features, rename or {})
         reason = _misfit(problem.space, columns)
         if reason:
-            results[path] = ReplayedCounterexample(path, INVALID, np.nan, _least(entry), reason)
+            results[path] = ReplayedCounterexample(path, INVALID, np.nan, _lowest(entry), reason)
             continue
         together = (entry.seed, entry.precision, entry.backend)
         batches.setdefault(together, []).append((path, entry, columns))
@@ -196,7 +196,7 @@ def _replay_each(
         if len(batch) == 1:
             ((path, entry, _),) = batch
             reason = one_line(format_error(error))
-            return {path: ReplayedCounterexample(path, INVALID, np.nan, _least(entry), reason)}
+            return {path: ReplayedCounterexample(path, INVALID, np.nan, _lowest(entry), reason)}
     results: _Replayed = {}
     for each in batch:
         results |= _replay_each(problem, replay, [each])
@@ -253,7 +253,7 @@ def _replay_batch(
             message = "" if verdicts.messages is None else verdicts.messages[i]
             notes.append(message or status.name.lower())
         results[path] = ReplayedCounterexample(
-            path, state, robustness, _least(entry), "; ".join(notes), bool(changes)
+            path, state, robustness, _lowest(entry), "; ".join(notes), bool(changes)
         )
     return results
 
@@ -271,7 +271,7 @@ def _not_again(
     entry: SavedCounterexample, changes: tuple[Change, ...] | None, robustness: float
 ) -> list[str]:
     """Say that the same model gives another number than when a counterexample was saved."""
-    before = _least(entry)
+    before = _lowest(entry)
     near = abs(robustness - before) <= CLOSE * max(1.0, abs(before))
     if changes is None or changes or near or np.isnan(before):
         return []
@@ -281,13 +281,13 @@ def _not_again(
     ]
 
 
-def _least(entry: SavedCounterexample) -> float:
+def _lowest(entry: SavedCounterexample) -> float:
     values = [value for value in entry.robustness.values() if isinstance(value, int | float)]
     return min(values, default=np.nan)
 
 
 def _misfit(space: FeatureSpace, columns: Mapping[str, Any]) -> str:
-    """Return why the space has no place for a counterexample; empty where it has."""
+    """Return why the space has no place for a counterexample; empty if it has."""
     try:
         return _why_not_in(space, columns)
     except (ValueError, TypeError, KeyError, OverflowError, AttributeError) as error:

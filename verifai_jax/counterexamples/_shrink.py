@@ -284,7 +284,7 @@ class _Search:
         start: Float[np.ndarray, "1 d"],
     ) -> None:
         self.candidates, self.by, self.rng = candidates, by, rng
-        self.most = int(candidates.nominal.count(start)[0])
+        self.max_changed = int(candidates.nominal.count(start)[0])
         self.history: list[Step] = []
 
     def order(self, points: Float[np.ndarray, "n d"]) -> np.ndarray:
@@ -302,7 +302,7 @@ class _Search:
         points = self.candidates.points[self.candidates.failing]
         if self.by == "count":
             # However few its items, what departs in more than the row does is no smaller.
-            points = points[self.candidates.nominal.count(points) <= self.most]
+            points = points[self.candidates.nominal.count(points) <= self.max_changed]
         return points[self.order(points)]
 
     def note(self) -> None:
@@ -327,7 +327,7 @@ class _Search:
         # Half for what decides where to go, so that some is left to go there.
         candidates.limit = candidates.budget // 2
         if self.by == "count" and nominal.space.items:
-            points = self.with_fewest_items()
+            points = self.without_needless_items()
         if self.by == "count":
             own = points[:1][candidates(points[:1])[1]]
             minimize_count(candidates, self.starts(own, alike=False), self.rng)
@@ -339,7 +339,7 @@ class _Search:
         candidates.limit = candidates.budget - 2 * nominal.space.dim
         self.follow(self.starts()[:1])
         # A boundary of many pieces has a nearest point on each: some of those beside this one.
-        search_beside(candidates, self.failures()[0], self.rng)
+        search_alongside(candidates, self.failures()[0], self.rng)
         self.follow(self.starts(self.failures()[:1], cosine=0.97)[1:], rounds=10)
         for _ in range(2):
             if candidates.left < candidates.budget // 20:
@@ -355,15 +355,15 @@ class _Search:
         revert_features(candidates, self.failures()[0])
         self.note()
 
-    def with_fewest_items(self) -> Float[np.ndarray, "1 d"]:
+    def without_needless_items(self) -> Float[np.ndarray, "1 d"]:
         """Return the failure with the fewest items, such as events; from now on none has more."""
         candidates = self.candidates
-        least = remove_items(candidates, self.failures()[0])
-        if int(candidates.nominal.count(least[None])[0]) > self.most:
+        lowest = remove_items(candidates, self.failures()[0])
+        if int(candidates.nominal.count(lowest[None])[0]) > self.max_changed:
             return self.failures()[:1]
-        candidates.most_items = int(candidates.nominal.items(least[None])[0])
+        candidates.max_items = int(candidates.nominal.items(lowest[None])[0])
         self.note()
-        return least[None]
+        return lowest[None]
 
     def starts(
         self,
@@ -389,8 +389,8 @@ class _Search:
             if len(chosen) >= FOLLOWED:
                 break
             v = u - nominal.u
-            ways = [w - nominal.u for w in chosen]
-            if all(v @ w < cosine * np.linalg.norm(v) * np.linalg.norm(w) for w in ways):
+            departures = [w - nominal.u for w in chosen]
+            if all(v @ w < cosine * np.linalg.norm(v) * np.linalg.norm(w) for w in departures):
                 chosen.append(u)
         return np.array(chosen)
 
@@ -403,7 +403,7 @@ class _Search:
             self.note()
 
 
-def search_beside(
+def search_alongside(
     candidates: Candidates, u: Float[np.ndarray, " d"], rng: np.random.Generator
 ) -> None:
     """Search failures on the same coordinates, a little farther away in other directions."""
@@ -429,13 +429,13 @@ def search_elsewhere(
     """
     nominal = candidates.nominal
     free = np.flatnonzero(np.array(nominal.cube.levels) == 0)
-    most = min(int(nominal.count(u[None])[0]), len(free)) if keep_count else len(free)
+    maximum = min(int(nominal.count(u[None])[0]), len(free)) if keep_count else len(free)
     reach = 0.98 * float(nominal.distance(u[None])[0])
-    if not most or not reach:
+    if not maximum or not reach:
         return
     moved = np.zeros((40, nominal.space.dim))
     for row in moved:
-        row[rng.permutation(free)[:most]] = rng.standard_normal(most)
+        row[rng.permutation(free)[:maximum]] = rng.standard_normal(maximum)
     moved *= reach * rng.uniform(0.3, 1, (len(moved), 1)) / _length(moved)
     points = nominal.settle(nominal.u + moved)
     rho, failing = candidates(points)
@@ -474,7 +474,7 @@ def _length(rows: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n 1"]:
 def _verified(
     problem: Problem, search: _Search, key: Key[Array, ""], number: int, precision: str
 ) -> tuple[np.ndarray, Replay] | None:
-    """Return the least failure that fails alone too, in float64 as well; None where none does.
+    """Return the least failure that fails alone too, in float64 as well; None if none does.
 
     It is taken a little farther from nominal than the boundary, where rounding would decide.
     """

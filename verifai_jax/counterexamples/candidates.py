@@ -41,10 +41,10 @@ class Candidates:
     - `precision`: of the simulations, `"float32"` or `"float64"`.
 
     **Attributes:** `points` `[n, d]`, `rho` `[n]` and `failing` `[n]` of all that were simulated;
-    `limit`: simulations after which no more are made for now; `most_items`: points with more items
+    `limit`: simulations after which no more are made for now; `max_items`: points with more items
     (such as events) are not simulated; `temperature` of the smooth
     robustness that is differentiated; `differentiable`: whether gradients can be had; `note`: why
-    not, in words; `without_verdict`: simulations that had none, and `trouble`, what the first of
+    not, as text; `without_verdict`: simulations that had none, and `trouble`, what the first of
     them raised.
     """
 
@@ -53,7 +53,7 @@ class Candidates:
     ) -> None:
         self.problem, self.nominal, self.budget = problem, nominal, budget
         self.precision, self.limit = precision, budget
-        self.most_items: int | None = None
+        self.max_items: int | None = None
         self._evaluate = Evaluator(problem, BATCH, precision=precision)
         self._differentiate: Evaluator | None = None
         self._known: dict[bytes, tuple[float, bool]] = {}
@@ -103,7 +103,7 @@ class Candidates:
         order = self._accepted(points, order)[: max(self.left, 0)]
         if order:
             verdicts = self._evaluate(points[order])
-            rho = np.where(verdicts.proper, verdicts.least, np.inf).astype(np.float64)
+            rho = np.where(verdicts.proper, verdicts.lowest, np.inf).astype(np.float64)
             self.without_verdict += int(np.sum(~verdicts.proper))
             self.trouble = next(filter(None, [self.trouble, *(verdicts.messages or [])]), "")
             for i, value, fails in zip(order, rho, verdicts.violated, strict=True):
@@ -115,7 +115,7 @@ class Candidates:
         return np.array([rho for rho, _ in known]), np.array([fails for _, fails in known], bool)
 
     def tangents(self, points: Float[np.ndarray, "n d"]) -> list[Tangent | None]:
-        """Return the tangents of the robustness at points `[n, d]`; None where it has none."""
+        """Return the tangents of the robustness at points `[n, d]`; None if it has none."""
         points = self.nominal.settle(points)
         keys = [point.tobytes() for point in points]
         if self.differentiable:
@@ -140,21 +140,21 @@ class Candidates:
         assert verdicts.gradient is not None
         free = np.array(self.nominal.cube.levels) == 0
         gradients = np.where(free, verdicts.gradient, 0.0).astype(np.float64)
-        for key, point, rho, gradient in zip(keys, points, verdicts.least, gradients, strict=True):
+        for key, point, rho, gradient in zip(keys, points, verdicts.lowest, gradients, strict=True):
             if np.isfinite(rho) and np.all(np.isfinite(gradient)) and np.any(gradient):
                 self._tangents_at[key] = Tangent(point.astype(np.float64), float(rho), gradient)
 
     def _accepted(self, points: Float[np.ndarray, "n d"], order: list[int]) -> list[int]:
-        if self.most_items is not None and order:
+        if self.max_items is not None and order:
             items = self.nominal.items(points[order])
-            order = [i for i, n in zip(order, items, strict=True) if n <= self.most_items]
+            order = [i for i, n in zip(order, items, strict=True) if n <= self.max_items]
         if self.nominal.space.where is None or not order:
             return order
-        accepted_places = []
+        accepted_indices = []
         for start in range(0, len(order), BATCH):
             part = order[start : start + BATCH]
             block = np.zeros((BATCH, points.shape[1]), np.float32)
             block[: len(part)] = points[part]
             accepted = np.asarray(self.nominal.space.accepts_points(block))[: len(part)]
-            accepted_places += [i for i, good in zip(part, accepted, strict=True) if good]
-        return accepted_places
+            accepted_indices += [i for i, good in zip(part, accepted, strict=True) if good]
+        return accepted_indices

@@ -48,7 +48,7 @@ class SavedCounterexample:
     - `robustness`: of each formula, as simulated.
     - `seed`, `row`: of the run and in its table: they decide the random key of the simulation.
     - `precision`, `backend`: that it was simulated with.
-    - `verdict`: of closer replays of the row that it came from; empty where there were none.
+    - `verdict`: of closer replays of the row that it came from; empty if there were none.
     - `changed`: what departs from nominal, `[nominal, value]` by coordinate, where it was shrunk.
     - `found`: the search, its budget, the number of simulations, the version, and the `sources`:
       what the model was made of, as a run records it.
@@ -127,9 +127,9 @@ def _is_real(value: Any) -> bool:
     return abs(value) <= sys.float_info.max  # Neither NaN nor an integer beyond all floats.
 
 
-def _is_up_to(most: int) -> Callable[[object], bool]:
+def _is_up_to(maximum: int) -> Callable[[object], bool]:
     def fits(value: object) -> bool:
-        return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most
+        return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= maximum
 
     return fits
 
@@ -159,14 +159,14 @@ _FORMS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "changed": (lambda value: value is None or _maps_to(_is_pair)(value), "an object of pairs"),
     "found": (lambda value: isinstance(value, dict), "an object"),
 }
-"""For each entry of a file whether a value can be it, and what it must be, in words."""
+"""For each entry of a file whether a value can be it, and what it must be, as text."""
 
 
 def save_counterexamples(
     run: Run,
     folder: str | Path,
     *,
-    most: int = 5,
+    max_count: int = 5,
     shrink: bool = True,
     budget: int = 1000,
 ) -> list[Path]:
@@ -180,7 +180,7 @@ def save_counterexamples(
 
     - `run`: with its problem.
     - `folder`: it is made where there is none; files that are there already stay.
-    - `most`: counterexamples at most.
+    - `max_count`: counterexamples at most.
     - `shrink`: whether each is first shrunk towards the nominal features, where these are known.
     - `budget`: simulations to shrink one with, at most.
 
@@ -189,7 +189,7 @@ def save_counterexamples(
     **Raises:** `ValueError` for a run without its problem or without a counterexample.
     """
     problem = problem_of(run)
-    check_count("most", most)
+    check_count("max_count", max_count)
     check_count("budget", budget)
     claimed = run.table.counterexamples
     if not len(claimed):
@@ -201,9 +201,9 @@ def save_counterexamples(
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     paths: dict[Path, None] = {}
-    for place in _spread(points, most):
-        row = int(ordered.index[place])
-        features = {name: ordered.iloc[place][name] for name in problem.space.columns}
+    for index in _spread(points, max_count):
+        row = int(ordered.index[index])
+        features = {name: ordered.iloc[index][name] for name in problem.space.columns}
         changed = None
         if problem.black_box:
             # What was not repeated in the run may not come again: it is no regression test then.
@@ -224,11 +224,11 @@ def save_counterexamples(
         seen = replay(problem, features, run_keys(run.seed)[1], row, run.precision)
         if not seen.violated:
             # Shrinking in another precision, or rounding in the table, must not claim too much.
-            features, changed = {name: ordered.iloc[place][name] for name in features}, None
+            features, changed = {name: ordered.iloc[index][name] for name in features}, None
             seen = replay(problem, features, run_keys(run.seed)[1], row, run.precision)
         if not seen.violated:
             continue
-        verdict = str(ordered.iloc[place]["verdict"]) if "verdict" in ordered else ""
+        verdict = str(ordered.iloc[index]["verdict"]) if "verdict" in ordered else ""
         saved = SavedCounterexample(
             problem=run.name,
             target=run.target,
@@ -270,14 +270,14 @@ def read_corpus(folder: str | Path) -> tuple[dict[Path, SavedCounterexample], di
 
     **Raises:** `FileNotFoundError` where there is no such place.
     """
-    place = Path(folder)
-    if not place.exists():
-        raise FileNotFoundError(f"there is no corpus of counterexamples in {place}")
-    paths = [place]
-    if place.is_dir():
-        below = (path.relative_to(place) for path in sorted(place.rglob("*")))
+    location = Path(folder)
+    if not location.exists():
+        raise FileNotFoundError(f"there is no corpus of counterexamples in {location}")
+    paths = [location]
+    if location.is_dir():
+        below = (path.relative_to(location) for path in sorted(location.rglob("*")))
         seen = (path for path in below if not any(part.startswith(".") for part in path.parts))
-        paths = [place / path for path in seen if path.suffix.lower() == ".json"]
+        paths = [location / path for path in seen if path.suffix.lower() == ".json"]
     entries, damaged = {}, {}
     for path in paths:
         try:
@@ -299,11 +299,11 @@ def renamed(features: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, 
     return result
 
 
-def _spread(points: Any, most: int) -> list[int]:
+def _spread(points: Any, maximum: int) -> list[int]:
     """Return places of points, the first and then each time the one farthest from those before."""
     chosen = [0]
     distance = np.linalg.norm(points - points[0], axis=1)
-    while len(chosen) < min(most, len(points)):
+    while len(chosen) < min(maximum, len(points)):
         farthest = int(np.argmax(distance))
         if distance[farthest] <= 0:
             break

@@ -144,10 +144,10 @@ def _control_points(i: Influence, rho: float) -> str:
     if alone:
         return f" Its part {format_spans(alone)} alone does it."
     gain = np.nan_to_num(i.each - rho)
-    most = gain.max(initial=0.0)
-    if most <= 0:
+    maximum = gain.max(initial=0.0)
+    if maximum <= 0:
         return " No part of it does it alone."
-    strong = [span for span, g in zip(i.spans, gain, strict=True) if g > 0.3 * most]
+    strong = [span for span, g in zip(i.spans, gain, strict=True) if g > 0.3 * maximum]
     return f" No part of it does it alone; what counts most is {format_spans(strong)}."
 
 
@@ -164,7 +164,7 @@ def format_spans(spans: list[Span]) -> str:
 
 
 def describe_gradient(influences: Sequence[Influence]) -> str:
-    """Write which small change helps most; empty where no gradient is known."""
+    """Write which small change helps most; empty if no gradient is known."""
     changes = [
         (abs(change), i, k)
         for i in influences
@@ -178,9 +178,9 @@ def describe_gradient(influences: Sequence[Influence]) -> str:
     what = i.name if len(i.gradient) == 1 else i.coordinates[k]
     if i.spans is not None:
         what = f"{i.name} {format_spans([i.spans[k]])}"
-    way = "less" if slope < 0 else "more"
+    direction = "less" if slope < 0 else "more"
     return (
-        f"A small change helps most in {what}: {way} of it raises the robustness by about "
+        f"A small change helps most in {what}: {direction} of it raises the robustness by about "
         f"{format_number(abs(slope), 3)} for each unit, near this value."
     )
 

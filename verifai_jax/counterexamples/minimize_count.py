@@ -37,8 +37,8 @@ def revert_features(candidates: Candidates, u: Point) -> Point:
         changed = np.flatnonzero(nominal.moved(u[None])[0])
         if not len(changed):
             return u
-        groups = [np.intersect1d(places, changed) for _, places in nominal.groups]
-        sets = [places for places in groups if 1 < len(places) < len(changed)]
+        groups = [np.intersect1d(coordinates, changed) for _, coordinates in nominal.groups]
+        sets = [coordinates for coordinates in groups if 1 < len(coordinates) < len(changed)]
         if len(changed) > 24:
             sets += [part for n in (2, 4, 8) for part in np.array_split(changed, n)]
         sets += [changed[i : i + 1] for i in range(len(changed))]
@@ -60,19 +60,19 @@ def revert_features(candidates: Candidates, u: Point) -> Point:
             others = revert(candidates, u, more)
             tried = np.concatenate([tried, others])
             failing = np.concatenate([failing, candidates(others)[1]])
-        u = least_departure(candidates, tried[failing])
+        u = smallest_departure(candidates, tried[failing])
     return u
 
 
 def revert(candidates: Candidates, u: Point, sets: list[np.ndarray]) -> Points:
     """Return the point with each of these sets of coordinates back at nominal."""
     points = np.repeat(u[None], len(sets), axis=0)
-    for point, places in zip(points, sets, strict=True):
-        point[places] = candidates.nominal.u[places]
+    for point, coordinates in zip(points, sets, strict=True):
+        point[coordinates] = candidates.nominal.u[coordinates]
     return points
 
 
-def least_departure(candidates: Candidates, points: Points) -> Point:
+def smallest_departure(candidates: Candidates, points: Points) -> Point:
     """Return the point with the fewest departures, and of those the nearest."""
     order = np.lexsort((candidates.nominal.distance(points), candidates.nominal.count(points)))
     return points[order[0]]
@@ -86,14 +86,14 @@ def trial_values(candidates: Candidates, i: int) -> list[float]:
     else:
         cells = np.unique(np.linspace(0, cube.levels[i] - 1, min(cube.levels[i], 8)).astype(int))
         every = np.zeros((len(cells), len(cube.discrete)), int)
-        place = int(np.flatnonzero(cube.discrete == i)[0])
-        every[:, place] = cells
-        values = candidates.nominal.centres(every)[:, place]
+        index = int(np.flatnonzero(cube.discrete == i)[0])
+        every[:, index] = cells
+        values = candidates.nominal.centres(every)[:, index]
     return [float(v) for v in values if np.float32(v) != candidates.nominal.u[i]]
 
 
-def grow(candidates: Candidates, starts: Points, most: int) -> Results:
-    """Search failing points with `most` departures at most, from nominal on; perhaps none."""
+def grow(candidates: Candidates, starts: Points, maximum: int) -> Results:
+    """Search failing points with `maximum` departures at most, from nominal on; perhaps none."""
     nominal = candidates.nominal
     d = nominal.space.dim
     pairs = [(i, value) for i in range(d) for value in trial_values(candidates, i)]
@@ -105,7 +105,7 @@ def grow(candidates: Candidates, starts: Points, most: int) -> Results:
     for point, (i, value) in zip(points, pairs, strict=True):
         point[i] = value
     rho, failing = candidates(points)
-    if failing.any() or most < 2:
+    if failing.any() or maximum < 2:
         return points[failing]
     # Of each coordinate the two best values, the best coordinates first.
     ranked = np.argsort(rho)
@@ -115,7 +115,7 @@ def grow(candidates: Candidates, starts: Points, most: int) -> Results:
         if len(offered.setdefault(i, [])) < 2:
             offered[i].append(value)
     beam = distinct_sets(candidates, points[ranked])[:BEAM]
-    for _ in range(2, most + 1):
+    for _ in range(2, maximum + 1):
         if candidates.left <= 0:
             break
         longer = []
@@ -155,7 +155,7 @@ def distinct_sets(candidates: Candidates, points: Points) -> Results:
 
 
 def exchange(candidates: Candidates, u: Point, rng: np.random.Generator) -> Point | None:
-    """Search a failing point with one departure less than `u`; None where none is found.
+    """Search a failing point with one departure less than `u`; None if none is found.
 
     The other coordinates are pushed away from nominal, along the gradient of the robustness, and at
     random, three rounds, with more for the sets that came nearest to a failure.
@@ -170,20 +170,20 @@ def exchange(candidates: Candidates, u: Point, rng: np.random.Generator) -> Poin
     for turn in range(3):
         each = int(np.clip((96, 96, 96)[turn] // len(smaller), 4, 32))
         tried = []
-        for tangent, centre, places in zip(
+        for tangent, centre, coordinates in zip(
             candidates.tangents(centres), centres, smaller, strict=True
         ):
-            tried.append(push(candidates, centre, places, tangent, each, width, rng))
+            tried.append(push(candidates, centre, coordinates, tangent, each, width, rng))
         owner = np.repeat(np.arange(len(smaller)), [len(part) for part in tried])
         points = nominal.settle(np.concatenate(tried))
         rho, failing = candidates(points)
         if failing.any():
-            return least_departure(candidates, points[failing])
+            return smallest_departure(candidates, points[failing])
         if candidates.left <= 0:
             return None
         # The half that came nearest, each from its best point on.
-        least = np.array([rho[owner == k].min() for k in range(len(smaller))])
-        kept = np.argsort(least)[: max(1, min(8, (len(smaller) + 1) // 2))]
+        lowest = np.array([rho[owner == k].min() for k in range(len(smaller))])
+        kept = np.argsort(lowest)[: max(1, min(8, (len(smaller) + 1) // 2))]
         centres = np.array([points[owner == k][np.argmin(rho[owner == k])] for k in kept])
         smaller = [smaller[k] for k in kept]
         width *= 0.4
@@ -193,7 +193,7 @@ def exchange(candidates: Candidates, u: Point, rng: np.random.Generator) -> Poin
 def push(
     candidates: Candidates,
     centre: Point,
-    places: np.ndarray,
+    coordinates: np.ndarray,
     tangent: Tangent | None,
     count: int,
     width: float,
@@ -201,7 +201,7 @@ def push(
 ) -> Results:
     """Draw points that differ from `centre` in these coordinates only."""
     cube, u0 = candidates.nominal.cube, candidates.nominal.u
-    free = np.array([i for i in places if cube.levels[i] == 0], int)
+    free = np.array([i for i in coordinates if cube.levels[i] == 0], int)
     points = np.repeat(centre[None].astype(np.float64), count, axis=0)
     if len(free):
         away = np.sign(centre[free] - u0[free])
@@ -219,7 +219,7 @@ def push(
         corner = rng.random(noise.shape) < 0.3 * width
         noise = np.where(corner, (rng.random(noise.shape) < 0.5).astype(float), noise)
         rest[:, free] = noise
-    for i in places:
+    for i in coordinates:
         if cube.levels[i]:
             rows = rng.random(count) < 0.3
             points[rows, i] = rng.random(int(rows.sum()))
@@ -245,7 +245,7 @@ def minimize_count(candidates: Candidates, starts: Points, rng: np.random.Genera
         if not pool or candidates.left > enough:
             pool.append(revert_features(candidates, u))
     while candidates.left > 0:
-        u = least_departure(candidates, np.array(pool))
+        u = smallest_departure(candidates, np.array(pool))
         count = int(nominal.count(u[None])[0])
         if count <= 1:
             break

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from verifai_jax.counterexamples.candidates import Candidates, Tangent
-from verifai_jax.statistics.least_distance import shortest_in_box
+from verifai_jax.statistics.smallest_change import shortest_in_box
 
 Point = Float[np.ndarray, " d"]
 Points = Float[np.ndarray, "n d"]
@@ -113,21 +113,21 @@ def propose(candidates: Candidates, track: Track, count: int, rng: np.random.Gen
     """Propose about `count` points nearer to nominal than that of the track."""
     nominal = candidates.nominal
     levels = np.array(nominal.cube.levels)
-    places = np.flatnonzero(track.free & (levels == 0))
+    coordinates = np.flatnonzero(track.free & (levels == 0))
     u0 = nominal.u.astype(np.float64)
-    v = track.u.astype(np.float64)[places] - u0[places]
+    v = track.u.astype(np.float64)[coordinates] - u0[coordinates]
     length = float(np.linalg.norm(v))
     parts = [discrete_steps(candidates, track)]
     if length > 0:
         lines = segment_shares(track)
-        aims = boundary_steps(candidates, track, places, v)
+        aims = boundary_steps(candidates, track, coordinates, v)
         left = max(count - len(lines) - len(aims) - len(parts[0]), 6)
         ones = single_coordinates(track, v, left // 3, rng)
         near = random_directions(track, v, left - len(ones), rng)
         moved = np.concatenate([np.outer(lines, v), aims, ones, near])
         moved = moved[np.linalg.norm(moved, axis=1) < length]
         points = np.repeat(track.u[None].astype(np.float64), len(moved), axis=0)
-        points[:, places] = u0[places] + moved
+        points[:, coordinates] = u0[coordinates] + moved
         parts.append(points)
     return np.concatenate(parts)
 
@@ -140,19 +140,24 @@ def segment_shares(track: Track) -> Float[np.ndarray, " n"]:
 
 
 def boundary_steps(
-    candidates: Candidates, track: Track, places: Int[np.ndarray, " k"], v: Departure
+    candidates: Candidates, track: Track, coordinates: Int[np.ndarray, " k"], v: Departure
 ) -> Departures:
     """Return departures at, and on the way to, the nearest points of the linearised boundary."""
-    u0 = candidates.nominal.u.astype(np.float64)[places]
+    u0 = candidates.nominal.u.astype(np.float64)[coordinates]
     ends = np.zeros(len(track.u))
-    low, high = (ends + candidates.nominal.low)[places], (ends + candidates.nominal.high)[places]
-    tangents = track.tangents[-1:] or fit_tangent(candidates, track, places)
+    low, high = (
+        (ends + candidates.nominal.low)[coordinates],
+        (ends + candidates.nominal.high)[coordinates],
+    )
+    tangents = track.tangents[-1:] or fit_tangent(candidates, track, coordinates)
     targets = []
     for some in (tangents, track.tangents[-6:]) if len(track.tangents) > 1 else (tangents,):
-        rows = np.array([piece.gradient[places] for piece in some])
+        rows = np.array([piece.gradient[coordinates] for piece in some])
         if not len(rows) or not rows.any():
             continue
-        levels = np.array([p.gradient[places] @ (p.point[places] - u0) - p.value for p in some])
+        levels = np.array(
+            [p.gradient[coordinates] @ (p.point[coordinates] - u0) - p.value for p in some]
+        )
         nearest = shortest_in_box(rows, levels, low - u0, high - u0)
         if nearest is not None:
             targets.append(nearest)
@@ -160,7 +165,7 @@ def boundary_steps(
     if not targets:
         return np.zeros((0, len(v)))
     track.target = track.u.astype(np.float64)
-    track.target[places] = u0 + targets[0]
+    track.target[coordinates] = u0 + targets[0]
     steps = [
         stretch * ((1 - turn) * v + turn * target)
         for target in targets
@@ -171,19 +176,19 @@ def boundary_steps(
 
 
 def fit_tangent(
-    candidates: Candidates, track: Track, places: Int[np.ndarray, " k"]
+    candidates: Candidates, track: Track, coordinates: Int[np.ndarray, " k"]
 ) -> list[Tangent]:
-    """Fit a tangent to the points that were simulated nearby; none where they are too few."""
+    """Fit a tangent to the points that were simulated nearby; empty if they are too few."""
     others = np.ones(len(track.u), bool)
-    others[places] = False
+    others[coordinates] = False
     alike = np.isfinite(candidates.rho) & np.all(
         candidates.points[:, others] == track.u[others], axis=1
     )
-    points, rho = candidates.points[alike].astype(np.float64)[:, places], candidates.rho[alike]
-    k = len(places)
+    points, rho = candidates.points[alike].astype(np.float64)[:, coordinates], candidates.rho[alike]
+    k = len(coordinates)
     if len(points) < k + 2:
         return []
-    offsets = points - track.u[places]
+    offsets = points - track.u[coordinates]
     far = np.linalg.norm(offsets, axis=1)
     order = np.argsort(far)[: 3 * k + 4]
     offsets, rho, far = offsets[order], rho[order], far[order]
@@ -193,7 +198,7 @@ def fit_tangent(
     weighted = design * weight[:, None]
     solution = np.linalg.solve(weighted.T @ design + ridge, weighted.T @ rho)
     gradient = np.zeros(len(track.u))
-    gradient[places] = solution[1:]
+    gradient[coordinates] = solution[1:]
     if not np.all(np.isfinite(gradient)) or not gradient.any():
         return []
     return [Tangent(track.u.astype(np.float64), float(solution[0]), gradient)]
@@ -237,19 +242,19 @@ def discrete_steps(candidates: Candidates, track: Track) -> Points:
     nominal = candidates.nominal
     cube = nominal.cube
     tried = []
-    for place, i in enumerate(cube.discrete):
+    for index, i in enumerate(cube.discrete):
         if not track.free[i] or track.u[i] == nominal.u[i]:
             continue
-        here = int(nominal.cells(track.u)[place])
-        home = int(nominal.cells(nominal.u)[place])
+        here = int(nominal.cells(track.u)[index])
+        home = int(nominal.cells(nominal.u)[index])
         nearer = {home}
         if cube.ordered[i]:
             nearer |= {here + int(np.sign(home - here)), (here + home) // 2}
         for cell in nearer - {here}:
             point = track.u.astype(np.float64)
             cells = np.zeros((1, len(cube.discrete)), np.int32)
-            cells[0, place] = cell
-            point[i] = nominal.u[i] if cell == home else nominal.centres(cells)[0, place]
+            cells[0, index] = cell
+            point[i] = nominal.u[i] if cell == home else nominal.centres(cells)[0, index]
             tried.append(point)
     return np.array(tried).reshape(-1, nominal.space.dim)
 

@@ -111,7 +111,7 @@ class Nominal:
             middles = self.centres(cells)
             u[:, discrete] = np.where(same, self.u[discrete], middles)
         if self.space.items and len(u):
-            # Coordinates of items that there are not mean nothing, and do not depart; an item that
+            # Coordinates of items that do not exist mean nothing, and do not depart; an item that
             # comes back is nominal's.
             used = self._compiled(self.space.used, u)
             u = np.where(used, self._compiled(self.space.settle, u), self.u)
@@ -140,11 +140,11 @@ class Nominal:
 
     def centres(self, cells: Int[np.ndarray, "*n k"]) -> Float[np.ndarray, "*n k"]:
         """Return the middles of cells as coordinates."""
-        cube, places = self.cube, np.asarray(cells, np.int32)
+        cube, numbers = self.cube, np.asarray(cells, np.int32)
         if any(weights is not None for weights in cube.weights):
-            return np.asarray(cube.centres(places))  # pyright: ignore[reportArgumentType]
+            return np.asarray(cube.centres(numbers))  # pyright: ignore[reportArgumentType]
         counts = np.array([cube.levels[i] for i in cube.discrete], np.float32)
-        return ((places + np.float32(0.5)) / counts).astype(np.float32)
+        return ((numbers + np.float32(0.5)) / counts).astype(np.float32)
 
     def moved(self, points: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, "n d"]:
         """Return the coordinates of settled points that can be moved back to those of nominal."""
@@ -165,8 +165,8 @@ class Nominal:
         gap = np.abs(np.asarray(points, np.float64) - self.u)
         discrete = self.cube.discrete
         if len(discrete):
-            places = self.cells(points).astype(np.float64)
-            apart = np.abs(places - self.cells(self.u))
+            numbers = self.cells(points).astype(np.float64)
+            apart = np.abs(numbers - self.cells(self.u))
             steps = np.array([max(self.cube.levels[i] - 1, 1) for i in discrete])
             ordered = np.array([self.cube.ordered[i] for i in discrete])
             gap[:, discrete] = np.where(ordered, apart / steps, apart > 0)
@@ -185,8 +185,8 @@ class Nominal:
         """Return the number of items of each array of variable length, beyond the least."""
         lengths = list(self.cube.lengths)
         levels = np.array([self.cube.levels[i] for i in lengths], np.float32)
-        places = np.asarray(points, np.float32)[:, lengths] * levels
-        return np.clip(places.astype(int), 0, np.maximum(levels - 1, 0).astype(int))
+        numbers = np.asarray(points, np.float32)[:, lengths] * levels
+        return np.clip(numbers.astype(int), 0, np.maximum(levels - 1, 0).astype(int))
 
     def restored(self, u: Float[np.ndarray, " d"]) -> Float[np.ndarray, "n d"]:
         """Return a point with some or all of the items back that nominal has and it lacks."""

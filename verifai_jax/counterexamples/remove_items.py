@@ -36,9 +36,9 @@ def remove_items(candidates: Candidates, u: Float[np.ndarray, " d"]) -> Float[np
         points = nominal.restored(u)
         present = _present(candidates, u)
         drops = np.zeros((0, nominal.space.items), bool)
-        for places in _sets(present):
+        for removed in _sets(present):
             row = np.zeros((1, nominal.space.items), bool)
-            row[0, places] = True
+            row[0, removed] = True
             drops = np.concatenate([drops, row])
         if len(drops):
             points = np.concatenate([points, _without(candidates, u, drops)])
@@ -73,13 +73,13 @@ def _without(
 
 def _sets(present: Int[np.ndarray, " k"]) -> list[list[int]]:
     """Return sets of items to take away, all of them together among them."""
-    places = present.tolist()
-    count = len(places)
+    removed = present.tolist()
+    count = len(removed)
     if count <= EXHAUSTIVE:
-        return [list(chosen) for n in range(count, 0, -1) for chosen in combinations(places, n)]
+        return [list(chosen) for n in range(count, 0, -1) for chosen in combinations(removed, n)]
     runs = [
-        places[begin : begin + length]
+        removed[begin : begin + length]
         for length in range(count, 0, -1)
         for begin in range(0, count - length + 1, max(1, length // 4))
     ]
-    return runs + [list(pair) for pair in combinations(places, 2)]
+    return runs + [list(pair) for pair in combinations(removed, 2)]

@@ -64,8 +64,10 @@ def select_row(run: Run, row: Row) -> tuple[int, dict[str, Any]]:
     return number, entry
 
 
-def select_others(run: Run, nominal: Nominal, number: int, most: int) -> Float[np.ndarray, "n d"]:
-    """Return the points of other counterexamples than row `number`, `most` of them at most.
+def select_others(
+    run: Run, nominal: Nominal, number: int, maximum: int
+) -> Float[np.ndarray, "n d"]:
+    """Return the points of other counterexamples than row `number`, `maximum` of them at most.
 
     Where there are more, half of them are the nearest, and the rest is spread over the others.
     """
@@ -74,9 +76,9 @@ def select_others(run: Run, nominal: Nominal, number: int, most: int) -> Float[n
     if not len(failing):
         return np.zeros((0, nominal.space.dim), np.float32)
     order = np.argsort(_rough_distance(nominal, failing), kind="stable")
-    if len(order) > most:
-        half = most // 2
-        rest = np.linspace(half, len(order) - 1, most - half).astype(int)
+    if len(order) > maximum:
+        half = maximum // 2
+        rest = np.linspace(half, len(order) - 1, maximum - half).astype(int)
         order = np.concatenate([order[:half], order[rest]])
     return nominal.settle(nominal.space.points(failing.iloc[order]))
 

@@ -28,17 +28,17 @@ from verifai_jax.estimation.mixture import Mixture
 
 ONE = 0.25
 """Distance below which two least distant failures of different searches count as one."""
-MOST_CENTRES = 16
+MAX_CENTRES = 16
 """Regions that get components of their own, at most."""
 CHAINS_WORTH = 1.5
 """Independent failures that the states of one chain are worth."""
 FAR_WIDER = 3.0
 """Factor on those of a component for what few chains have not seen of a region."""
-MOST_DIRECTIONS = 8
+MAX_DIRECTIONS = 8
 """Directions that decide in a region, at most; with more of them it is bounded on all sides."""
 DIRECTION = 0.3
 """Part of the greatest singular value of the normals from which a direction counts."""
-LEAST_WEIGHT = 0.02
+MIN_WEIGHT = 0.02
 """Least weight of a chain or a centre, in parts of the greatest."""
 
 Around: TypeAlias = tuple[Gaussian, Gaussian, *tuple[Gaussian | Marginals, ...]]
@@ -102,7 +102,7 @@ class Anchors:
 
     @cached_property
     def _directions(self) -> tuple[Float[np.ndarray, "d p"] | None, ...]:
-        """Orthonormal directions that decide in each region; None where there are many, or none."""
+        """Orthonormal directions that decide in each region; None if there are many, or none."""
         if not self.chains.normals:
             return (None,) * len(self.regions)
         return tuple(
@@ -138,16 +138,16 @@ class Anchors:
 
 
 def _span(normals: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "d p"] | None:
-    """Return orthonormal directions that span normals; None where they are many, or none."""
+    """Return orthonormal directions that span normals; None if they are many, or none."""
     _, size, rows = np.linalg.svd(normals, full_matrices=False)
     rank = int(np.sum(size > DIRECTION * size.max(initial=0.0)))
-    return rows[:rank].T if 0 < rank <= min(MOST_DIRECTIONS, normals.shape[1] - 1) else None
+    return rows[:rank].T if 0 < rank <= min(MAX_DIRECTIONS, normals.shape[1] - 1) else None
 
 
 def anchors_of(explorations: Sequence[Exploration], defensive: float) -> Anchors:
     """Return the anchors of explorations: their regions, the least distant ones if many."""
     joined = join_explorations(explorations)
-    return Anchors(joined, tuple(_regions(joined)[:MOST_CENTRES]), defensive)
+    return Anchors(joined, tuple(_regions(joined)[:MAX_CENTRES]), defensive)
 
 
 def join_explorations(explorations: Sequence[Exploration]) -> Exploration:
@@ -188,4 +188,4 @@ def _regions(exploration: Exploration) -> list[Int[np.ndarray, " chains"]]:
 def weigh_chains(exploration: Exploration) -> Float[np.ndarray, " m"]:
     """Weigh chains by the prior at their least distant failure, tempered and bounded below."""
     norms = np.sum(exploration.nearest**2, axis=1)
-    return np.maximum(np.exp((norms.min() - norms) / 4), LEAST_WEIGHT)
+    return np.maximum(np.exp((norms.min() - norms) / 4), MIN_WEIGHT)

@@ -55,7 +55,7 @@ def approach_corner(
             if size and np.isfinite(value):
                 offset = (float(slope @ beyond[row]) - float(value)) / size
                 touching[row].append((slope / size, offset))
-                within = _least_distant(touching[row])
+                within = _nearest(touching[row])
                 target[row] = best[row] if within is None else within
         rows = np.flatnonzero(np.sum(target**2, axis=1) < np.sum(best**2, axis=1))
         if not len(rows):
@@ -75,7 +75,7 @@ def cost_of_corner(planes: int = PLANES, halvings: int = HALVINGS) -> int:
     return planes * (halvings + 3)
 
 
-def _least_distant(
+def _nearest(
     planes: list[tuple[Float[np.ndarray, " d"], float]],
 ) -> Float[np.ndarray, " d"] | None:
     """Return the point nearest to the origin on the inner side of all planes; None without one."""

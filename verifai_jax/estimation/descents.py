@@ -35,11 +35,11 @@ FAR = 4.0
 """Standard deviations from the middle of the prior at which failures are rare."""
 DRAWN, DRAWN_WITH_SLOPES = 0.2, 0.33
 """Starts that are drawn together, in parts of the simulations; the most promising descend first."""
-MOST_DRAWN = 2048
+MAX_DRAWN = 2048
 """Starts that are drawn together, at most, since all are compared with one another."""
 HITS = 0.02
 """Starts that fail themselves and count as ends, at most, in parts of the simulations."""
-FEWEST_AT_ONCE, MOST_AT_ONCE = 16, 128
+MIN_AT_ONCE, MAX_AT_ONCE = 16, 128
 """Descents that are side by side."""
 STEPS, FURTHER_STEPS = 60, 12
 """Steps of a descent without gradients, at most, and of one that gradients have led nowhere."""
@@ -49,7 +49,7 @@ SAME_PLANE, ENOUGH = 0.07, 8
 """Distance of planes below which they are one, and descents to one after which no more go on."""
 LONGEST = 3.0
 """Length of a step with gradients, at most."""
-MOST_POWER = 4.0
+MAX_POWER = 4.0
 """Power of the way that is left like which the robustness falls, at most."""
 FELL, STRAIGHT = 0.9, 0.9
 """Part to which a step has lowered the robustness that says something of the power, and the cosine
@@ -105,17 +105,17 @@ class _Descents:
 def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulations: int) -> Ends:
     """Descend from as many starts as the simulations allow, a few more at most.
 
-    **Returns:** the failures; none where no descent found one.
+    **Returns:** the failures; empty if no descent found one.
 
     **Raises:** `Ended` where time is over.
     """
     begin = limit_state.simulations
     share = DRAWN if limit_state.gradient is None else DRAWN_WITH_SLOPES
-    drawn = min(max(FEWEST_AT_ONCE, round(share * simulations)), MOST_DRAWN)
+    drawn = min(max(MIN_AT_ONCE, round(share * simulations)), MAX_DRAWN)
     starts = _begin(limit_state, draw_starts(limit_state, rng, drawn))
     hits = np.flatnonzero(starts.score == -np.inf)[: max(8, round(HITS * simulations))]
     others = np.flatnonzero(starts.score > -np.inf)
-    worse = _worse_neighbours(_places_ahead(limit_state, starts), starts.score)
+    worse = _worse_neighbours(_points_ahead(limit_state, starts), starts.score)
     others = others[np.argsort(-worse[others], kind="stable")]
     # Far out, where they lie, several regions overlap.
     failing = starts.of(hits)
@@ -123,7 +123,7 @@ def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulat
     if limit_state.gradient is not None:
         failing = _begin(limit_state, failing.z)
     points, feet = [failing.z], [failing.feet]
-    count, before, begun = FEWEST_AT_ONCE, limit_state.simulations, 0
+    count, before, begun = MIN_AT_ONCE, limit_state.simulations, 0
     while limit_state.simulations - begin < simulations:
         now, others = others[:count], others[count:]
         if len(now):
@@ -142,7 +142,7 @@ def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulat
         begun += len(descents.z)
         left = begin + simulations - limit_state.simulations
         count = left * begun // max(limit_state.simulations - before, 1)
-        count = min(max(count, FEWEST_AT_ONCE), MOST_AT_ONCE)
+        count = min(max(count, MIN_AT_ONCE), MAX_AT_ONCE)
     return Ends(np.concatenate(points), np.concatenate(feet))
 
 
@@ -178,7 +178,7 @@ def _planes(feet: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n coordinates"
     return np.concatenate([feet, FAR * feet / np.maximum(norms, 1e-9)], axis=1)
 
 
-def _places_ahead(limit_state: LimitState, descents: _Descents) -> Float[np.ndarray, "n d"]:
+def _points_ahead(limit_state: LimitState, descents: _Descents) -> Float[np.ndarray, "n d"]:
     """Return where the slope at each point says that the limit state is; the point without one.
 
     It is looked for no farther than one step leads.
@@ -281,7 +281,7 @@ def _descend_by_gradient(
         fell &= (new.score > 0) & (new.score < FELL * score)
         lower = rows[fell]
         exponent = np.log(slopes[lower] / slope[fell]) / np.log(new.score[fell] / score[fell])
-        estimate = 1 / np.clip(1 - exponent, 1 / MOST_POWER, 1.0)
+        estimate = 1 / np.clip(1 - exponent, 1 / MAX_POWER, 1.0)
         # Where the way turns, another part of the system may have a slope of its own.
         straight_on = np.sum(directions[lower] * direction[fell], axis=1) > STRAIGHT
         power[lower] = np.where(straight_on, estimate, np.sqrt(power[lower] * estimate))

@@ -120,7 +120,7 @@ class DoublePrecisionEvaluator:
         self, u: Float[np.ndarray, "n d"]
     ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
         verdicts = self._evaluator(self._plain(u))
-        return verdicts.least, verdicts.violated, verdicts.proper
+        return verdicts.lowest, verdicts.violated, verdicts.proper
 
     def gradient(
         self, u: Float[np.ndarray, "n d"]
@@ -144,14 +144,14 @@ class DoublePrecisionEvaluator:
         first = self._evaluator.simulations
         verdicts = self._differentiated(self._plain(u), TEMPERATURE, first)
         self._evaluator.simulations = first + len(u)
-        return verdicts.least, verdicts.violated, verdicts.proper, self._by_cube(u, verdicts)
+        return verdicts.lowest, verdicts.violated, verdicts.proper, self._by_cube(u, verdicts)
 
     def held(
         self, u: Float[np.ndarray, "n d"], numbers: Int[np.ndarray, " n"]
     ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
         """Evaluate points, each with the random key of an earlier simulation by its number."""
         verdicts = self._held_keys(self._plain(u), numbers)
-        return verdicts.least, verdicts.violated, verdicts.proper
+        return verdicts.lowest, verdicts.violated, verdicts.proper
 
     def gradient_held(
         self, u: Float[np.ndarray, "n d"], numbers: Int[np.ndarray, " n"]
@@ -163,7 +163,7 @@ class DoublePrecisionEvaluator:
     ]:
         """Evaluate points with the random keys of earlier simulations, and differentiate."""
         verdicts = self._held_slopes(self._plain(u), numbers, TEMPERATURE)
-        return verdicts.least, verdicts.violated, verdicts.proper, self._by_cube(u, verdicts)
+        return verdicts.lowest, verdicts.violated, verdicts.proper, self._by_cube(u, verdicts)
 
     @cached_property
     def _held_keys(self) -> "HeldKeys":

@@ -61,11 +61,11 @@ A_PART = 4
 """Simulations for each doubling of the coordinates, about, to find those that decide."""
 IMPROBABLE = 20.0
 """Logarithm of the prior's density beside the greatest, below which a region is left out."""
-FEWEST_CHAINS, MOST_CHAINS = 8, 256
+MIN_CHAINS, MAX_CHAINS = 8, 256
 """Chains, at least, where there are as many ends, and at most."""
 MERGES, NEIGHBOURS = 3, 4
 """Times that groups of ends are compared, and others with which each is, the nearest first."""
-COMPARED, MOST_COMPARED = 0.4, 512
+COMPARED, MAX_COMPARED = 0.4, 512
 """Ends that are compared with one another, in parts of the simulations for that, and at most."""
 
 
@@ -95,7 +95,7 @@ def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int)
 
     - `simulations`: number of them, about.
 
-    **Returns:** the failures; none where no descent found one.
+    **Returns:** the failures; empty if no descent found one.
 
     **Raises:** `Ended` where time is over.
     """
@@ -111,7 +111,7 @@ def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int)
     cost += (HALVINGS + 3 * (FIRST_STEPS + NEAREST_STEPS) + corners) * differentiates
     telling = round(TELLING_APART * simulations)
     left = simulations - telling - (limit_state.simulations - begin)
-    chains = min(max(FEWEST_CHAINS, left // cost), MOST_CHAINS, len(ends.points))
+    chains = min(max(MIN_CHAINS, left // cost), MAX_CHAINS, len(ends.points))
     rows, groups = _choose_ends(limit_state, ends, chains, telling)
     z = ends.points[rows]
     if differentiates:
@@ -150,8 +150,8 @@ def _choose_ends(
 
     **Returns:** rows of ends, and the region of each.
     """
-    most = max(chains, round(COMPARED * simulations))
-    rows = _spread_out(ends, min(most, MOST_COMPARED))
+    maximum = max(chains, round(COMPARED * simulations))
+    rows = _spread_out(ends, min(maximum, MAX_COMPARED))
     gaps = _gaps(ends, rows, rows)
     gaps[np.triu_indices(len(rows))] = np.inf
     group = _joined(limit_state, ends.points[rows], np.argsort(gaps, axis=1)[:, :LINKS])
@@ -222,17 +222,17 @@ def _joined(
     known: Int[np.ndarray, " k"] | None = None,
 ) -> Int[np.ndarray, " k"]:
     """Return numbers `[k]` of groups of failures: joined to others where the middle fails."""
-    places = np.arange(len(z))
-    group = places.copy() if known is None else known.copy()
+    indices = np.arange(len(z))
+    group = indices.copy() if known is None else known.copy()
     for other in others.T:
-        tried = np.flatnonzero((other < places) & (group[other] != group))
+        tried = np.flatnonzero((other < indices) & (group[other] != group))
         middle = (z[tried] + z[other[tried]]) / 2
         for row in tried[fails_at(limit_state, middle)]:
             group[group == group[row]] = group[other[row]]
     return np.unique(group, return_inverse=True)[1]
 
 
-def _spread_out(ends: Ends, most: int) -> Int[np.ndarray, " k"]:
+def _spread_out(ends: Ends, maximum: int) -> Int[np.ndarray, " k"]:
     """Return ends far from one another, the least distant first; no two that are one."""
     everything = np.arange(len(ends.points))
     nearest = int(np.linalg.norm(ends.points, axis=1).argmin())
@@ -240,7 +240,7 @@ def _spread_out(ends: Ends, most: int) -> Int[np.ndarray, " k"]:
     def gaps_from(row: int) -> Float[np.ndarray, " n"]:
         return _gaps(ends, everything, np.array([row]))[:, 0]
 
-    return farthest_first(nearest, gaps_from, most, SAME)
+    return farthest_first(nearest, gaps_from, maximum, SAME)
 
 
 def _squares(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n 1"]:

@@ -38,11 +38,11 @@ CELLS = 48
 
 def effective_size(weight: Float[np.ndarray, " n"]) -> float:
     """Return the number of equally weighted points that these weights are worth."""
-    most = weight.max(initial=0.0)
-    if not most > 0:
+    maximum = weight.max(initial=0.0)
+    if not maximum > 0:
         return 0.0
     # Of the largest, so that squares of small ones do not all vanish.
-    parts = weight / most
+    parts = weight / maximum
     return float(parts.sum() ** 2 / np.sum(parts * parts))
 
 
@@ -195,7 +195,7 @@ def fit_copula(
     steps: Marginals,
     worth: float = 1.0,
 ) -> Copula | None:
-    """Join marginals by the correlations beyond sampling noise; None where there are none."""
+    """Join marginals by the correlations beyond sampling noise; None if there are none."""
     d, size = z.shape[1], effective_size(weight) * worth
     v = rank_scores(steps, z)
     centred = v - weight @ v
@@ -230,8 +230,8 @@ def fit_marginals(
     size = effective_size(weight) * worth
     if len(z) > KERNELS:
         # Equally many points in each part of the weight: the same density with less work.
-        places = (np.arange(KERNELS) + 0.5) / KERNELS
-        rows = np.searchsorted(np.cumsum(weight), places * weight.sum())
+        quantiles = (np.arange(KERNELS) + 0.5) / KERNELS
+        rows = np.searchsorted(np.cumsum(weight), quantiles * weight.sum())
         z, weight = z[np.minimum(rows, len(z) - 1)], np.full(KERNELS, 1 / KERNELS)
     edges, logs, masses = [], [], []
     flat = (np.array([-np.inf, np.inf]), np.zeros(1), np.ones(1))
@@ -285,8 +285,8 @@ def _steps(
     best = 0.0
     chosen = (np.array([-np.inf, np.inf]), np.zeros(1), np.ones(1))
     # Counted once, in the finest borders, of which the others are sums.
-    place = np.clip(np.searchsorted(_FINEST, u, side="right") - 1, 0, len(_FINEST) - 2)
-    fine = np.append(0, np.cumsum(np.bincount(place, weight, len(_FINEST) - 1)))
+    index = np.clip(np.searchsorted(_FINEST, u, side="right") - 1, 0, len(_FINEST) - 2)
+    fine = np.append(0, np.cumsum(np.bincount(index, weight, len(_FINEST) - 1)))
     for border, among in zip(_BORDERS, _AMONG, strict=True):
         k = len(border) - 1
         if k > size:
@@ -315,11 +315,11 @@ def fit_shell(
     inner = np.unique(np.interp(np.arange(1, steps) / steps, total, score[order]))
     low, high = score.min() - 0.05, score.max() + 0.3
     edges = np.unique(np.concatenate([[-np.inf, low], inner, [high, np.inf]]))
-    place = np.clip(np.searchsorted(edges, score, side="right") - 1, 0, len(edges) - 2)
+    index = np.clip(np.searchsorted(edges, score, side="right") - 1, 0, len(edges) - 2)
     below, above = edges[:-1], edges[1:]
     width = np.where(below > 0, ndtr(-below) - ndtr(-above), ndtr(above) - ndtr(below))
     width = np.maximum(width, 1e-300)
-    mass = (np.bincount(place, weight, len(width)) * size + 0.5) / (size + 0.5 * len(width))
+    mass = (np.bincount(index, weight, len(width)) * size + 0.5) / (size + 0.5 * len(width))
     # Outside of all points the prior's own density is enough.
     mass[0], mass[-1] = min(mass[0], width[0]), min(mass[-1], max(width[-1], 0.01))
     mass = mass / mass.sum()

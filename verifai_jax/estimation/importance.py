@@ -32,13 +32,13 @@ from verifai_jax.estimation.normal_space import Ended, LimitState, Scores
 
 SHARE_OF_STAGE = 0.1
 """Share of the simulations for each stage that improves the proposal before it is frozen."""
-MOST_STAGES = 5
+MAX_STAGES = 5
 """Stages that improve the proposal, at most."""
 KEPT = 0.25
 """Share of the previous proposal in the next one, so that no stage can spoil it."""
 ANCHORED = 0.1
 """Share of the anchors in a proposal, so that no stage forgets a region that a search has found."""
-LEAST_REGION = 1e-3
+MIN_REGION = 1e-3
 """Part of the failures as which a region counts at least, where shares are given out."""
 ENOUGH = 2500
 """Effective failures beyond which a further stage is not worth its simulations."""
@@ -175,7 +175,7 @@ def fit_proposal(
     size = max(1, int(SHARE_OF_STAGE * simulations))
     proposals, zs, failing = [], [], []
     effective, tail, before, left, probability = 0.0, np.inf, 0.0, simulations, 0.0
-    for stage in range(MOST_STAGES):
+    for stage in range(MAX_STAGES):
         z, _, scores, ratio, _ = draw(limit_state, rng, proposal, size)
         left -= size
         proposals.append(proposal)
@@ -232,7 +232,7 @@ def _share_out(
     """
     owner = anchors.owners(z)
     mass = np.bincount(owner, weight)
-    balanced = weight / np.maximum(mass, LEAST_REGION * mass.sum())[owner]
+    balanced = weight / np.maximum(mass, MIN_REGION * mass.sum())[owner]
     table = np.exp(log_ratios(anchored.components[1:], z))
     others = mixture.fitted_ratio(z) / (1 - mixture.shares[0])
     shares = optimal_shares(np.column_stack([others, table]), balanced / balanced.sum(), defensive)

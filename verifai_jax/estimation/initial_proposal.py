@@ -37,7 +37,7 @@ PATHS = 48
 """Failures from which paths are tried, at most."""
 TRIED, SPACING = 3, 4
 """Points of an exploration to which paths are tried: the nearest, the fifth, the ninth."""
-MOST_UNSEEN = 0.9
+MAX_UNSEEN = 0.9
 """Share of the failures that may count as missed by all explorations, at most."""
 
 
@@ -95,9 +95,9 @@ def compare_explorations(
     count, reached = len(proposals), share @ near
     lonely = near.sum(axis=1) <= 1
     alone = float(share @ lonely)
-    most = limit_state.left // (count * TRIED * COST_OF_PATHS)
-    if count > 1 and alone > WORTH_PATHS and most:
-        rows = rng.choice(len(z), min(most, PATHS), p=np.where(lonely, share, 0.0) / alone)
+    maximum = limit_state.left // (count * TRIED * COST_OF_PATHS)
+    if count > 1 and alone > WORTH_PATHS and maximum:
+        rows = rng.choice(len(z), min(maximum, PATHS), p=np.where(lonely, share, 0.0) / alone)
         joined = near[rows]
         with suppress(Ended):  # Then the paths that were simulated count.
             for number, points in enumerate(found):
@@ -105,7 +105,7 @@ def compare_explorations(
                 joined[far, number] = _leads_to(limit_state, z[rows[far]], points)
         reached = reached + alone * (joined.mean(axis=0) - near[rows].mean(axis=0))
         alone *= float(np.mean(joined.sum(axis=1) <= 1))
-    unseen = min(MOST_UNSEEN, (count - 1) / count * alone)
+    unseen = min(MAX_UNSEEN, (count - 1) / count * alone)
     return Agreement(np.clip(reached, 0.0, 1.0), alone, unseen)
 
 

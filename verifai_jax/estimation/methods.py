@@ -42,11 +42,11 @@ from verifai_jax.estimation.splitting import (
 
 COUNTED = 0.06
 """Relative error at which counting the failures of the prior is good enough."""
-LEAST_EFFECTIVE = 60
+MIN_EFFECTIVE = 60
 """Effective failures that importance sampling has to promise."""
-LEAST_OF_MOVED = 15
+MIN_OF_MOVED = 15
 """The same of the moved prior, whose weights have no such tail as those of fitted proposals."""
-FEWEST_COUNTED = 10
+MIN_COUNTED = 10
 """Failures of the first samples from which on their rate says what counting promises."""
 WORST_TAIL = 0.7
 """Tail index beyond which weighted samples are not relied on (Vehtari et al., 2024)."""
@@ -61,7 +61,7 @@ SHARE_OF_EXPLORATION, SHARE_WITH_GRADIENTS = 0.08, 0.12
 PRECISE, SHARE_BEYOND = 20_000, 0.25
 """Simulations that make an estimate precise, and the share of those beyond for each search with
 gradients: a region that none has found is the greater error then."""
-FEWEST_OF_EXPLORATION = 600
+MIN_EXPLORED = 600
 """Simulations of a search, below which it says too little to be worth them."""
 SHARE_OF_PATHS = 0.03
 """Share of the budget for paths between the failures of different searches."""
@@ -96,14 +96,14 @@ class Answer:
     """An answer of a method; fields are those of `Estimate`.
 
     - `prior`: counts of the independent samples of the prior that the bound rests on.
-    - `probability`: the estimate; None where none is claimed.
+    - `probability`: the estimate; None if none is claimed.
     - `low`, `high`: ends of the interval.
     - `method`: the method that gave the estimate.
     - `effective`, `relative_error`: precision of the estimate.
     - `diagnostics`: further numbers of the method.
-    - `notes`: surprises, in words.
+    - `notes`: sentences on anything surprising.
     - `drawn`: data of the pictures.
-    - `samples`: the weighted samples that the estimate rests on; None where there are none.
+    - `samples`: the weighted samples that the estimate rests on; None if there are none.
     - `nearest`: least distant failures `[m, d]` that the searches found.
     """
 
@@ -204,9 +204,9 @@ def estimate_by_importance_sampling(
                 limit_state, rng, points, chain_ids, limit_state.left, mix(proposals), anchors
             )
         counted = _promised_by_counting(limit_state, fitted, counts)
-        least = max(counted, LEAST_OF_MOVED if by_chance else 0)
-        few = not by_chance and fitted.effective * limit_state.left < LEAST_EFFECTIVE
-        if few or fitted.promise(limit_state.left) < least:
+        needed = max(counted, MIN_OF_MOVED if by_chance else 0)
+        few = not by_chance and fitted.effective * limit_state.left < MIN_EFFECTIVE
+        if few or fitted.promise(limit_state.left) < needed:
             answer = _without_proposal(limit_state, rng, plan, run, counts, fitted, counted)
             return _with_chance(answer, again, limit_state.own_chance)
         # A little is left over to see whether the searches agree.
@@ -238,7 +238,7 @@ def estimate_by_importance_sampling(
 
 def _promised_by_counting(limit_state: LimitState, fitted: FittedProposal, counts: Counts) -> float:
     """Return the failures that are likely counted, if all that is left samples the prior."""
-    many = counts.failures >= FEWEST_COUNTED
+    many = counts.failures >= MIN_COUNTED
     rate = counts.failures / counts.simulations if many else fitted.probability
     return rate * (limit_state.left + counts.simulations)
 
@@ -318,7 +318,7 @@ def _explore(limit_state: LimitState, rng: np.random.Generator) -> list[Explorat
     if limit_state.gradient is not None:
         beyond = SHARE_BEYOND * max(0, budget - PRECISE)
         simulations = round(SHARE_WITH_GRADIENTS * min(budget, PRECISE) + beyond)
-    if simulations < FEWEST_OF_EXPLORATION:
+    if simulations < MIN_EXPLORED:
         return []
     found = [explore(limit_state, rng, simulations) for _ in range(EXPLORATIONS)]
     return [exploration for exploration in found if len(exploration.points)]
@@ -495,14 +495,14 @@ def _bound_only(
     level = run.levels[-1] if run.levels else np.inf
     why = {
         "stuck": "the search found no failure: the robustness gets no lower than "
-        f"{limit_state.least:z.4g}, or has no slope to follow",
+        f"{limit_state.lowest:z.4g}, or has no slope to follow",
         "budget": f"the budget ended at robustness {level:z.4g}, which is reached with probability "
         f"{reached:z.1e}; failing is rarer, or impossible",
     }.get(run.stopped or "", f"ended ({run.stopped}) at robustness {level:z.4g}")
     counts = counts + monte_carlo.sample_prior(limit_state, rng, limit_state.left)
     answer = _monte_carlo_answer(counts, plan)
     answer.diagnostics = {"levels": list(run.levels), "fractions": list(run.fractions)}
-    if not np.isfinite(limit_state.least):
+    if not np.isfinite(limit_state.lowest):
         pass  # No simulation had a verdict, of which there is a note.
     elif limit_state.failures == 0:
         answer.notes.insert(0, why)
@@ -523,7 +523,7 @@ def bound_from_pilot(limit_state: LimitState, plan: Plan) -> Answer:
 def _first_level(
     limit_state: LimitState, rng: np.random.Generator, plan: Plan
 ) -> FirstLevel | None:
-    """Simulate the first level, samples of the prior; None where time ends before it does."""
+    """Simulate the first level, samples of the prior; None if time ends before it does."""
     try:
         z = limit_state.sample_prior(rng, min(CHAIN * plan.chains, limit_state.left))
         scores = limit_state(z)

@@ -31,11 +31,11 @@ from verifai_jax.estimation.fitting import (
 
 MODES = (1, 2, 4, 8)
 """Numbers of clusters to try."""
-MOST_POINTS = 1500
+MAX_POINTS = 1500
 """Failures that one half of the components is fitted to, at most: more change the fit little."""
 TOGETHER = 0.3
 """Part of the shares that all points decide; points not fitted to decide the rest."""
-LEAST_SHARE = 5e-4
+MIN_SHARE = 5e-4
 """Share below which a component is dropped."""
 
 
@@ -78,7 +78,7 @@ class Mixture:
             ]
         )
         components = (*self.components, *other.components[1:])
-        keep = np.append(True, shares[1:] >= LEAST_SHARE)
+        keep = np.append(True, shares[1:] >= MIN_SHARE)
         shares[1:] *= (1 - shares[0]) / max(shares[1:][keep[1:]].sum(), 1e-12)
         return Mixture(
             tuple(c for c, use in zip(components, keep, strict=True) if use), shares[keep]
@@ -137,7 +137,7 @@ def fit_mixture(
     # what all points together say.
     together = optimal_shares(np.exp(log_ratios(components, z)), weight, defensive)
     share = np.array(crossed) / 2 * (1 - TOGETHER) + together * TOGETHER
-    keep = np.flatnonzero(share >= LEAST_SHARE)
+    keep = np.flatnonzero(share >= MIN_SHARE)
     shares = share[keep] / share[keep].sum() * (1 - defensive)
     return Mixture((Prior(d), *(components[i] for i in keep)), np.append(defensive, shares))
 
@@ -208,9 +208,9 @@ def _thin(
     z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, " m"]]:
     """Thin out weighted points, and scale their weights to sum one."""
-    if len(z) > MOST_POINTS:
+    if len(z) > MAX_POINTS:
         # The heaviest stay as they are: they are what a proposal must not miss.
-        chance = np.minimum(1.0, MOST_POINTS * weight / weight.sum())
+        chance = np.minimum(1.0, MAX_POINTS * weight / weight.sum())
         chance = np.maximum(chance, 0.02)
         keep = rng.random(len(z)) < chance
         z, weight = z[keep], (weight / chance)[keep]

@@ -21,7 +21,7 @@ from verifai_jax.estimation.components import Gaussian, Prior, log_ratios
 from verifai_jax.estimation.fitting import effective_size
 from verifai_jax.estimation.importance import (
     DEFENSIVE,
-    MOST_STAGES,
+    MAX_STAGES,
     SHARE_OF_STAGE,
     FittedProposal,
     draw,
@@ -106,7 +106,7 @@ def share_out(
     zs: list[np.ndarray] = []
     proposals: list[Mixture] = []
     weight = np.zeros(0)
-    for _ in range(MOST_STAGES - 2):
+    for _ in range(MAX_STAGES - 2):
         z, _, scores, *_ = draw(limit_state, rng, proposal, size)
         zs.append(z[scores.failing])
         counts.append(len(z))

@@ -21,7 +21,7 @@ WIDTH = np.sqrt(12.0)
 """Width of the unit interval in standard deviations of the uniform distribution."""
 NEAREST_FACE = 0.01
 """Part of the way to an end of the interval that a step leaves, at least."""
-_LEAST = 1e-300
+_MIN_DENSITY = 1e-300
 
 
 def natural_slopes(
@@ -36,7 +36,7 @@ def natural_slopes(
     - `uniform`: True at coordinates of a uniform feature.
     """
     density = np.exp(-z * z / 2) / np.sqrt(2 * np.pi)
-    return np.where(uniform, gradient / np.maximum(WIDTH * density, _LEAST), gradient)
+    return np.where(uniform, gradient / np.maximum(WIDTH * density, _MIN_DENSITY), gradient)
 
 
 def move_naturally(
@@ -50,7 +50,7 @@ def move_naturally(
         return z + steps
     # Measured from the nearer end, where the distance is known to all digits.
     side = np.where(z > 0, -1.0, 1.0)
-    begin = np.maximum(ndtr(-np.abs(z)), _LEAST)
+    begin = np.maximum(ndtr(-np.abs(z)), _MIN_DENSITY)
     end = begin + side * steps / WIDTH
     end = np.clip(end, NEAREST_FACE * begin, 1 - NEAREST_FACE * (1 - begin))
     return np.where(uniform, side * ndtri(end), z + steps)

@@ -32,7 +32,7 @@ Differentiate: TypeAlias = Callable[
 ]
 """The same, and the gradient `[n, d]` of the robustness by the coordinates of the unit cube."""
 
-MOST_DRAWN = 4_000_000
+MAX_DRAWN = 4_000_000
 """Points drawn from the prior in search of accepted ones, at most, for each one wanted."""
 _CONSTRAINT_BATCH = 4096
 """Points of one call of the constraint, so that one shape compiles."""
@@ -115,10 +115,10 @@ class LimitState:
         draws: bool = False,
         one_by_one: bool = False,
     ) -> None:
-        self.most = self.step = batch * together
+        self.max_step = self.step = batch * together
         self.one_by_one = one_by_one
         if one_by_one:
-            self.step = min(FIRST, self.most)
+            self.step = min(FIRST, self.max_step)
         self.evaluate, self.dim, self.budget, self.batch = evaluate, dim, budget, batch
         self.constraint, self.deadline, self.report = constraint, deadline, report
         self.gradient, self.draws = gradient, draws
@@ -128,7 +128,7 @@ class LimitState:
         """Simulations, failures and missing verdicts of the first samples of the prior."""
         self.own_chance = ""
         """A sentence on memory or chance that the system has beside its random key, if it has."""
-        self.least = np.inf
+        self.lowest = np.inf
         self.ended: str | None = None
 
     @property
@@ -161,7 +161,7 @@ class LimitState:
             z = z[self.accepts(z)][: n - count]
             accepted.append(z)
             count, drawn = count + len(z), drawn + _CONSTRAINT_BATCH
-            if drawn > MOST_DRAWN and count < n * drawn / (100 * MOST_DRAWN):
+            if drawn > MAX_DRAWN and count < n * drawn / (100 * MAX_DRAWN):
                 raise ValueError("where accepts too little of the space to sample it")
         return np.concatenate(accepted) if accepted else np.zeros((0, self.dim))
 
@@ -209,7 +209,7 @@ class LimitState:
             start = stop
             if self.one_by_one:
                 quick = time.perf_counter() - began < SECONDS
-                self.step = min(2 * self.step, self.most) if quick else max(1, self.step // 2)
+                self.step = min(2 * self.step, self.max_step) if quick else max(1, self.step // 2)
         return [np.concatenate(column) for column in zip(*parts, strict=True)]
 
     def _linearize(self, z: Float[np.ndarray, "n d"]) -> Linearized:
@@ -244,9 +244,9 @@ class LimitState:
         self.failures += int(failing.sum())
         self.no_verdict += int((~proper).sum())
         if known.any():
-            self.least = min(self.least, float(rho[known].min()))
+            self.lowest = min(self.lowest, float(rho[known].min()))
         if self.report is not None:
-            self.report(self.simulations, self.failures, self.least)
+            self.report(self.simulations, self.failures, self.lowest)
         return Scores(score, failing, proper)
 
 
@@ -282,7 +282,10 @@ def squared_distances(
 
 
 def farthest_first(
-    first: int, gaps_from: Callable[[int], Float[np.ndarray, " n"]], most: int, least: float = -1.0
+    first: int,
+    gaps_from: Callable[[int], Float[np.ndarray, " n"]],
+    maximum: int,
+    min_gap: float = -1.0,
 ) -> Int[np.ndarray, " chosen"]:
     """Choose points that are far from one another.
 
@@ -290,11 +293,11 @@ def farthest_first(
 
     - `first`: the point that is chosen first.
     - `gaps_from`: the distances `[n]` of all points from one.
-    - `most`: number of points, at most.
-    - `least`: distance from the chosen ones at which no other point is chosen.
+    - `maximum`: number of points, at most.
+    - `min_gap`: distance from the chosen ones at which no other point is chosen.
     """
     chosen, gaps = [first], gaps_from(first)
-    while len(chosen) < min(most, len(gaps)) and gaps.max() > least:
+    while len(chosen) < min(maximum, len(gaps)) and gaps.max() > min_gap:
         chosen.append(int(gaps.argmax()))
         gaps = np.minimum(gaps, gaps_from(chosen[-1]))
     return np.array(chosen)

@@ -12,11 +12,11 @@ from jaxtyping import Bool, Float
 
 from verifai_jax.estimation.normal_space import LimitState, fails_at
 
-PLACES = np.array([0.5, 0.25, 0.75, 0.1, 0.9])
+FRACTIONS = np.array([0.5, 0.25, 0.75, 0.1, 0.9])
 """Places of a path that are simulated, the middle first."""
 OUTWARD = 1.02
 """Factor on the distances of an arc, so that one along a boundary lies inside."""
-COST_OF_PATHS = 2 * len(PLACES)
+COST_OF_PATHS = 2 * len(FRACTIONS)
 """Simulations for a pair of points, at most."""
 
 
@@ -30,10 +30,10 @@ def connected(
     joined = np.zeros(len(a), bool)
     for path in (_straight, _arc):
         rows = np.flatnonzero(~joined)
-        for place in PLACES:
+        for fraction in FRACTIONS:
             if not len(rows):
                 break
-            fails = fails_at(limit_state, path(a[rows], b[rows], place))
+            fails = fails_at(limit_state, path(a[rows], b[rows], fraction))
             rows = rows[fails]
         joined[rows] = True
     return joined
@@ -67,18 +67,18 @@ def halve(
 def _straight(
     a: Float[np.ndarray, "n d"],
     b: Float[np.ndarray, "n d"],
-    place: float | Float[np.ndarray, "n 1"],
+    fraction: float | Float[np.ndarray, "n 1"],
 ) -> Float[np.ndarray, "n d"]:
-    return (1 - place) * a + place * b
+    return (1 - fraction) * a + fraction * b
 
 
 def _arc(
-    a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "n d"], place: float
+    a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "n d"], fraction: float
 ) -> Float[np.ndarray, "n d"]:
     """Return points of the arcs: the angle and the distance from the origin change evenly."""
     far_a = np.linalg.norm(a, axis=1, keepdims=True)
     far_b = np.linalg.norm(b, axis=1, keepdims=True)
     one, other = a / np.maximum(far_a, 1e-12), b / np.maximum(far_b, 1e-12)
     angle = np.arccos(np.clip(np.sum(one * other, axis=1, keepdims=True), -1 + 1e-9, 1 - 1e-9))
-    turned = np.sin((1 - place) * angle) * one + np.sin(place * angle) * other
-    return OUTWARD * ((1 - place) * far_a + place * far_b) * turned / np.sin(angle)
+    turned = np.sin((1 - fraction) * angle) * one + np.sin(fraction * angle) * other
+    return OUTWARD * ((1 - fraction) * far_a + fraction * far_b) * turned / np.sin(angle)

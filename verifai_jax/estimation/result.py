@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from verifai_jax.core.figure import Drawn
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 from verifai_jax.statistics.binomial import simulations_until
@@ -34,7 +34,7 @@ class Estimate(Drawn, InNotebook):
     """A failure probability, as `estimate` returns it.
 
     - `name`: name of the problem.
-    - `probability`: of a failure, under the prior of the feature space; None where none is claimed.
+    - `probability`: of a failure, under the prior of the feature space; None if none is claimed.
     - `low`, `high`: the interval, at `confidence`; without an estimate 0 and `upper_bound`.
     - `confidence`: of the interval and of the bound.
     - `method`: `"monte_carlo"`, `"importance"` or `"splitting"`; None without an estimate.
@@ -49,11 +49,11 @@ class Estimate(Drawn, InNotebook):
       meaning.
     - `relative_error`: one standard error over the estimate.
     - `diagnostics`: further numbers of the method, by name.
-    - `notes`: surprises, in words.
+    - `notes`: sentences on anything surprising.
     - `p0`: the wanted upper limit of the probability, if one was given.
     - `seed`, `version`, `precision`, `backend`: needed to repeat the estimate.
     - `seconds`: wall-clock time.
-    - `sources`: what the model was made of, as a run records it; empty where that is not recorded.
+    - `sources`: what the model was made of, as a run records it; empty if that is not recorded.
     - `drawn`: data of the pictures.
     """
 
@@ -179,4 +179,4 @@ class Estimate(Drawn, InNotebook):
 
         **Returns:** the path.
         """
-        return late("verifai_jax.reports", "write_report")(self, path, **options)
+        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)

@@ -22,9 +22,9 @@ from verifai_jax.estimation.normal_space import Ended, LimitState, scores_of
 
 ACCEPTED = 0.44
 """Share of moves that the scale of the moves aims at (Papaioannou et al., section 4.3)."""
-MOST_LEVELS = 60
+MAX_LEVELS = 60
 """Levels of a run, at most."""
-FEWEST = 8
+MIN_SURVIVORS = 8
 """Points that must lie below a level."""
 FirstLevel: TypeAlias = tuple[
     Float[np.ndarray, "n d"],
@@ -47,7 +47,7 @@ class SplittingRun:
     - `chain_ids`: the chain `[n]` that each failure comes from.
     - `first`: counts of the first level, independent samples of the prior: simulations, failures,
       and missing verdicts.
-    - `stopped`: the reason for an early end; None where the run reached failures.
+    - `stopped`: the reason for an early end; None if the run reached failures.
     """
 
     levels: list[float] = field(default_factory=list)
@@ -100,7 +100,7 @@ def run_splitting(
         run.first = (len(z), int(failing.sum()), int((~proper).sum()))
         steps, above, scale = 1, np.inf, 0.8
         chain_ids = np.arange(len(z))
-        for _ in range(MOST_LEVELS):
+        for _ in range(MAX_LEVELS):
             level = _level(score, chains / per_level, above)
             if level is None:
                 run.stopped = "stuck"
@@ -147,12 +147,12 @@ def explore_failures(
 def _level(score: Float[np.ndarray, " n"], share: float, above: float) -> float | None:
     """Return the next level: the `share` quantile, or lower where that makes no progress."""
     ordered = np.sort(score)
-    level = ordered[max(FEWEST, round(share * len(score))) - 1]
+    level = ordered[max(MIN_SURVIVORS, round(share * len(score))) - 1]
     if level == -np.inf or (level < above and np.mean(score <= level) < 0.7):
         return float(level)
     # A plateau: take the points strictly below it, if there are any.
     below = ordered[ordered < min(level, above)]
-    return float(below[-1]) if len(below) >= FEWEST else None
+    return float(below[-1]) if len(below) >= MIN_SURVIVORS else None
 
 
 def _walk(

@@ -104,14 +104,14 @@ def _replace_by_parts(
     """
     z, kept, d = z.copy(), np.ones(z.shape, bool), z.shape[1]
     # The place of each coordinate in the row of those that are tried; the others come last.
-    place = np.argsort(np.argsort(np.where(among, rng.random(z.shape), 2.0), axis=1), axis=1)
+    index = np.argsort(np.argsort(np.where(among, rng.random(z.shape), 2.0), axis=1), axis=1)
     count = among.sum(axis=1)
     begin, size, quarter = np.zeros(len(z), int), (count + 1) // 2, (count + 3) // 4
     active = count > 0
     while active.any():
         rows = np.flatnonzero(active)
         end = np.minimum(begin[rows] + size[rows], count[rows])[:, None]
-        part = (place[rows] >= begin[rows, None]) & (place[rows] < end)
+        part = (index[rows] >= begin[rows, None]) & (index[rows] < end)
         moved = np.where(part, values[rows], z[rows])
         fails = fails_at(limit_state, moved)
         # Another region may fail there too: in the same one the middle of the way fails as well.
@@ -126,6 +126,6 @@ def _replace_by_parts(
             left = among[row] & kept[row]
             fruitless = size[row] <= quarter[row] and np.array_equal(left, among[row])
             active[row] = left.any() and size[row] > 1 and not fruitless
-            place[row] = np.argsort(np.argsort(np.where(left, place[row], d)))
+            index[row] = np.argsort(np.argsort(np.where(left, index[row], d)))
             begin[row], size[row], count[row] = 0, (size[row] + 1) // 2, np.sum(left)
     return z, kept

@@ -21,7 +21,7 @@ from verifai_jax.evaluation.engine import Engine, engine_for
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.problem.problem import Problem
 
-FEWEST = 64
+MIN_BUDGET = 64
 """Simulations below which nothing is compiled, or measured: either takes longer than they do."""
 WORTH_MEASURING = 30.0
 """Seconds that a run must take natively before a slow compiler is asked for a quicker program,"""
@@ -82,7 +82,7 @@ def _fastest(
     # Measured once for a problem, so that its runs in one process agree on the backend.
     host, compiled = problem.on_backend(on_host), problem.on_backend(traced)
     other = problem.programs.peek(SPEEDS, (traced, batch, precision))
-    if other is None and budget < FEWEST:
+    if other is None and budget < MIN_BUDGET:
         why = f"{budget} simulations, which take less than compiling for {traced} takes"
         return Choice(host, on_host, why)
     speed = problem.programs.get(

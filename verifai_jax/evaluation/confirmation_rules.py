@@ -48,7 +48,7 @@ def decide(
     - `came_again`: whether other rows could be simulated again, so that one that raises now has not
       come again.
     """
-    rho = {name: verdicts.least for name, verdicts in replayed.items()}
+    rho = {name: verdicts.lowest for name, verdicts in replayed.items()}
     found.rho.update(rho)
     base = next((name for name in ("float64", "again") if name in replayed), "")
     finest = next((n for n in ("quarter_step", base, "simulator") if n in replayed), "")
@@ -112,7 +112,7 @@ def hold_to_run(
         found.why[i] = f"it did not come again when the run simulated it again{then}"
 
 
-def least_failing(again: Verdicts, more: Verdicts, at: np.ndarray) -> Verdicts:
+def lowest_failing(again: Verdicts, more: Verdicts, at: np.ndarray) -> Verdicts:
     """Return the repetitions, those rows replaced that a further one shows to fail less.
 
     **Arguments:**
@@ -121,7 +121,7 @@ def least_failing(again: Verdicts, more: Verdicts, at: np.ndarray) -> Verdicts:
     - `more`: a further repetition of the rows `at`.
     """
     with np.errstate(invalid="ignore"):
-        less = ~more.violated | ~(more.least <= again.least[at])
+        less = ~more.violated | ~(more.lowest <= again.lowest[at])
     rho, status, violated = again.rho.copy(), again.status.copy(), again.violated.copy()
     taken = at[less]
     rho[taken], status[taken] = more.rho[less], more.status[less]
@@ -162,7 +162,7 @@ def describe_disagreement(
     holds = [name for name, replayed in found.items() if not replayed.violated[i]]
     if holds == ["again"]:
         run = "" if as_run is None else f", and {as_run:z.4g} in the run"
-        return f"it holds when simulated again: robustness {found['again'].least[i]:z.4g}{run}"
+        return f"it holds when simulated again: robustness {found['again'].lowest[i]:z.4g}{run}"
     if len(holds) == len(found):
         return "it holds in every replay"
     if holds:

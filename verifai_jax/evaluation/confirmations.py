@@ -299,14 +299,14 @@ class Repetitions:
     - `moved`: those with another robustness, beyond rounding, or none.
     - `rounded`: those whose last digits alone differ.
     - `lost`: those that did not fail again.
-    - `most`: how far a robustness moved.
+    - `max_difference`: how far a robustness moved.
     """
 
     rows: int = 0
     moved: int = 0
     rounded: int = 0
     lost: int = 0
-    most: float = 0.0
+    max_difference: float = 0.0
 
     @classmethod
     def count(
@@ -333,21 +333,23 @@ class Repetitions:
             self.moved + other.moved,
             self.rounded + other.rounded,
             self.lost + other.lost,
-            max(self.most, other.most),
+            max(self.max_difference, other.max_difference),
         )
 
     def __str__(self) -> str:
-        """Say what that means of the system; empty where all rows came again bit for bit."""
+        """Say what that means of the system; empty if all rows came again bit for bit."""
         plural = "s" * (self.rows != 1)
         of = f"of {self.rows} violating row{plural} simulated again with the same features and seed"
         if self.moved:
-            by = f" (by up to {self.most:z.2g})" if self.most else ""
+            by = f" (by up to {self.max_difference:z.2g})" if self.max_difference else ""
             return (
                 f"the system has memory or chance of its own: {of}, {self.moved} gave another "
                 f"robustness{by}, and {self.lost} did not fail"
             )
         if self.rounded:
-            return f"{of}, {self.rounded} have other last digits, by up to {self.most:z.2g}"
+            return (
+                f"{of}, {self.rounded} have other last digits, by up to {self.max_difference:z.2g}"
+            )
         return ""
 
 

@@ -29,7 +29,7 @@ from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.trace import Trace
-from verifai_jax.evaluation.confirmation_rules import decide, hold_to_run, least_failing
+from verifai_jax.evaluation.confirmation_rules import decide, hold_to_run, lowest_failing
 from verifai_jax.evaluation.confirmations import (
     EXACT_STEP,
     FINER,
@@ -93,8 +93,8 @@ class Confirmer:
     - `seed`: of the run; a simulation gets the random key that it had.
     - `simulator`: another system for the same features and signals, or a problem with one, that
       has to agree.
-    - `most`: how many rows are examined whatever comes; by default 256, and more where a row takes
-      few replays: 2048 where the step stays. Of more, those nearest to zero are, and
+    - `max_rows`: how many rows are examined whatever comes; by default 256, and more where a row
+      takes few replays: 2048 where the step stays. Of more, those nearest to zero are, and
       further ones until the rest is ten times farther from zero than any replay has moved a row;
       these stay `unexamined`. Only where rows have a column `rho`. A row that is worse than all
       examined before is examined whatever else was.
@@ -116,16 +116,16 @@ class Confirmer:
         seed: int = 0,
         *,
         simulator: System | Callable[..., Trace] | Problem | str | None = None,
-        most: int | None = None,
+        max_rows: int | None = None,
         executor: Executor | None = None,
         target: str | None = None,
     ) -> None:
-        if most is not None and (
-            isinstance(most, bool) or not isinstance(most, int | np.integer) or most < 1
+        if max_rows is not None and (
+            isinstance(max_rows, bool) or not isinstance(max_rows, int | np.integer) or max_rows < 1
         ):
-            raise ValueError(f"most must be a positive integer; got {most!r}")
+            raise ValueError(f"max_rows must be a positive integer; got {max_rows!r}")
         in_precision(precision)
-        self.problem, self.precision, self.seed, self.most = problem, precision, seed, most
+        self.problem, self.precision, self.seed, self.max_rows = problem, precision, seed, max_rows
         self.executor, self.target = executor, target
         self.other = None if simulator is None else _other(problem, simulator)
         self.examined, self.band, self.worst = 0, 0.0, np.inf
@@ -176,13 +176,13 @@ class Confirmer:
         if self.problem.system.exact_step:
             self.check_names += (EXACT_STEP,)
         found.rho.update({name: np.full(len(numbers), np.nan) for name in self._checks})
-        most = self.most
-        if most is None:
+        max_rows = self.max_rows
+        if max_rows is None:
             cost = max(1, sum(factor for _, factor in self._checks.values()))
-            most = max(ROWS, COST // cost)
+            max_rows = max(ROWS, COST // cost)
         rest = np.arange(len(numbers)) if run is None else _order(run)
         while len(rest):
-            size = self._block_size(rest, run, most, limit)
+            size = self._block_size(rest, run, max_rows, limit)
             if not size:
                 break
             block, rest = np.split(rest, [size])
@@ -297,14 +297,14 @@ class Confirmer:
         self,
         rest: Int[np.ndarray, " rest"],
         run: Float[np.ndarray, " n"] | None,
-        most: int,
+        max_rows: int,
         limit: int | None,
     ) -> int:
         """Return how many of the rows that are left are examined next; 0 to leave them."""
         if run is None:
             size = len(rest)
-        elif self.examined < most:
-            size = most - self.examined
+        elif self.examined < max_rows:
+            size = max_rows - self.examined
         else:
             size = 0 if self.far(float(np.min(np.abs(run[rest])))) else BLOCK
         if limit is not None:
@@ -389,7 +389,7 @@ class Confirmer:
         def notice(rows: np.ndarray, seen: Verdicts) -> None:
             held = bool(np.any(~seen.violated & ~np.isin(seen.status, RAISED)))
             self.flips = self.flips or held
-            moved = run is not None and np.any(came_otherwise(run[rows], seen.least))
+            moved = run is not None and np.any(came_otherwise(run[rows], seen.lowest))
             self.wavers = self.wavers or held or bool(moved)
 
         notice(np.arange(len(numbers)), again)
@@ -400,7 +400,7 @@ class Confirmer:
             own = jax.tree.map(lambda leaf, left=left: leaf[left], features)
             [more] = replays.anew(own, numbers[left])
             notice(left, more)
-            again = least_failing(again, more, left)
+            again = lowest_failing(again, more, left)
         return again
 
     def _left_out(self, rest: Int[np.ndarray, " rest"], found: Confirmations) -> str:

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
 
-from verifai_jax.core.compilation import Compilation, Effort, compile_soon, tracing
+from verifai_jax.core.compilation import Compilation, XlaOptimization, compile_soon, tracing
 from verifai_jax.core.devices import spread_over_devices
 from verifai_jax.core.fingerprint import fingerprint
 from verifai_jax.core.keys import IMPLEMENTATION, as_key, simulation_key
@@ -31,10 +31,10 @@ from verifai_jax.core.remembered import is_kept, lower_or_recall, remembered_as
 from verifai_jax.core.shapes import pad_rows
 from verifai_jax.core.steps import as_traced
 from verifai_jax.evaluation.differentiation import Derivative, reverse_refused
+from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.inputs import CubePoints, Inputs
 from verifai_jax.evaluation.packing import Packing
 from verifai_jax.evaluation.row import Row, RowFunction
-from verifai_jax.evaluation.steering import NOTHING, Steering
 from verifai_jax.evaluation.verdicts import Verdicts, violations
 from verifai_jax.mtl.clauses import goals_of
 from verifai_jax.problem.problem import Problem
@@ -64,7 +64,7 @@ class Engine:
     - `lanes`: rows that a device works on together; as the system says when left out.
     - `effort`: how much XLA does to make its programs fast; when left out as the system says, and
       for derivatives, which are of few rows, at most a little.
-    - `steering`: what it computes for a search in addition to the robustness.
+    - `guidance`: what it computes for a search in addition to the robustness.
 
     `notes` says, once compiled, what the engine decided that a user may not expect.
     """
@@ -81,17 +81,17 @@ class Engine:
         own_keys: bool = False,
         alone: bool = False,
         lanes: int | None = None,
-        effort: Effort | None = None,
-        steering: Steering = NOTHING,
+        effort: XlaOptimization | None = None,
+        guidance: Guidance = NOTHING,
     ) -> None:
-        self.steering = steering
+        self.guidance = guidance
         self.problem, self.batch, self.gradient = problem, batch, gradient
         self.inputs = CubePoints(problem) if inputs is None else inputs
         self.precision, self.own_keys, self.alone = precision, own_keys, alone
         if effort is None:
             effort = problem.system.effort
             effort = "little" if gradient and effort == "most" else effort
-        self.effort: Effort = effort
+        self.effort: XlaOptimization = effort
         devices = jax.local_devices() if devices is None else devices
         # A batch smaller than the number of devices is not worth splitting.
         self.devices = devices[: max(1, min(len(devices), batch))]
@@ -105,7 +105,7 @@ class Engine:
         self._derivative = Derivative(self.inputs.dim, problem.system.forward_up_to)
         goals = goals_of(problem.formulas.values()) if clauses else None
         self.goals = goals
-        self._function = RowFunction(problem, self.inputs, precision, gradient, goals, steering)
+        self._function = RowFunction(problem, self.inputs, precision, gradient, goals, guidance)
         self._packing: dict[Mode, Packing] = {}
         self._traced: dict[Mode, jax.stages.Traced] = {}
         self._compiling: dict[Mode, Compilation] = {}
@@ -464,7 +464,7 @@ class EngineMode(NamedTuple):
     gradient: bool
     precision: str
     clauses: bool
-    steering: Steering
+    guidance: Guidance
     given: bool
 
 
@@ -478,11 +478,11 @@ def engine_for(
     gradient: bool = False,
     precision: str = "float32",
     clauses: bool = False,
-    steering: Steering = NOTHING,
+    guidance: Guidance = NOTHING,
     given: bool = False,
 ) -> Engine:
     """Return the engine of this (problem, batch, mode), made once and kept with the problem."""
-    mode = EngineMode(batch, gradient, precision, clauses, steering, given)
+    mode = EngineMode(batch, gradient, precision, clauses, guidance, given)
     return problem.programs.get(
         ENGINES,
         mode,
@@ -492,7 +492,7 @@ def engine_for(
             gradient,
             precision=precision,
             clauses=clauses,
-            steering=steering,
+            guidance=guidance,
             inputs=CubePoints(problem, given, precision),
         ),
     )

@@ -18,10 +18,10 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.progress import count_done
 from verifai_jax.core.shapes import power_of_two
 from verifai_jax.evaluation.engine import Engine, engine_for
+from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.raising import ALIKE, Raising
-from verifai_jax.evaluation.steering import NOTHING, Steering
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 
@@ -43,7 +43,7 @@ class Evaluator:
     - `journal`: of rows in flight, for a problem on the host.
     - `executor`: with `concurrent.futures`' `submit`, whose workers simulate; this process when
       left out.
-    - `steering`: what is computed for a search in addition to the robustness.
+    - `guidance`: what is computed for a search in addition to the robustness.
     - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
     - `keep_traces`: whether verdicts come with traces; in this process.
     - `given`: whether rows of features that somebody gave (`given_rows`) may be among the points.
@@ -62,7 +62,7 @@ class Evaluator:
         journal: Journal | None = None,
         executor: Executor | None = None,
         target: str | None = None,
-        steering: Steering = NOTHING,
+        guidance: Guidance = NOTHING,
         keep_traces: bool = False,
         given: bool = False,
         ends_raising: bool = False,
@@ -78,18 +78,18 @@ class Evaluator:
 
             self.engine = executor_engine.ExecutorEngine(
                 problem, batch, executor, gradient=gradient, clauses=clauses,
-                precision=precision, journal=journal, target=target, steering=steering,
+                precision=precision, journal=journal, target=target, guidance=guidance,
                 given=self.given,
             )  # fmt: skip
         elif problem.black_box:
             self.engine = HostEngine(
-                problem, precision, journal, steering=steering, keep_traces=keep_traces,
+                problem, precision, journal, guidance=guidance, keep_traces=keep_traces,
                 given=self.given,
             )  # fmt: skip
         else:
-            steering = steering._replace(trace=keep_traces)
+            guidance = guidance._replace(trace=keep_traces)
             self.engine = engine_for(
-                problem, batch, gradient, precision, clauses, steering, self.given
+                problem, batch, gradient, precision, clauses, guidance, self.given
             )
         # Features of few points are those of a whole batch, bit for bit.
         self._padded_to = power_of_two(batch) if ends_raising else 1

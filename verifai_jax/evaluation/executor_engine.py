@@ -32,10 +32,10 @@ from verifai_jax.core.executors import (
 from verifai_jax.core.programs import Slot
 from verifai_jax.core.shapes import power_of_two
 from verifai_jax.evaluation.engine import chunks_and_lanes
+from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.remarks import Remarks
-from verifai_jax.evaluation.steering import NOTHING, Steering
 from verifai_jax.evaluation.verdicts import RowVerdict, Verdicts
 from verifai_jax.evaluation.worker import ARRAYS, BlockMode, evaluate_block, question_of
 from verifai_jax.problem.problem import Problem
@@ -50,10 +50,10 @@ WORTH_KEEPING = 0.01
 is quicker is simulated again instead."""
 IN_FLIGHT = 3
 """Blocks on their way for each worker, so that none waits for the next one."""
-MOST_DROPPED = 100
+MAX_DROPPED = 100
 """Answers to other calls after which an executor is given up: a bound, so that no run waits for
 ever for one that mixes up its answers."""
-MOST_AHEAD = 1 << 22
+MAX_AHEAD = 1 << 22
 """Rows at most that are on their way at a time: a bound on the memory that they take."""
 
 SHIPMENTS: Slot[tuple[str, str | None], Any] = Slot("shipments")
@@ -68,7 +68,7 @@ class ExecutorEngine:
     - `problem`: a checked one, on the backend it is to run on.
     - `batch`: rows of a batch on one machine, which says how many lanes go together.
     - `executor`: with `submit`.
-    - `gradient`, `clauses`, `precision`, `steering`: as of `engine.Engine`.
+    - `gradient`, `clauses`, `precision`, `guidance`: as of `engine.Engine`.
     - `given`: whether points are rows of given features, as of `CubePoints`.
     - `journal`: of rows in flight, for a problem on the host.
     - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
@@ -88,7 +88,7 @@ class ExecutorEngine:
         precision: str = "float32",
         journal: Journal | None = None,
         target: str | None = None,
-        steering: Steering = NOTHING,
+        guidance: Guidance = NOTHING,
         given: bool = False,
     ) -> None:
         check_executor(executor)
@@ -103,9 +103,11 @@ class ExecutorEngine:
         form = problem.space.feature_form
         self._features: Any = jax.tree.structure(form)
         _, lanes = chunks_and_lanes(problem, batch, len(jax.local_devices()))
-        least = power_of_two(batch)
+        smallest = power_of_two(batch)
         backend = problem.system.backend if problem.system.backends else None
-        self.mode = BlockMode(lanes, gradient, clauses, precision, least, backend, steering, given)
+        self.mode = BlockMode(
+            lanes, gradient, clauses, precision, smallest, backend, guidance, given
+        )
         self._dtype = np.dtype(precision if given else "float32")
         self.unit = lanes
         if problem.black_box:
@@ -129,13 +131,13 @@ class ExecutorEngine:
         if self._seconds is None:
             return self.unit * (1 if self.problem.black_box else AT_FIRST)
         wanted = seconds_per_block(self.executor)
-        rows = int(min(wanted / max(self._seconds, 1e-9), MOST_AHEAD // 8))
+        rows = int(min(wanted / max(self._seconds, 1e-9), MAX_AHEAD // 8))
         return max(self.unit, rows - rows % self.unit)
 
     @property
     def ahead(self) -> int:
         """Rows on their way that keep all workers busy."""
-        return min(MOST_AHEAD, IN_FLIGHT * count_workers(self.executor) * self.block)
+        return min(MAX_AHEAD, IN_FLIGHT * count_workers(self.executor) * self.block)
 
     def begin_compiling(self) -> None:
         """Do nothing: the workers compile, with their first block."""
@@ -189,7 +191,7 @@ class ExecutorEngine:
         if result.get("question", question) == question:
             return True
         self._dropped += 1
-        if self._dropped > MOST_DROPPED:
+        if self._dropped > MAX_DROPPED:
             raise WorkerError(
                 f"{self._dropped} answers of the executor belonged to other calls than the one "
                 "whose future they came by; what was finished before is kept: resume with another "
@@ -219,7 +221,7 @@ class ExecutorEngine:
                 self.problem,
                 self.precision,
                 self._journal,
-                steering=self.mode.steering,
+                guidance=self.mode.guidance,
                 given=self.mode.given,
             )
         return self._recalling.evaluate(u, key, first, padded_to=self.mode.padded_to)
@@ -245,12 +247,12 @@ class ExecutorEngine:
             self._remarks.join(result["remarks"])
         if self._journal is not None and result["seconds"] > WORTH_KEEPING * count:
             for i in range(count):
-                marks = None if verdicts.marks is None else verdicts.marks[i]
+                coverage_ids = None if verdicts.coverage_ids is None else verdicts.coverage_ids[i]
                 message = "" if verdicts.messages is None else verdicts.messages[i]
                 holds = np.array(not verdicts.violated[i])
-                steering = None if verdicts.steering is None else verdicts.steering[i]
+                guidance = None if verdicts.guidance is None else verdicts.guidance[i]
                 rho, status = verdicts.rho[i], int(verdicts.status[i])
-                row = RowVerdict(rho, status, holds, message, marks, steering)
+                row = RowVerdict(rho, status, holds, message, coverage_ids, guidance)
                 self._journal.add(first + i, u[i], row)
         return verdicts
 
@@ -288,9 +290,9 @@ class Pending:
 
     def send(self) -> list[Future]:
         """Send blocks until each worker has a few, and return those that are new."""
-        most = self._ended + IN_FLIGHT * count_workers(self._engine.executor)
+        maximum = self._ended + IN_FLIGHT * count_workers(self._engine.executor)
         already = len(self._sent)
-        while self._unsent and len(self._sent) < most:
+        while self._unsent and len(self._sent) < maximum:
             begin, end = self._unsent.popleft()
             left = end - begin + sum(b - a for a, b in self._unsent)
             stop = min(begin + self._engine.step(left), end)
@@ -314,8 +316,8 @@ class Pending:
                 u = self._u[begin:stop]
                 found[begin] = self._engine.recall(u, self._key, self._first + begin)
 
-            def ended(place: int, result: dict[str, Any]) -> None:
-                begin, stop, _ = self._sent[place]
+            def ended(index: int, result: dict[str, Any]) -> None:
+                begin, stop, _ = self._sent[index]
                 u, first = self._u[begin:stop], self._first + begin
                 self._ended += 1
                 if not self._engine.is_answer(result, self._words, first, u):

@@ -26,14 +26,14 @@ from verifai_jax.core.shapes import pad_rows, power_of_two
 from verifai_jax.core.text import storable
 from verifai_jax.core.trace import Status, Trace, without_wrapping
 from verifai_jax.core.user_errors import format_user_error
+from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.remarks import Remarks
-from verifai_jax.evaluation.steering import NOTHING, Steering
 from verifai_jax.evaluation.verdicts import (
     RowVerdict,
     Verdicts,
     boolean_semantics,
-    trace_marks,
+    trace_coverage_ids,
     trace_verdict,
     violations,
 )
@@ -53,14 +53,14 @@ most so much work is lost with the process."""
 class HostMonitor:
     """The compiled monitor of a problem for batches of traces that came from the host."""
 
-    def __init__(self, problem: Problem, steering: Steering = NOTHING) -> None:
-        self.steering = steering
+    def __init__(self, problem: Problem, guidance: Guidance = NOTHING) -> None:
+        self.guidance = guidance
 
         def decided(trace: Trace, features: PyTree) -> tuple[Array, Array, Array, Array]:
-            told = jnp.zeros(0, jnp.float32)
-            if steering.size:
-                told = steering.values(problem, trace, features)
-            return *trace_verdict(problem, trace), trace_marks(problem, trace), told
+            extra = jnp.zeros(0, jnp.float32)
+            if guidance.size:
+                extra = guidance.values(problem, trace, features)
+            return *trace_verdict(problem, trace), trace_coverage_ids(problem, trace), extra
 
         self._decide = jax.jit(jax.vmap(decided))
         self._holds = jax.jit(jax.vmap(lambda trace: boolean_semantics(problem, trace)))
@@ -71,23 +71,23 @@ class HostMonitor:
         Float[np.ndarray, "n k"],
         Int[np.ndarray, " n"],
         Bool[np.ndarray, "n k"],
-        Int[np.ndarray, "n marks"],
-        Float[np.ndarray, "n steering"],
+        Int[np.ndarray, "n ids"],
+        Float[np.ndarray, "n guidance"],
     ]:
-        """Return robustness, status, Boolean semantics, marks and what steers a search.
+        """Return robustness, status, Boolean semantics, coverage ids and what steers a search.
 
         In one shape for many `count`. `features` are needed only where something steers.
         """
         signals = {name: without_wrapping(signal) for name, signal in traces.signals.items()}
         padded = jax.tree.map(pad_rows, _with_signals(traces, signals))
-        own = jax.tree.map(pad_rows, features) if self.steering.size else {}
+        own = jax.tree.map(pad_rows, features) if self.guidance.size else {}
         decided = self._decide(padded, own)
-        rho, status, marks, told = (np.asarray(leaf)[:count] for leaf in decided)
+        rho, status, coverage_ids, guidance = (np.asarray(leaf)[:count] for leaf in decided)
         holds = np.ones(rho.shape, bool)
         if np.any(rho == 0):
             # Now, while the traces are here: simulating again may be dear.
             holds = np.asarray(self._holds(padded))[:count]
-        return rho, status, holds, marks, told
+        return rho, status, holds, coverage_ids, guidance
 
 
 MONITORS: Slot[str, HostMonitor] = Slot("monitors of host systems")
@@ -104,7 +104,7 @@ class HostEngine:
     - `journal`: where rows are kept as soon as they have a verdict, until their batch is finished.
     - `system`: simulated instead of the problem's own, such as one with a finer step.
     - `monitor`: one that is compiled already for the same formulas.
-    - `steering`: what is computed for a search in addition to the robustness; that of the monitor
+    - `guidance`: what is computed for a search in addition to the robustness; that of the monitor
       if one is given.
     - `keep_traces`: whether verdicts come with the traces, on the clock of the monitor.
     - `given`: whether points are rows of given features, as of `CubePoints`.
@@ -120,7 +120,7 @@ class HostEngine:
         *,
         system: System | None = None,
         monitor: HostMonitor | None = None,
-        steering: Steering = NOTHING,
+        guidance: Guidance = NOTHING,
         keep_traces: bool = False,
         given: bool = False,
     ) -> None:
@@ -128,10 +128,10 @@ class HostEngine:
         self.problem, self.precision, self.journal = problem, precision, journal
         self.keep_traces = keep_traces
         self.system = problem.system if system is None else system
-        if monitor is None and not steering.size:
+        if monitor is None and not guidance.size:
             # The one of all engines of the problem, so that it compiles once.
             monitor = problem.programs.get(MONITORS, "", lambda: HostMonitor(problem))
-        self.monitor = HostMonitor(problem, steering) if monitor is None else monitor
+        self.monitor = HostMonitor(problem, guidance) if monitor is None else monitor
         self.compile_seconds = 0.0
         self.simulation_seconds = 0.0
         self.remarks = Remarks()
@@ -203,7 +203,7 @@ class HostEngine:
         behaviour = self.problem.behaviour
         width = None if behaviour is None else behaviour.size
         formulas = len(self.problem.formulas)
-        rows = _Rows(len(seeds), formulas, self.precision, width, self.monitor.steering.size)
+        rows = _Rows(len(seeds), formulas, self.precision, width, self.monitor.guidance.size)
         if keep_traces:
             rows.traces = [None for _ in seeds]
         if self.system.can_simulate_batch:
@@ -218,8 +218,8 @@ class HostEngine:
             violated,
             features,
             messages=rows.messages,
-            marks=rows.marks,
-            steering=rows.steering if self.monitor.steering.size else None,
+            coverage_ids=rows.coverage_ids,
+            guidance=rows.guidance if self.monitor.guidance.size else None,
             traces=rows.traces,
         )
 
@@ -242,11 +242,11 @@ class HostEngine:
             trace = _checked(outcome.trace, count)
             self.remarks.add(trace.notes, count)
             if _is_plain(trace):
-                rows.rho[:], rows.status[:], rows.holds[:], marks, rows.steering[:] = self.monitor(
-                    trace, count, features
+                rows.rho[:], rows.status[:], rows.holds[:], coverage_ids, rows.guidance[:] = (
+                    self.monitor(trace, count, features)
                 )
-                if rows.marks is not None:
-                    rows.marks[:] = marks
+                if rows.coverage_ids is not None:
+                    rows.coverage_ids[:] = coverage_ids
                 for i in range(count if rows.traces is not None else 0):
                     each = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], trace)
                     rows.show(i, on_host_clock(each))
@@ -284,11 +284,11 @@ class HostEngine:
         waiting = _Waiting(partial(self._block_verdicts, features), keep, rows.show)
         started = time.perf_counter()
         try:
-            for place, outcome in self._outcomes(each, [int(seeds[i]) for i in todo]):
+            for index, outcome in self._outcomes(each, [int(seeds[i]) for i in todo]):
                 self.simulation_seconds = time.perf_counter() - started
                 said = outcome.trace.notes if isinstance(outcome.trace, Trace) else {}
                 self.remarks.add(said)
-                waiting.add(todo[place], outcome)
+                waiting.add(todo[index], outcome)
         finally:
             # Also when interrupted: what has been simulated goes into the journal.
             waiting.settle_all()
@@ -306,15 +306,18 @@ class HostEngine:
     ) -> list[RowVerdict]:
         filled = [*traces, *[traces[-1]] * (BLOCK - len(traces))]
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *filled)
-        place = np.array([*rows, *[rows[-1]] * (BLOCK - len(rows))])
-        own = jax.tree.map(lambda leaf: np.asarray(leaf)[place], features)
+        index = np.array([*rows, *[rows[-1]] * (BLOCK - len(rows))])
+        own = jax.tree.map(lambda leaf: np.asarray(leaf)[index], features)
         try:
-            rho, status, holds, marks, told = self.monitor(stacked, BLOCK, own)
+            rho, status, holds, coverage_ids, guidance = self.monitor(stacked, BLOCK, own)
         except Exception as error:
             # The monitor refuses traces of this form: their signals, or their clock.
             return [_without_verdict(Status.ERROR, format_user_error(error))] * len(traces)
         each = range(len(traces))
-        return [RowVerdict(rho[i], int(status[i]), holds[i], "", marks[i], told[i]) for i in each]
+        return [
+            RowVerdict(rho[i], int(status[i]), holds[i], "", coverage_ids[i], guidance[i])
+            for i in each
+        ]
 
 
 class _Waiting:
@@ -359,14 +362,16 @@ class _Rows:
     """The rows of a batch while they are filled, in any order."""
 
     def __init__(
-        self, count: int, formulas: int, precision: str, marks: int | None, steering: int
+        self, count: int, formulas: int, precision: str, coverage_ids: int | None, guidance: int
     ) -> None:
-        self.steering = np.full((count, steering), np.nan, np.float32)
+        self.guidance = np.full((count, guidance), np.nan, np.float32)
         self.rho = np.full((count, formulas), np.nan, precision)
         self.status = np.full(count, Status.ERROR, np.int32)
         self.holds = np.ones((count, formulas), bool)
         self.messages = [""] * count
-        self.marks = None if marks is None else np.full((count, marks), -1, np.int32)
+        self.coverage_ids = (
+            None if coverage_ids is None else np.full((count, coverage_ids), -1, np.int32)
+        )
         self.traces: list[Trace | None] | None = None  # Where they are to be kept.
 
     def show(self, i: int, trace: Trace) -> None:
@@ -374,11 +379,11 @@ class _Rows:
             self.traces[i] = trace
 
     def put(self, i: int, row: RowVerdict) -> None:
-        self.rho[i], self.status[i], self.holds[i], self.messages[i], marks, steering = row
-        if steering is not None and len(steering):
-            self.steering[i] = steering
-        if self.marks is not None and marks is not None and len(marks):
-            self.marks[i] = marks
+        self.rho[i], self.status[i], self.holds[i], self.messages[i], coverage_ids, guidance = row
+        if guidance is not None and len(guidance):
+            self.guidance[i] = guidance
+        if self.coverage_ids is not None and coverage_ids is not None and len(coverage_ids):
+            self.coverage_ids[i] = coverage_ids
 
 
 def _without_verdict(status: Status, message: str) -> RowVerdict:

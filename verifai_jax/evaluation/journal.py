@@ -46,8 +46,10 @@ class Journal:
             "status": int(verdict.status),
             "holds": np.asarray(verdict.holds).tolist(),
             "message": verdict.message,
-            "marks": None if verdict.marks is None else np.asarray(verdict.marks).tolist(),
-            "steering": None if verdict.steering is None else verdict.steering.tolist(),
+            "coverage_ids": None
+            if verdict.coverage_ids is None
+            else np.asarray(verdict.coverage_ids).tolist(),
+            "guidance": None if verdict.guidance is None else verdict.guidance.tolist(),
         }
         self._last = max(self._last, row)
         if self._file is None:
@@ -98,14 +100,14 @@ def _read(path: Path) -> dict[int, tuple[str, RowVerdict]]:
             continue  # It has changed, or was being written when the process died.
         try:
             entry = json.loads(text)
-            marks, steering = entry.get("marks"), entry.get("steering")
+            coverage_ids, guidance = entry.get("coverage_ids"), entry.get("guidance")
             verdict = RowVerdict(
                 np.asarray(entry["rho"], np.float64),
                 int(entry["status"]),
                 np.asarray(entry["holds"], bool),
                 str(entry["message"]),
-                None if marks is None else np.asarray(marks, np.int32),
-                None if steering is None else np.asarray(steering, np.float32),
+                None if coverage_ids is None else np.asarray(coverage_ids, np.int32),
+                None if guidance is None else np.asarray(guidance, np.float32),
             )
             known[int(entry["row"])] = (str(entry["point"]), verdict)
         except (ValueError, KeyError, TypeError):

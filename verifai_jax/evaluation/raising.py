@@ -72,7 +72,7 @@ class Raising:
 
     @property
     def reason(self) -> str | None:
-        """The message of all, empty where they have none; None if others may still succeed."""
+        """The message of all, empty if they have none; None if others may still succeed."""
         seconds = 0.0 if self._since is None else time.monotonic() - self._since
         alike = ALWAYS if seconds < SLOW else ALIKE if seconds < LONG else FEW
         enough = self._count >= (alike if len(self._kinds) == 1 else ALWAYS)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from verifai_jax.core.text import MOST_OF_A_MESSAGE, storable
+from verifai_jax.core.text import MAX_MESSAGE_LENGTH, storable
 
 
 @dataclass
@@ -18,7 +18,7 @@ class Remarks:
         """Take in the notes of a simulation, or those that several have together."""
         self.simulations += simulations
         for note, times in notes.items():
-            self._count(storable(note, MOST_OF_A_MESSAGE), simulations, times)
+            self._count(storable(note, MAX_MESSAGE_LENGTH), simulations, times)
 
     def join(self, other: Mapping[str, Any]) -> None:
         """Take in the remarks of a worker, as `to_data` gives them."""

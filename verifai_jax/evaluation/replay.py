@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Key
 
 from verifai_jax.core.keys import simulation_key
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook, picture_html
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import shows_progress
@@ -122,9 +122,9 @@ class Replay(InNotebook):
         - `path`: of a picture to write; none when left out.
         - `signals`: the signals, and features that are Signals, to draw; chosen when left out.
 
-        **Raises:** `UnknownNameError` for a signal that there is not.
+        **Raises:** `UnknownNameError` for a signal that does not exist.
         """
-        return late("verifai_jax.plotting.replay", "plot_replay")(self, path, signals)
+        return lazy_import("verifai_jax.plotting.replay", "plot_replay")(self, path, signals)
 
     def animate(
         self,
@@ -147,7 +147,7 @@ class Replay(InNotebook):
         **Raises:** `ValueError` for a problem without `draw` that has no MuJoCo model and is no
         environment of Gymnasium; `UnknownNameError` for a camera that the model lacks.
         """
-        draw = late("verifai_jax.plotting.animation", "animate")
+        draw = lazy_import("verifai_jax.plotting.animation", "animate")
         return draw(self, path, camera=camera, size=size, fps=fps)
 
 

@@ -1,6 +1,6 @@
 """The function of one row that engines batch: robustness, status, clauses, derivatives, Booleans.
 
-    function = RowFunction(problem, inputs, "float32", gradient=True, goals=None, steering=NOTHING)
+    function = RowFunction(problem, inputs, "float32", gradient=True, goals=None, guidance=NOTHING)
     function(row, key, temperature, shared, Derivative(d))          # Row, traced by JAX
 
 Derivatives are of an objective, which is a simulation and its monitor: `objective` is that alone,
@@ -16,10 +16,10 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.trace import Trace
 from verifai_jax.evaluation.differentiation import Derivative
+from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.inputs import Inputs
-from verifai_jax.evaluation.steering import NOTHING, Steering
 from verifai_jax.evaluation.streaming_monitor import streaming_monitor
-from verifai_jax.evaluation.verdicts import boolean_semantics, trace_marks, trace_verdict
+from verifai_jax.evaluation.verdicts import boolean_semantics, trace_coverage_ids, trace_verdict
 from verifai_jax.mtl import hard, robustness, smooth
 from verifai_jax.mtl.clauses import ABSENT, Goals
 from verifai_jax.problem.problem import Problem
@@ -42,7 +42,7 @@ class RowFunction(NamedTuple):
     - `precision`: of simulation, monitor and gradient.
     - `gradient`: whether the smooth robustness is differentiated.
     - `goals`: for an evaluation clause by clause.
-    - `steering`: what is computed for a search in addition to the robustness.
+    - `guidance`: what is computed for a search in addition to the robustness.
     """
 
     problem: Problem
@@ -50,7 +50,7 @@ class RowFunction(NamedTuple):
     precision: str
     gradient: bool
     goals: Goals | None
-    steering: Steering
+    guidance: Guidance
 
     def __call__(
         self,
@@ -95,7 +95,7 @@ class RowFunction(NamedTuple):
         features, system = self.inputs.simulated(coordinates, row, shared)
         trace = system(features, key).hold()
         verdict = trace_verdict(self.problem, trace)
-        more = self.steering.all(self.problem, trace, features)
+        more = self.guidance.all(self.problem, trace, features)
         dtype = coordinates.dtype
         if self.goals is None:
             semantics = smooth(temperature.astype(dtype))
@@ -103,21 +103,21 @@ class RowFunction(NamedTuple):
                 robustness(formula, trace, semantics, end=self.problem.end)
                 for formula in self.problem.formulas.values()
             ]
-            least = self._guided(jnp.min(jnp.stack(smoothed)), trace, features)
-            return least, (*verdict, features, None, more)
+            lowest = self._with_guide(jnp.min(jnp.stack(smoothed)), trace, features)
+            return lowest, (*verdict, features, None, more)
         values = self.goals.values(trace, hard, self.problem.end)
         nearest = jnp.argmin(jnp.max(values, axis=1))
         # A goal that is broken is a failure, whatever the guide says.
         broken = jnp.max(values[nearest]) < 0
-        told = self._guided(values[nearest], trace, features)
-        # And clauses that there are not stay absent.
-        told = jnp.where(broken | (values[nearest] <= 0.5 * ABSENT), values[nearest], told)
-        results = (*verdict, features, told, more)
+        observed = self._with_guide(values[nearest], trace, features)
+        # And clauses that do not exist stay absent.
+        observed = jnp.where(broken | (values[nearest] <= 0.5 * ABSENT), values[nearest], observed)
+        results = (*verdict, features, observed, more)
         if not self.gradient:
             return values[nearest], results
         semantics = smooth(temperature.astype(dtype))
         smoothed = self.goals.values(trace, semantics, self.problem.end)[nearest]
-        return self._guided(smoothed, trace, features), results
+        return self._with_guide(smoothed, trace, features), results
 
     def finish(self, derivatives: Float[Array, "*clauses dim"] | None, results: PyTree) -> Row:
         """Return the row of these derivatives and of the results of the objective."""
@@ -147,12 +147,12 @@ class RowFunction(NamedTuple):
         features, system = self._simulated(row, shared)
         dtype = jnp.dtype(self.precision)
         traced = self.problem.behaviour is not None and self.inputs.streaming
-        if traced or self.steering != NOTHING:
+        if traced or self.guidance != NOTHING:
             trace = system(features, key)
             rho, status = trace_verdict(self.problem, trace)
-            more = self.steering.all(self.problem, trace, features)
+            more = self.guidance.all(self.problem, trace, features)
             if traced:
-                more |= {"marks": trace_marks(self.problem, trace)}
+                more |= {"coverage_ids": trace_coverage_ids(self.problem, trace)}
             return Row(rho.astype(dtype), status, features, more)
         monitor = streaming_monitor(self.problem) if self.inputs.streaming else None
         if monitor is not None:
@@ -164,10 +164,10 @@ class RowFunction(NamedTuple):
     def _simulated(self, row: PyTree, shared: PyTree) -> tuple[PyTree, Callable[..., Any]]:
         return self.inputs.simulated(self.coordinates(row, shared), row, shared)
 
-    def _guided(self, values: Array, trace: Trace, features: PyTree) -> Array:
+    def _with_guide(self, values: Array, trace: Trace, features: PyTree) -> Array:
         """Return robustness, or clauses, with the guide's share, for their derivatives."""
         guide = self.problem.guide
-        if not self.steering.guide or guide is None:
+        if not self.guidance.guide or guide is None:
             return values
         share = guide.share(guide.value(trace, features, self.problem.end))
         return (1 - guide.weight) * values + guide.weight * share.astype(values.dtype)

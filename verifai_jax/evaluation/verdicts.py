@@ -2,7 +2,7 @@
 
     verdicts = engine.evaluate(u, key, first=0)
     verdicts.rho, verdicts.status                       # [n, formulas], [n]
-    verdicts.violated, verdicts.least                   # [n], [n]
+    verdicts.violated, verdicts.lowest                 # [n], [n]
 
 A simulation violates the property if it ended properly and breaks a formula: with a negative
 robustness, or with one of exactly zero where the Boolean semantics say so (`x >= 0` holds at zero,
@@ -34,10 +34,10 @@ class Verdicts(NamedTuple):
     - `clauses`: `[n, clauses]`, scaled values of the clauses of the goal that is nearest to being
       broken (`mtl.clauses`); None unless wanted.
     - `clause_gradients`: `[n, clauses, d]`, of the clauses by the coordinates; None unless wanted.
-    - `messages`: what a host system raised, one a row, empty where nothing; None for systems that
+    - `messages`: what a host system raised, one a row, empty if nothing; None for systems that
       JAX traces.
-    - `marks`: what each trace shows (`problem.behaviour`), -1 for nothing; None without one.
-    - `steering`: what else a search learns (`evaluation.steering`); None unless wanted.
+    - `coverage_ids`: what each trace shows (`problem.behaviour`), -1 for nothing; None without one.
+    - `guidance`: what else a search learns (`evaluation.guidance`); None unless wanted.
     - `traces`: the traces themselves, None if there is none; None unless they are kept.
     """
 
@@ -49,8 +49,8 @@ class Verdicts(NamedTuple):
     clauses: Float[np.ndarray, "n clauses"] | None = None
     clause_gradients: Float[np.ndarray, "n clauses d"] | None = None
     messages: list[str] | None = None
-    marks: Int[np.ndarray, "n marks"] | None = None
-    steering: Float[np.ndarray, "n steering"] | None = None
+    coverage_ids: Int[np.ndarray, "n ids"] | None = None
+    guidance: Float[np.ndarray, "n guidance"] | None = None
     traces: list[Trace | None] | None = None
 
     @property
@@ -59,7 +59,7 @@ class Verdicts(NamedTuple):
         return self.status == Status.OK
 
     @property
-    def least(self) -> Float[np.ndarray, " n"]:
+    def lowest(self) -> Float[np.ndarray, " n"]:
         """The least robustness over the formulas; NaN without a verdict."""
         return np.min(self.rho, axis=1)
 
@@ -105,9 +105,9 @@ class RowVerdict(NamedTuple):
     - `rho`: `[formulas]`, or one number that stands for all; NaN without a verdict.
     - `status`: a code of `Status`.
     - `holds`: `[formulas]`, or one truth value for all: the Boolean semantics.
-    - `message`: what the system raised; empty where nothing.
-    - `marks`: what its trace shows, `[marks]`; None without a trace, or a `problem.behaviour`.
-    - `steering`: what else a search learns, `[steering]`; None unless there is a trace, and it
+    - `message`: what the system raised; empty if nothing.
+    - `coverage_ids`: what its trace shows, `[ids]`; None without a trace, or a `problem.behaviour`.
+    - `guidance`: what else a search learns, `[guidance]`; None unless there is a trace, and it
       is wanted.
     """
 
@@ -115,8 +115,8 @@ class RowVerdict(NamedTuple):
     status: int
     holds: Bool[np.ndarray, " formulas"] | Bool[np.ndarray, ""]
     message: str
-    marks: Int[np.ndarray, " marks"] | None = None
-    steering: Float[np.ndarray, " steering"] | None = None
+    coverage_ids: Int[np.ndarray, " ids"] | None = None
+    guidance: Float[np.ndarray, " guidance"] | None = None
 
 
 def violations(
@@ -137,9 +137,9 @@ def violations(
     """
     proper = status == Status.OK
     # A formula without a verdict leaves it to the others.
-    least = rho[:, 0] if rho.shape[1] == 1 else np.fmin.reduce(rho, axis=1)
-    broken = proper & (least < 0)
-    undecided = proper & (least == 0)
+    lowest = rho[:, 0] if rho.shape[1] == 1 else np.fmin.reduce(rho, axis=1)
+    broken = proper & (lowest < 0)
+    undecided = proper & (lowest == 0)
     if undecided.any():
         broken |= undecided & ~np.all(holds(), axis=1)
     return broken
@@ -172,7 +172,7 @@ def trace_verdict(
     return with_status(rho, status, finite)
 
 
-def trace_marks(problem: Problem, trace: Trace) -> Int[Array, " marks"]:
+def trace_coverage_ids(problem: Problem, trace: Trace) -> Int[Array, " ids"]:
     """Return what a trace shows of a problem with a `behaviour`; traced by JAX."""
     if problem.behaviour is None:
         return jnp.zeros(0, jnp.int32)

@@ -21,10 +21,10 @@ from verifai_jax.core.keys import as_key
 from verifai_jax.core.precision import reproducible_settings
 from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import Engine
+from verifai_jax.evaluation.guidance import Guidance
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.inputs import CubePoints
 from verifai_jax.evaluation.remarks import Remarks
-from verifai_jax.evaluation.steering import Steering
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 
@@ -35,8 +35,8 @@ ARRAYS = (
     "gradient",
     "clauses",
     "clause_gradients",
-    "marks",
-    "steering",
+    "coverage_ids",
+    "guidance",
 )
 """Parts of verdicts that come back as arrays under their names."""
 
@@ -48,7 +48,7 @@ class BlockMode(NamedTuple):
     - `gradient`, `clauses`, `precision`: as of `Engine`.
     - `padded_to`: rows that a host system's features are computed of together.
     - `backend`: of a system that has several.
-    - `steering`: what is computed for a search in addition to the robustness.
+    - `guidance`: what is computed for a search in addition to the robustness.
     - `given`: whether points are rows of given features, as of `CubePoints`.
     """
 
@@ -58,7 +58,7 @@ class BlockMode(NamedTuple):
     precision: str
     padded_to: int
     backend: str | None
-    steering: Steering
+    guidance: Guidance
     given: bool = False
 
 
@@ -135,7 +135,7 @@ def _on_host(
     engine = problem.programs.get(
         HOST_ENGINES,
         mode,
-        lambda: HostEngine(problem, mode.precision, steering=mode.steering, given=mode.given),
+        lambda: HostEngine(problem, mode.precision, guidance=mode.guidance, given=mode.given),
     )
     started, engine.remarks = time.perf_counter(), Remarks()
     verdicts = engine.evaluate(u, as_key(key), first, padded_to=mode.padded_to)
@@ -165,7 +165,7 @@ def _compiled(
             mode.clauses,
             inputs=CubePoints(problem, mode.given, mode.precision),
             lanes=mode.lanes,
-            steering=mode.steering,
+            guidance=mode.guidance,
         ),
     )
     engine.compile()

@@ -3,7 +3,7 @@
     traffic = events.Automaton("cruise", {
         ("cruise", "cut_in"): dict(to="crowded", wait=Box(0.5, 4), gap=Box(5, 20)),
         ("crowded", "brake"): dict(to="cruise", wait=Box(0.2, 2), rate=Box(2, 8), weight=2.0),
-    }, most=6)
+    }, max_events=6)
 
 An `Automaton` is a domain like any other; a system gets an `Events`.
 """

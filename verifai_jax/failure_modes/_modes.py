@@ -57,7 +57,7 @@ from verifai_jax.problem.dependence import depends_on_key, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.binomial import clopper_pearson
 
-DIVIDING, MOST_DIVIDING = 0.25, 6500
+DIVIDING, MAX_DIVIDING = 0.25, 6500
 """Share of the budget that divides the failures, and most of these simulations; the rest is for the
 probability."""
 MORE_DIVIDING = 2
@@ -66,7 +66,7 @@ SHOWN = 200
 """Failures of a mode that its result keeps, and samples of the prior that its name is told from."""
 OUTWARD = (1.0, 1.005, 1.02, 1.05)
 """Factors on a likeliest failure, of which the first that fails again in a run is its row."""
-MOST_OF_RUN = 200
+MAX_RUN_FAILURES = 200
 """Failures of a given run that the search for modes begins from."""
 
 
@@ -79,7 +79,7 @@ def modes(
     batch: int | None = None,
     seed: int = 0,
     confidence: float = 0.95,
-    least_share: float = 0.001,
+    min_share: float = 0.001,
     precision: str = "float32",
     backend: str | None = None,
     max_seconds: float | None = None,
@@ -94,12 +94,12 @@ def modes(
     - `batch`: simulations at once.
     - `seed`: the same seed gives the same modes on the same machine.
     - `confidence`: of all intervals, between 0 and 1.
-    - `least_share`: part of the failure probability below which a region is not listed.
+    - `min_share`: part of the failure probability below which a region is not listed.
     - `precision`, `backend`: as in `falsify`.
     - `max_seconds`: wall-clock seconds after which what is finished is divided into modes.
     - `progress`: True draws a progress bar, False none; None draws one on a terminal.
 
-    **Returns:** the modes, the most probable first; none where no failure was found or failures
+    **Returns:** the modes, the most probable first; empty if no failure was found or failures
     could not be weighed, and a note says so. Where the system draws random numbers, probabilities
     are over these too, and each mode holds the random key under which its likeliest failure fails.
 
@@ -114,17 +114,17 @@ def modes(
     changed = source.changed_since() if isinstance(source, Run) else ""
     check_options(budget, 1 if batch is None else batch, seed, max_seconds, None)
     check_fraction("confidence", confidence)
-    check_fraction("least_share", least_share)
+    check_fraction("min_share", min_share)
     in_precision(precision)
     problem.space.check_where()
-    least = int(budget) - min(round(DIVIDING * budget), MOST_DIVIDING)
-    chains = chains_for(least, SHARE_OF_LEVEL)
+    for_probability = int(budget) - min(round(DIVIDING * budget), MAX_DIVIDING)
+    chains = chains_for(for_probability, SHARE_OF_LEVEL)
     batch = min(chains if batch is None else batch, budget)
     chosen = resolved(problem, batch=batch, budget=budget, precision=precision, wanted=backend)
     chosen.problem.check()
     draws = depends_on_key(chosen.problem)
     # Under each of several keys the failures are divided.
-    estimated = int(budget) - (MORE_DIVIDING if draws else 1) * (int(budget) - least)
+    estimated = int(budget) - (MORE_DIVIDING if draws else 1) * (int(budget) - for_probability)
     simulated = DoublePrecisionEvaluator(chosen.problem, batch, precision, seed)
     simulated.compile()
     rng = np.random.default_rng(seed)
@@ -159,7 +159,7 @@ def modes(
     if limit_state.own_chance:
         notes.insert(0, f"{limit_state.own_chance}; what a mode hands out may not fail again")
     if divided is not None and answer.samples is not None:
-        numbers = _Numbers(chosen.problem, seed, precision, backend, confidence, least_share)
+        numbers = _Numbers(chosen.problem, seed, precision, backend, confidence, min_share)
         listed, rest, run = _list_modes(numbers, rng, answer, divided)
         missed = clopper_pearson(divided.tried - divided.joined, divided.tried, confidence)
         unexplained = (missed.low, missed.high)
@@ -201,7 +201,7 @@ class _Numbers:
     precision: str
     backend: str | None
     confidence: float
-    least_share: float
+    min_share: float
     notes: list[str] = field(default_factory=list)
     """On failures that did not come again."""
 
@@ -227,7 +227,7 @@ def _failures_of(source: Problem | Run) -> Float[np.ndarray, "n d"] | None:
     rows = source.table.counterexamples
     if not len(rows):
         return None
-    rows = rows.sort_values("rho").head(MOST_OF_RUN)
+    rows = rows.sort_values("rho").head(MAX_RUN_FAILURES)
     points = np.asarray(source.problem.space.points(rows), np.float64)
     return ndtri(np.clip(points, 1e-8, 1 - 1e-8))
 
@@ -297,7 +297,7 @@ def _list_modes(
     of_sample[samples.failing] = regions.assign(samples.failures)
     parts = [_part_of(samples, of_sample == k) for k in range(regions.count)]
     masses = np.array([float(part.x.sum()) for part in parts]) / float(samples.x.sum())
-    order = [int(k) for k in np.argsort(-masses, kind="stable") if masses[k] >= numbers.least_share]
+    order = [int(k) for k in np.argsort(-masses, kind="stable") if masses[k] >= numbers.min_share]
     rest = whole * max(0.0, float(1 - masses[order].sum()))
     if not order:
         return (), rest, None
@@ -404,7 +404,7 @@ def _simulate_under(
 
 
 def _cause(numbers: _Numbers, features: dict[str, Any], key: Any, number: int) -> tuple[float, str]:
-    """Return the robustness at features, and the formula and predicate that decide, in words."""
+    """Return the robustness at features, and the formula and predicate that decide, as text."""
     replayed = replay(numbers.problem, features, key, number, numbers.precision)
     rho = min(replayed.rho.values())
     if not replayed.violated and replayed.rho:

@@ -25,7 +25,7 @@ from verifai_jax.failure_modes.regions import Regions
 
 ASKED = 24
 """Failures whose keys are tried on one another."""
-MOST_KEYS = 4
+MAX_KEYS = 4
 """Keys that are held, at most."""
 ENOUGH = 0.9
 """Share of the failures from which on no further key is held."""
@@ -129,9 +129,9 @@ def _likeliest_of(
     """
     region, ends = np.full(len(z), -1), found.design_points
     nearest = np.argsort(squared_distances(z, ends), axis=1)
-    ways = [(ends[column], column) for column in nearest.T]
-    ways += [(found.points[rows], found.region[rows]) for rows in found.candidates(z).T]
-    for points, number in ways:
+    candidates = [(ends[column], column) for column in nearest.T]
+    candidates += [(found.points[rows], found.region[rows]) for rows in found.candidates(z).T]
+    for points, number in candidates:
         left = np.flatnonzero(region < 0)
         joined = left[connected(own, z[left], points[left])] if len(left) else left
         region[joined] = number[joined]
@@ -152,7 +152,7 @@ def _choose_keys(
         limit_state.simulations += own.simulations
     chosen: list[int] = []
     left = np.ones(len(z), bool)
-    while len(chosen) < MOST_KEYS and left.mean() > 1 - ENOUGH:
+    while len(chosen) < MAX_KEYS and left.mean() > 1 - ENOUGH:
         share = {key: float(np.mean(failing[left])) for key, failing in fails.items()}
         typical = [key for key in share if share[key] >= TYPICAL]
         key = min(typical, key=share.__getitem__) if typical else max(share, key=share.__getitem__)

@@ -18,7 +18,7 @@ from verifai_jax.analysis.conditions import Between
 
 KEPT = 0.95
 """Share of the mode's failures that fulfil each condition."""
-MOST = 6
+MAX_WORDS = 6
 """Conditions of a name, at most."""
 HELPS = 0.7
 """Share of the prior's samples that a further condition may keep, at most."""
@@ -56,7 +56,7 @@ def name_mode(failures: pd.DataFrame, prior: pd.DataFrame) -> str:
     left = [each for name in varying for each in _conditions(failures, prior, name)]
     inside = np.ones(len(prior), bool)
     taken: list[Between | _Choice] = []
-    while left and len(taken) < MOST:
+    while left and len(taken) < MAX_WORDS:
         judged = inside if inside.sum() > FEW else np.ones(len(prior), bool)
         shares = [float(np.mean(each.matches(prior)[judged])) for each in left]
         best = int(np.argmin(shares))

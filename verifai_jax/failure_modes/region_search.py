@@ -27,7 +27,7 @@ SAME = 0.05
 """Distance below which two least distant failures are one, in parts of the first one's."""
 LOOKED_AT = 150
 """Failures from which paths to their region are tried, at a time."""
-WHOLE_EFFORT = 4500
+FULL_SEARCH = 4500
 """Simulations left from which so many are looked at; with fewer, as many fewer are."""
 A_LOOK = 8
 """Simulations that a look at a failure takes, about."""
@@ -57,11 +57,11 @@ def find_regions(
     **Raises:** `Ended` where time is over.
     """
     d = limit_state.dim
-    most = _scaled(limit_state, CANDIDATES)
+    maximum = _scaled(limit_state, CANDIDATES)
     regions = Regions(np.zeros((0, d)), np.zeros(0, int))
-    near = z[np.argsort(np.sum(z * z, axis=1))[: max(1, most // 4)]]
-    drawn = z[rng.choice(len(z), most // 2, p=share)]
-    _extend(limit_state, rng, regions, np.concatenate([_spread(nearest, most), near, drawn]))
+    near = z[np.argsort(np.sum(z * z, axis=1))[: max(1, maximum // 4)]]
+    drawn = z[rng.choice(len(z), maximum // 2, p=share)]
+    _extend(limit_state, rng, regions, np.concatenate([_spread(nearest, maximum), near, drawn]))
     for _ in range(ROUNDS):
         count = _scaled(limit_state, LOOKED_AT)
         rows, joined = _look(limit_state, rng, regions, z, share, count)
@@ -87,9 +87,9 @@ def share_explained(
     return int(joined.sum()), len(joined)
 
 
-def _scaled(limit_state: LimitState, most: int) -> int:
+def _scaled(limit_state: LimitState, maximum: int) -> int:
     """Return how many to look at, at least two."""
-    return max(2, round(most * min(1.0, _left(limit_state) / WHOLE_EFFORT)))
+    return max(2, round(maximum * min(1.0, _left(limit_state) / FULL_SEARCH)))
 
 
 def _left(limit_state: LimitState) -> int:
@@ -97,12 +97,14 @@ def _left(limit_state: LimitState) -> int:
     return limit_state.left - min(A_LOOK * LOOKED_AT, limit_state.left // 4)
 
 
-def _spread(points: Float[np.ndarray, "m d"], most: int) -> Float[np.ndarray, "_ d"]:
+def _spread(points: Float[np.ndarray, "m d"], maximum: int) -> Float[np.ndarray, "_ d"]:
     """Choose points that are far from one another, beginning with the least distant one."""
-    if len(points) <= most:
+    if len(points) <= maximum:
         return points
     nearest = int(np.sum(points**2, axis=1).argmin())
-    rows = farthest_first(nearest, lambda row: np.linalg.norm(points - points[row], axis=1), most)
+    rows = farthest_first(
+        nearest, lambda row: np.linalg.norm(points - points[row], axis=1), maximum
+    )
     return points[rows]
 
 

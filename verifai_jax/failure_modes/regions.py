@@ -21,7 +21,7 @@ NEIGHBOURS = 5
 """Regions whose nearest point a path is tried to, and further nearest points, at most."""
 PRIOR_FREEDOM = 4
 """Degrees of freedom that the prior's standard deviations count as, beside those of a region."""
-LEAST_SCALE, MOST_SCALE = 1e-4, 3.0
+MIN_SCALE, MAX_SCALE = 1e-4, 3.0
 """Least and greatest standard deviation of a region."""
 
 
@@ -81,7 +81,7 @@ class Regions:
                 continue
             # The logarithm of a standard deviation of few points is too low in the mean.
             bias = (digamma(freedom / 2) - np.log(freedom / 2)) / 2
-            own = np.clip(points.std(axis=0, ddof=1) * np.exp(-bias), LEAST_SCALE, MOST_SCALE)
+            own = np.clip(points.std(axis=0, ddof=1) * np.exp(-bias), MIN_SCALE, MAX_SCALE)
             stds[k] = own ** (freedom / (freedom + PRIOR_FREEDOM))
         return stds
 

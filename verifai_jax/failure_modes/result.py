@@ -35,12 +35,12 @@ class Mode(InNotebook):
     - `distance`: of that point from the middle of the prior, in standard deviations of normal
       space (the reliability index).
     - `rho`: robustness there.
-    - `cause`: the formula and the predicate that decide there, in words; empty without a verdict.
+    - `cause`: the formula and the predicate that decide there, as text; empty without a verdict.
     - `failures`: features of failures of this mode, distributed as the prior's, one a row.
     - `problem`: the problem.
     - `run`: the simulations of the likeliest failure, all with its random key where the system
       draws.
-    - `row`: row of `run` that fails at, or just beyond, the likeliest failure; None where
+    - `row`: row of `run` that fails at, or just beyond, the likeliest failure; None if
       none does.
     """
 
@@ -145,7 +145,7 @@ class Modes(Drawn, InNotebook):
     - `rest`: probability of further regions that are too improbable to be listed.
     - `simulations`, `budget`: used and allowed.
     - `upper_bound`: guaranteed, by samples of the prior alone.
-    - `notes`: surprises, in words.
+    - `notes`: sentences on anything surprising.
     - `run`: simulations of the likeliest failures, as `falsify` keeps them.
     - `seconds`: wall-clock time.
     - `sources`: what the model was made of, as a run records it.
@@ -251,10 +251,10 @@ class Modes(Drawn, InNotebook):
     __repr__ = __str__
 
 
-def _listed(features: Mapping[str, Any], most: int = 6) -> str:
+def _listed(features: Mapping[str, Any], maximum: int = 6) -> str:
     """Write features in one line, the first few of many."""
     parts = [
         f"{name} = {value:z.4g}" if isinstance(value, float | np.floating) else f"{name} = {value}"
-        for name, value in list(features.items())[:most]
+        for name, value in list(features.items())[:maximum]
     ]
-    return ", ".join(parts) + (", ..." if len(features) > most else "")
+    return ", ".join(parts) + (", ..." if len(features) > maximum else "")

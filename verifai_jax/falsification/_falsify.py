@@ -184,10 +184,10 @@ def falsify(
         by = "inputs" if diverse is True else diverse
         search = searches.Diverse(search, capacity=max(256, stop_after or 0), by=by)
     ends = Ending(started, budget, max_seconds, stop_after, stop_when)
-    with new_folder(folder) as place:
-        table = ErrorTable(tuple(problem.space.columns), place)
+    with new_folder(folder) as path:
+        table = ErrorTable(tuple(problem.space.columns), path)
         rounds = Rounds(
-            problem, search, size, seed, table, precision, place, confirm, executor, target, given,
+            problem, search, size, seed, table, precision, path, confirm, executor, target, given,
             suggests=asking is not None,
         )  # fmt: skip
         if asking is not None:
@@ -238,7 +238,7 @@ def simulate(
 
     - `rows`: a DataFrame with the feature columns of a table (from an analysis, another run, a
       file), a row of one, or features as a person writes them, one or several.
-    - the others as in `falsify`.
+    - all other arguments: as in `falsify`.
 
     All are checked before anything is simulated, and simulated with exactly these numbers, in the
     run's precision; those of a table give its bits again.
@@ -290,7 +290,7 @@ def resume(
     - `even_if_changed`: whether to go on where files of the model are others than those that the
       run recorded when it began; its rows are then of two models, it has no failure rate, and its
       notes and its record say so.
-    - the others as in `falsify`.
+    - all other arguments: as in `falsify`.
 
     The table is that of an uninterrupted run with this budget and the same `batch`, bit for bit,
     whatever the search. Where the earlier budget cut the last round of a search that learns, its

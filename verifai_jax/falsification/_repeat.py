@@ -229,7 +229,7 @@ def repeat(
     each = min(rounds, max(1, SIMULATIONS_A_CALL // batch))
     with in_precision(precision):
         program = traced.programs.get(
-            WHOLE_ROUNDS,
+            MERGED_ROUNDS,
             (search, batch, each, precision),
             lambda: _WholeRounds(traced, search, batch, each, precision),
         )
@@ -327,10 +327,10 @@ class _WholeRounds:
         def holds() -> Bool[np.ndarray, "rows 1"]:
             undecided = np.flatnonzero((rho.ravel() == 0) & (flat == Status.OK))
             every = np.ones((rho.size, 1), bool)
-            for place in undecided.tolist():
-                seed, row = divmod(place, rho.shape[1])
+            for index in undecided.tolist():
+                seed, row = divmod(index, rho.shape[1])
                 found = self.engine.holds(u[seed, row][None], keys[seed], first + row)
-                every[place] = found.all()
+                every[index] = found.all()
             return every
 
         return violations(rho.reshape(-1, 1), flat, holds).reshape(rho.shape)
@@ -364,18 +364,18 @@ class _WholeRounds:
             temperature = search.temperature(state) if search.wants.gradient else 1.0
             simulate = jax.vmap(self.engine.row, in_axes=(0, 0, None))
             row = simulate(u, keys, jnp.float32(temperature))
-            least = jnp.min(row.rho, axis=-1)
+            lowest = jnp.min(row.rho, axis=-1)
             gradient = row.derivatives.get("gradient")
             gradient = None if gradient is None else gradient.astype(jnp.float32)
             valid = row.status == Status.OK
-            observations = Observations(u, least.astype(jnp.float32), valid, gradient)
+            observations = Observations(u, lowest.astype(jnp.float32), valid, gradient)
             if search.learns:
                 state = search.tell(state, cube, observations)
-            return state, (u, least, row.status)
+            return state, (u, lowest, row.status)
 
         state, results = jax.lax.scan(step, state, jnp.arange(self.rounds, dtype=jnp.int32))
         return state, jax.tree.map(lambda each: each.reshape(-1, *each.shape[2:]), results)
 
 
-WHOLE_ROUNDS: Slot[tuple[Search, int, int, str], _WholeRounds] = Slot("whole rounds")
+MERGED_ROUNDS: Slot[tuple[Search, int, int, str], _WholeRounds] = Slot("whole rounds")
 """Compiled rounds by (search, batch, rounds, precision)."""

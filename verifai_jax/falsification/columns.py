@@ -69,7 +69,7 @@ def from_frame(frame: "pd.DataFrame") -> Columns:
 
 
 def wrong_column(columns: Columns, numbers: Sequence[str] = ()) -> str:
-    """Say which column holds what it cannot; empty where all are as they were written.
+    """Say which column holds what it cannot; empty if all are as they were written.
 
     **Arguments:**
 

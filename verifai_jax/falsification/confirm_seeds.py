@@ -114,7 +114,7 @@ class SeedConfirmer:
     def _confirmer(self, seed: int) -> Confirmer:
         if seed not in self._confirmers:
             self._confirmers[seed] = Confirmer(
-                self.problem, self.precision, int(self.seeds[seed]), most=WITHOUT_BOUND
+                self.problem, self.precision, int(self.seeds[seed]), max_rows=WITHOUT_BOUND
             )
         return self._confirmers[seed]
 

@@ -24,7 +24,7 @@ class Counts:
     - `repetitions`: how violating rows of a host system came again.
     - `worst`: number of the row of least robustness among those claimed; None without one.
     - `nearest`: that among all rows with a verdict.
-    - `least`: the least robustness of all rows; NaN where none has one.
+    - `lowest`: the least robustness of all rows; NaN where none has one.
     - `first_message`: number and text of the first row that has one, of those without a verdict.
     - `not_differentiated`: rows whose gradient is not finite.
     """
@@ -37,7 +37,7 @@ class Counts:
     repetitions: Repetitions = field(default_factory=Repetitions)
     worst: int | None = None
     nearest: int | None = None
-    least: float = float("nan")
+    lowest: float = float("nan")
     first_message: tuple[int, str] | None = None
     not_differentiated: int = 0
 
@@ -59,28 +59,28 @@ class Tally:
     - `claimed`: counterexamples that closer replays did not refute.
     - `violating`: simulations that violate the property.
     - `without_verdict`: simulations that have none.
-    - `least`: the least robustness.
+    - `lowest`: the least robustness.
     """
 
     claimed: int = 0
     violating: int = 0
     without_verdict: int = 0
-    least: float = float("nan")
+    lowest: float = float("nan")
 
     def add(self, verdicts: Verdicts, claimed: Bool[np.ndarray, " n"]) -> None:
         """Count the rows of a round."""
         self.claimed += int(np.sum(claimed))
         self.violating += int(np.sum(verdicts.violated))
         self.without_verdict += int(np.sum(~verdicts.proper))
-        self.least = float(np.fmin(self.least, np.fmin.reduce(verdicts.least)))
+        self.lowest = float(np.fmin(self.lowest, np.fmin.reduce(verdicts.lowest)))
 
 
 def claimed_rows(columns: Columns) -> Bool[np.ndarray, " n"]:
     """Tell rows that violate the property and are claimed to."""
     claimed = violating_rows(columns)
     if "verdict" in columns:
-        places = np.flatnonzero(claimed)
-        claimed[places] = ~np.isin(columns["verdict"][places], NOT_CLAIMED)
+        indices = np.flatnonzero(claimed)
+        claimed[indices] = ~np.isin(columns["verdict"][indices], NOT_CLAIMED)
     return claimed
 
 
@@ -106,16 +106,16 @@ def count(parts: Iterable[tuple[Int[np.ndarray, " n"], Columns]]) -> Counts:
             if "rho_again" in columns:
                 own = (columns[name][violating] for name in ("rho", "rho_again", "verdict"))
                 counts.repetitions = counts.repetitions.joined(Repetitions.count(*own))
-        least = np.fmin.reduce(np.asarray(columns["rho"], np.float64))
-        counts.least = float(np.fmin(counts.least, least))
+        minimum = np.fmin.reduce(np.asarray(columns["rho"], np.float64))
+        counts.lowest = float(np.fmin(counts.lowest, minimum))
         rho = np.nan_to_num(np.asarray(columns["rho"], np.float64), nan=np.inf)
         for name, among in (("worst", claimed), ("nearest", proper)):
-            places = np.flatnonzero(among)
-            if len(places):
-                place = places[np.argmin(rho[places])]
-                if getattr(counts, name) is None or rho[place] < lowest[name]:
-                    setattr(counts, name, int(numbers[place]))
-                    lowest[name] = float(rho[place])
+            indices = np.flatnonzero(among)
+            if len(indices):
+                index = indices[np.argmin(rho[indices])]
+                if getattr(counts, name) is None or rho[index] < lowest[name]:
+                    setattr(counts, name, int(numbers[index]))
+                    lowest[name] = float(rho[index])
         if counts.first_message is None and "message" in columns:
             said = (i for i in np.flatnonzero(~proper) if columns["message"][i])
             if (first := next(said, None)) is not None:

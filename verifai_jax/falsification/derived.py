@@ -9,7 +9,7 @@ own, `--only` holds features. Whoever goes on with the run names the problem as 
 from collections.abc import Mapping
 from typing import Any
 
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.problem.problem import Problem
 
 
@@ -28,7 +28,7 @@ def as_simulated(problem: Problem, record: Mapping[str, Any]) -> Problem:
     if derived is None or problem.system.derived is not None:
         return problem
     try:
-        return late("verifai_jax.fuzzing.implicit", "as_recorded")(problem, derived)
+        return lazy_import("verifai_jax.fuzzing.implicit", "as_recorded")(problem, derived)
     except (TypeError, ValueError, AttributeError, KeyError):
         return problem  # What differs is said where the two are compared.
 

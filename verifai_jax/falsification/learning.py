@@ -3,11 +3,11 @@
     learning = Learning(problem, search, key)
     learning.begin(batch=32)                            # once its programs are being compiled
     points = learning.proposals.next(32)
-    learning.learn(Batch(points, "search"), objective, verdicts, marks)
+    learning.learn(Batch(points, "search"), objective, verdicts, coverage_ids)
 
 A search minimises the robustness of the worst formula, or, where formulas have a priority, the one
-number of `problem.rulebook.Objective`; a guide adds its term. Some searches want more: marks of
-what was covered, what happened in a trace, or a model of the traces (`Surrogate`).
+number of `problem.rulebook.Objective`; a guide adds its term. Some searches want more: coverage ids
+of what was covered, what happened in a trace, or a model of the traces (`Surrogate`).
 """
 
 from collections.abc import Mapping
@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from verifai_jax.evaluation.steering import Steering
+from verifai_jax.evaluation.guidance import Guidance
 from verifai_jax.evaluation.verdicts import Verdicts
-from verifai_jax.falsification.marks import MarkBook
+from verifai_jax.falsification.coverage_counts import CoverageCounts
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Objective
 from verifai_jax.search import Search
@@ -66,14 +66,15 @@ class Learning:
     - `search`: of the run.
     - `key`: of the search.
 
-    `surrogate` models the traces for a search that wants it, `marks` counts what was covered.
+    `surrogate` models the traces for a search that wants it, `coverage_ids` counts what was
+    covered.
     """
 
     def __init__(self, problem: Problem, search: Search, key: Key[Array, ""]) -> None:
         self.problem, self.search, self._key = problem, search, key
         guided = problem.guide is not None and search.learns
-        self.steering = Steering(guide=guided, outcome=search.wants.outcomes)
-        self.marks = MarkBook(problem) if search.wants.marks else None
+        self.guidance = Guidance(guide=guided, outcome=search.wants.outcomes)
+        self.coverage_ids = CoverageCounts(problem) if search.wants.coverage_ids else None
         self.surrogate: Surrogate | None = None
         self._objective = None if problem.rulebook is None else Objective(problem.rulebook)
         self.proposals: Any = None
@@ -88,16 +89,22 @@ class Learning:
             self.surrogate = Surrogate(self.problem, search.wants.traces, self._key)
 
     @property
-    def mark_width(self) -> int:
-        """Number of marks of a row at most; 0 if none are counted."""
-        return 0 if self.marks is None else self.marks.width
+    def coverage_id_count(self) -> int:
+        """Number of coverage ids of a row at most; 0 if none are counted."""
+        return 0 if self.coverage_ids is None else self.coverage_ids.width
 
     def begin(self, batch: int) -> None:
         """Begin the proposals of the search."""
         space = self.problem.space
         improve = None if self.surrogate is None else self.surrogate.improve
         self.proposals = Proposals(
-            self.search, space.cube, batch, self._key, space.constraint, self.mark_width, improve
+            self.search,
+            space.cube,
+            batch,
+            self._key,
+            space.constraint,
+            self.coverage_id_count,
+            improve,
         )
 
     @property
@@ -115,7 +122,7 @@ class Learning:
     def objective(self, verdicts: Verdicts) -> Float[np.ndarray, " n"]:
         """Return what the search minimises; with a priority it depends on the rows before."""
         if self._objective is None:
-            return verdicts.least
+            return verdicts.lowest
         return self._objective(verdicts.rho, verdicts.rho < 0)
 
     def learn(
@@ -123,7 +130,7 @@ class Learning:
         batch: Batch,
         objective: Float[np.ndarray, " n"],
         verdicts: Verdicts,
-        marks: Int[np.ndarray, "n marks"] | None,
+        coverage_ids: Int[np.ndarray, "n ids"] | None,
     ) -> None:
         """Let the search learn from a round.
 
@@ -132,18 +139,18 @@ class Learning:
         - `batch`: its points, of the unit cube.
         - `objective`: what the search minimises at each of them.
         - `verdicts`: of its simulations.
-        - `marks`: of its simulations, for a search that wants them.
+        - `coverage_ids`: of its simulations, for a search that wants them.
         """
         outcomes = None
-        if verdicts.steering is not None:
-            if self.steering.guide:
-                objective = self._guided(objective, verdicts.steering[:, 0])
-            if self.steering.outcome:
-                outcomes = verdicts.steering[:, int(self.steering.guide) :]
+        if verdicts.guidance is not None:
+            if self.guidance.guide:
+                objective = self._with_guide(objective, verdicts.guidance[:, 0])
+            if self.guidance.outcome:
+                outcomes = verdicts.guidance[:, int(self.guidance.guide) :]
         if batch.given:
             self._learn_given(batch, objective, verdicts, outcomes)
         else:
-            self._tell(objective, verdicts, marks, outcomes)
+            self._tell(objective, verdicts, coverage_ids, outcomes)
         if self.surrogate is not None:
             self.surrogate.learn(batch.points, verdicts)
 
@@ -171,7 +178,7 @@ class Learning:
         self,
         objective: Float[np.ndarray, " n"],
         verdicts: Verdicts,
-        marks: Int[np.ndarray, "n marks"] | None,
+        coverage_ids: Int[np.ndarray, "n ids"] | None,
         outcomes: Float[np.ndarray, "n outcome"] | None,
     ) -> None:
         """Tell the search what came of its points, in float32 whatever the simulations do."""
@@ -185,16 +192,16 @@ class Learning:
             single(verdicts.gradient),
             single(verdicts.clauses),
             single(verdicts.clause_gradients),
-            marks,
+            coverage_ids,
             outcomes,
         )
 
-    def _guided(
+    def _with_guide(
         self, rho: Float[np.ndarray, " n"], value: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"]:
         """Return the objective with the term of the guide, if there is one."""
         guide = self.problem.guide
-        return rho if guide is None or not self.steering.guide else guide.steer(rho, value)
+        return rho if guide is None or not self.guidance.guide else guide.steer(rho, value)
 
     def warm(self, table: "pd.DataFrame") -> None:
         """Let the search learn from the rows of an earlier table."""
@@ -210,14 +217,14 @@ class Learning:
             each = proper[names].to_numpy(np.float64)
             rho = self._objective(each, each < 0).astype(np.float32)
         # What the guide says of these rows is unknown; it counts as the least good.
-        rho = self._guided(rho, np.full(len(rho), np.nan, np.float32))
+        rho = self._with_guide(rho, np.full(len(rho), np.nan, np.float32))
         self.proposals.warm_start(self.problem.space.points(proper), rho)
 
     def checkpoint(self) -> dict[str, Any]:
         """Return what it knows as entries of a checkpoint, but for the state of the search."""
         state = {} if self._objective is None else self._objective.state
         entries: dict[str, Any] = {f"objective.{name}": value for name, value in state.items()}
-        for part in (self.surrogate, self.marks):
+        for part in (self.surrogate, self.coverage_ids):
             entries |= {} if part is None else part.checkpoint()
         return entries
 
@@ -230,6 +237,6 @@ class Learning:
         if self._objective is not None:
             names = self._objective.state
             self._objective.state = {name: checkpoint[f"objective.{name}"] for name in names}
-        for part in (self.surrogate, self.marks):
+        for part in (self.surrogate, self.coverage_ids):
             if part is not None:
                 part.restore(checkpoint)

@@ -24,7 +24,7 @@ from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.confirm_seeds import SeedConfirmer
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Observations, Search
-from verifai_jax.search.proposals import effort_of
+from verifai_jax.search.proposals import optimization_of
 from verifai_jax.search.repetition import Repetition
 
 VALUES_AT_ONCE = 256
@@ -75,8 +75,8 @@ def lockstep(
     state = start(jnp.stack([key for key, _ in keys]))
     repetitions = [Repetition(cube, key) for key, _ in keys] if cube.dim else []
     engines = {
-        kind: _engine(problem, kind, min(n * batch, most), precision)
-        for kind, most in ((False, VALUES_AT_ONCE), (True, DERIVATIVES_AT_ONCE))
+        kind: _engine(problem, kind, min(n * batch, maximum), precision)
+        for kind, maximum in ((False, VALUES_AT_ONCE), (True, DERIVATIVES_AT_ONCE))
     }
     number_keys = jax.jit(jax.vmap(simulation_key))
     rho: list[list[float]] = [[] for _ in range(n)]
@@ -97,12 +97,14 @@ def lockstep(
         rows = np.minimum(rows, left)
         if not rows.any():
             break
-        u, told = u.copy(), u.copy()
+        u, learned = u.copy(), u.copy()
         proposed += planned
         for seed, repetition in enumerate(repetitions):
             chosen = np.arange(batch) < planned[seed]
             number = int(proposed[seed])
-            u[seed], told[seed] = repetition.avoid(told[seed], chosen, not wanted[seed], number)
+            u[seed], learned[seed] = repetition.avoid(
+                learned[seed], chosen, not wanted[seed], number
+            )
             repetition.add(u[seed, : rows[seed]])
         values = np.full((n, batch), np.nan, np.float32)
         valid, broken = np.zeros((n, batch), bool), np.zeros((n, batch), bool)
@@ -118,15 +120,15 @@ def lockstep(
             for first in range(0, len(seed), engine.batch):
                 block = slice(first, first + engine.batch)
                 # Always as many, so that one program makes the keys.
-                place = np.minimum(np.arange(first, first + engine.padded), len(seed) - 1)
-                own = number_keys(run_key[seed[place]], numbers[place].astype(np.int32))
+                index = np.minimum(np.arange(first, first + engine.padded), len(seed) - 1)
+                own = number_keys(run_key[seed[index]], numbers[index].astype(np.int32))
                 some = seed[block], row[block]
                 parts.append(engine.evaluate(u[some], own, temperature=temperature[some]))
             count_done(len(seed))
             verdicts = Verdicts.concatenate(parts)
             raising.add(verdicts.status, verdicts.messages)
             raising.check(problem.name)
-            values[seed, row], valid[seed, row] = verdicts.least, verdicts.proper
+            values[seed, row], valid[seed, row] = verdicts.lowest, verdicts.proper
             broken[seed, row], clauses[seed, row] = verdicts.violated, verdicts.clauses
             if kind:
                 clause_gradients[seed, row] = verdicts.clause_gradients
@@ -151,7 +153,7 @@ def lockstep(
             if len(first) and not failed[seed]:
                 failed[seed], failures[seed] = True, u[seed, first[0]]
         observations = Observations(
-            u=jnp.asarray(told),
+            u=jnp.asarray(learned),
             rho=jnp.asarray(values),
             valid=jnp.asarray(valid),
             clauses=jnp.asarray(clauses),
@@ -189,7 +191,7 @@ def _search_programs(
 
     def make() -> tuple[jax.stages.Wrapped, ...]:
         # As for `falsify`: what is rounded otherwise may end up elsewhere.
-        options = options_of(effort_of(search, batch))
+        options = options_of(optimization_of(search, batch))
         compiled = partial(jax.jit, compiler_options=options)
         return (
             compiled(jax.vmap(lambda key: search.init(key, cube, batch))),

@@ -41,7 +41,7 @@ from verifai_jax.search.proposals import compiled_search
 if TYPE_CHECKING:
     import pandas as pd
 
-    from verifai_jax.falsification.ahead import Ahead
+    from verifai_jax.falsification.prefetch import Prefetch
     from verifai_jax.falsification.suggestions import Suggestions
 
 COMPILE, SEARCH, SIMULATE, CONFIRM, REST = "compile", "search", "simulate", "confirm", "rest"
@@ -91,7 +91,7 @@ class Rounds:
             journal=self._journal,
             executor=executor,
             target=target,
-            steering=self.learning.steering,
+            guidance=self.learning.guidance,
             keep_traces=self.learning.surrogate is not None,
             given=suggests or self.first.shape[1] > problem.space.dim,
         )
@@ -105,8 +105,8 @@ class Rounds:
         self.checkpoint: dict[str, Any] = {}
         self.record_checksum = 0
         self._pending: Any = None  # Points of the first round that are proposed already.
-        self._sends_ahead = executor is not None and not search.learns
-        self._ahead: Ahead | None = None
+        self._prefetches = executor is not None and not search.learns
+        self._prefetch: Prefetch | None = None
         self._saved = time.perf_counter()
         self._raising = Raising()
 
@@ -123,7 +123,7 @@ class Rounds:
         if differentiates:
             # They take longest to load: first, where nothing of them is to be traced.
             self._simulations.begin_if_recalled()
-        compiled_search(stage, cube, self.batch, self.learning.mark_width)
+        compiled_search(stage, cube, self.batch, self.learning.coverage_id_count)
         self.evaluate.begin_compiling()
         if differentiates:
             self._simulations.begin_derivatives()
@@ -134,13 +134,13 @@ class Rounds:
         self.learning.begin(self.batch)
         self._keep()
 
-    def advance(self, most: int, limit: int | None = None) -> None:
-        """Propose, simulate, confirm, learn and store at most `most` simulations.
+    def advance(self, maximum: int, limit: int | None = None) -> None:
+        """Propose, simulate, confirm, learn and store at most `maximum` simulations.
 
         - `limit`: simulations of the whole run, up to which points may be sent ahead to workers.
         """
         with self.watch.on(SIMULATE):
-            batch = self._next_points(most, limit)
+            batch = self._next_points(maximum, limit)
             if not len(batch.points):
                 self.learning.proposals.tell_refused()
                 self._keep()
@@ -153,34 +153,34 @@ class Rounds:
                 # A larger budget goes on before a round that this one cut, with all of its points.
                 self._keep()
 
-    def _next_points(self, most: int, limit: int | None) -> Batch:
+    def _next_points(self, maximum: int, limit: int | None) -> Batch:
         """Return the points of the next round: given ones, then suggestions, then proposals."""
         # The number of rows alone says how many of them are still to come, so resuming goes on.
         done = len(self.table)
-        given = self.first[done : done + most]
+        given = self.first[done : done + maximum]
         if len(given):
-            return Batch(given, "first", most < self.batch and len(self.first) > done + most)
+            return Batch(given, "first", maximum < self.batch and len(self.first) > done + maximum)
         if self.suggestions is not None:
             with self._searching():
                 given = self._suggested(self.suggestions, done)
-            left = most if limit is None else max(limit - done, 0)
+            left = maximum if limit is None else max(limit - done, 0)
             if len(given[:left]):
                 return Batch(given[:left], "suggested", limit is not None and len(given) > left)
-        if self._sends_ahead:
-            if self._ahead is None:
-                from verifai_jax.falsification.ahead import Ahead
+        if self._prefetches:
+            if self._prefetch is None:
+                from verifai_jax.falsification.prefetch import Prefetch
 
-                limit = done + most if limit is None else limit
+                limit = done + maximum if limit is None else limit
                 proposals = self.learning.proposals
-                self._ahead = Ahead(proposals, self.evaluate, self.batch, limit, done)
-            points, verdicts = self._ahead.next()
+                self._prefetch = Prefetch(proposals, self.evaluate, self.batch, limit, done)
+            points, verdicts = self._prefetch.next()
             return Batch(points, "search", verdicts=verdicts)
         points, self._pending = self._pending, None
         if points is not None:
             return Batch(points, "search")
         self._begin_stage()
         with self._searching():
-            points = self.learning.proposals.next(most)
+            points = self.learning.proposals.next(maximum)
         return Batch(points, "search", self.learning.proposals.cut)
 
     def _simulate(self, batch: Batch, first: int) -> Verdicts:
@@ -209,11 +209,11 @@ class Rounds:
         columns = rows_of(self.problem, verdicts, self._simulations.differentiates)
         if self.suggestions is not None:
             columns["suggested"] = np.full(len(batch.points), batch.source == "suggested")
-        marks, book = None, self.learning.marks
+        coverage_ids, book = None, self.learning.coverage_ids
         if book is not None:
-            marks = book.of(batch.points, verdicts)
-            columns["new_marks"] = book.add(marks)
-            marks = book.of_kinds(marks)
+            coverage_ids = book.of(batch.points, verdicts)
+            columns["new_coverage"] = book.add(coverage_ids)
+            coverage_ids = book.of_kinds(coverage_ids)
         objective = self.learning.objective(verdicts)
         claimed = verdicts.violated
         if self._confirmer is not None:
@@ -221,7 +221,7 @@ class Rounds:
             verdicts = without_failure(verdicts, verdicts.violated & ~claimed)
         if learns:
             with self._searching():
-                self.learning.learn(batch, objective, verdicts, marks)
+                self.learning.learn(batch, objective, verdicts, coverage_ids)
         self.table.append(columns)
         self.tally.add(verdicts, claimed)
 
@@ -280,7 +280,7 @@ class Rounds:
         waiting = suggestions.waiting(rows)
         if len(waiting) or not suggestions.due(rows):
             return waiting
-        from verifai_jax.falsification.question import describe_run
+        from verifai_jax.falsification.suggestion_prompt import describe_run
 
         question = describe_run(
             self.problem,
@@ -296,21 +296,21 @@ class Rounds:
         self.save()
         return suggestions.waiting(rows)
 
-    def measure(self, most: int, timed: bool) -> float:
+    def measure(self, maximum: int, timed: bool) -> float:
         """Simulate the first rows, and return the least seconds that one took.
 
         They are rows of the run. One by one, a first one that is quick is the only one, unless it
         raises.
 
-        - `most`: of the first round.
+        - `maximum`: of the first round.
         - `timed`: whether the seconds are wanted, for which they are simulated one by one.
         """
         if not len(self.first):
             with self._searching():
-                self._pending = self.learning.proposals.next(most)
+                self._pending = self.learning.proposals.next(maximum)
         points = np.asarray(self.first if len(self.first) else self._pending)
         with self.watch.on(SIMULATE):
-            return self._simulations.measure(points[:most], timed)
+            return self._simulations.measure(points[:maximum], timed)
 
     def take_in_measured(self) -> None:
         """Store the rows that were simulated one by one, without the rest of their round.
@@ -391,20 +391,22 @@ class Rounds:
             "violating": self.tally.violating,
             "counterexamples": self.tally.claimed,
             "without_verdict": self.tally.without_verdict,
-            "least_robustness": self.tally.least,
+            "least_robustness": self.tally.lowest,
         }
 
     @property
     def exhausted(self) -> bool:
         """True if a finite search has come to its end."""
-        waiting = self._pending is not None or (self._ahead is not None and not self._ahead.empty)
+        waiting = self._pending is not None or (
+            self._prefetch is not None and not self._prefetch.empty
+        )
         proposals = self.learning.proposals
         return proposals is not None and proposals.exhausted and not waiting
 
     def close(self) -> None:
         """Cancel what workers have been sent ahead and have not begun."""
-        if self._ahead is not None:
-            self._ahead.close()
+        if self._prefetch is not None:
+            self._prefetch.close()
 
     def save(self, seldom: bool = False) -> None:
         """Write the checkpoint to the folder; if `seldom`, only when the last one is a second old.
@@ -432,12 +434,12 @@ class Rounds:
             part.restore(checkpoint)
         counts = self.table.counts
         self._raising.always = counts.without_verdict == len(self.table)
-        self.tally = Tally(counts.claimed, counts.violating, counts.without_verdict, counts.least)
+        self.tally = Tally(counts.claimed, counts.violating, counts.without_verdict, counts.lowest)
         self._keep()
 
     def _keep(self) -> None:
         """Take the checkpoint: nothing is copied, as nothing in it is ever written to."""
-        ahead, proposals = self._ahead, self.learning.proposals
+        ahead, proposals = self._prefetch, self.learning.proposals
         state = proposals.checkpoint() if ahead is None else ahead.checkpoint
         self.checkpoint = {**state, "rows": np.array(len(self.table))}
         for part in self._parts:

@@ -46,7 +46,7 @@ def model_changes(
     - `now`: what the model is made of now; without it what lies on the disk counts.
     - `row`: of a run; all that it was simulated with where it is None.
 
-    **Returns:** the changes; none where nothing is recorded.
+    **Returns:** the changes; empty if nothing is recorded.
     """
     parts = [Sources.from_json(part) for part in recorded]
     if row is not None:
@@ -102,7 +102,7 @@ def has_several_models(recorded: Sequence[Mapping[str, Any]]) -> bool:
 
 
 def changed_since(changes: Sequence[Change], row: int | None, what: str = "the run") -> str:
-    """Say that the model has changed; empty where it has not."""
+    """Say that the model has changed; empty if it has not."""
     if not changes:
         return ""
     when = what if row is None else f"row {row} was simulated"
@@ -112,7 +112,7 @@ def changed_since(changes: Sequence[Change], row: int | None, what: str = "the r
 def finding_of(
     seen: Replay, stored: Mapping[str, Any], several: bool, near: float | None = None
 ) -> str:
-    """Say that a replay does not give the number of its row; empty where it does.
+    """Say that a replay does not give the number of its row; empty if it does.
 
     **Arguments:**
 

@@ -53,7 +53,7 @@ _BETWEEN_UNKNOWN = (
 
 
 def why_no_rate(run: Run) -> str:
-    """Say why the rows of a run give no failure rate; empty where they are samples of the prior."""
+    """Say why the rows of a run give no failure rate; empty if they are samples of the prior."""
     if run.prior:
         return ""
     if run.origin == "first":

@@ -44,7 +44,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     """
     file = folder / RECORD
     if not file.is_file():
-        raise FileNotFoundError(f"no run in {folder}: {RECORD} is missing{_rows_beside(folder)}")
+        raise FileNotFoundError(f"no run in {folder}: {RECORD} is missing{_rows_alongside(folder)}")
     try:
         record = json.loads(file.read_text())
     except (ValueError, RecursionError):
@@ -52,7 +52,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     if not isinstance(record, dict) or not isinstance(record.get("format"), int):
         raise ValueError(
             f"no run in {folder}: its {RECORD} is damaged, or of another program"
-            f"{_rows_beside(folder)}"
+            f"{_rows_alongside(folder)}"
         )
     if record.get("format") != FORMAT:
         raise ValueError(
@@ -63,10 +63,11 @@ def read_record(folder: Path) -> dict[str, Any]:
     for name, fits in _FORMS.items():
         if name not in record or not fits(record[name]):
             what = f"has no {name!r}" if name not in record else f"has {name!r} of another form"
-            raise ValueError(f"{file} is damaged: it {what}{_rows_beside(folder)}")
+            raise ValueError(f"{file} is damaged: it {what}{_rows_alongside(folder)}")
     if not is_intact(record):
         raise ValueError(
-            f"{file} is damaged: its content has changed since it was written{_rows_beside(folder)}"
+            f"{file} is damaged: its content has changed since it was "
+            f"written{_rows_alongside(folder)}"
         )
     return record
 
@@ -92,7 +93,7 @@ _NUMERIC = ("Box", "DiscreteBox", "Normal", "TruncatedNormal", "LogUniform", "Lo
 """Kinds of domains, the usual ones, whose columns are numbers."""
 
 
-def _rows_beside(folder: Path) -> str:
+def _rows_alongside(folder: Path) -> str:
     """Say how the rows of a folder are read without its record."""
     if (folder / FINISHED).is_file():
         return f"; the rows are in {folder / FINISHED}, which pandas.read_parquet reads"

@@ -26,7 +26,7 @@ def rows_of(
     assert verdicts.features is not None
     columns: dict[str, np.ndarray] = {**problem.space.rows(verdicts.features)}
     # Adding 0 makes a robustness of -0 one of 0.
-    columns["rho"] = verdicts.least + 0.0
+    columns["rho"] = verdicts.lowest + 0.0
     if len(problem.formulas) > 1:
         for i, name in enumerate(problem.formulas):
             columns[f"rho.{name}"] = verdicts.rho[:, i] + 0.0

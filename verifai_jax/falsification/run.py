@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from verifai_jax.core.keys import run_keys
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.locks import write_lock
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.seals import sealed
@@ -102,7 +102,7 @@ class Run(InNotebook):
     - `first`: points of the unit cube that were simulated before the search began.
     - `guide`: the term that steered the search, as plain data; None without one.
     - `sources`: what the model was made of when the run began, and again where it went on with
-      another one: files with their hashes, and versions, as plain data; empty where that is not
+      another one: files with their hashes, and versions, as plain data; empty if that is not
       recorded.
     - `derived`: what a verb made of the problem that it was given, as plain data; None if it was
       simulated as it was.
@@ -262,7 +262,7 @@ class Run(InNotebook):
         return model_changes(self.sources, now, row)
 
     def changed_since(self, row: int | None = None) -> str:
-        """Say in a sentence which files of the model are others by now; empty where none is."""
+        """Say in a sentence which files of the model are others by now; empty if none is."""
         return changed_since(self.changes(row), row)
 
     def compared(self, seen: Replay) -> Replay:
@@ -341,7 +341,7 @@ class Run(InNotebook):
 
     def analyze(self, **options: Any) -> Any:
         """Analyse the table: rules, importance, clusters, coverage; see `analysis.analyze`."""
-        return late("verifai_jax.analysis", "analyze")(self, **options)
+        return lazy_import("verifai_jax.analysis", "analyze")(self, **options)
 
     def replay(
         self, row: "int | np.integer | pd.Series | Mapping[str, Any]", precision: str | None = None
@@ -415,19 +415,21 @@ class Run(InNotebook):
         **Arguments:**
 
         - `folder`: it is made where there is none.
-        - `options`: of `counterexamples.save_counterexamples`: `most`, `shrink`, `budget`.
+        - `options`: of `counterexamples.save_counterexamples`: `max_count`, `shrink`, `budget`.
 
         **Raises:** `ValueError` for a run without its problem or without a counterexample.
         """
-        return late("verifai_jax.counterexamples", "save_counterexamples")(self, folder, **options)
+        return lazy_import("verifai_jax.counterexamples", "save_counterexamples")(
+            self, folder, **options
+        )
 
     def summary(self) -> str:
         """Write what failed, how often, the worst case and how to see it again."""
-        return late("verifai_jax.falsification.summary", "summarize")(self)
+        return lazy_import("verifai_jax.falsification.summary", "summarize")(self)
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the feature space with safe and failing samples; returns the figure."""
-        return late("verifai_jax.plotting.scatter", "plot_features")(self, path)
+        return lazy_import("verifai_jax.plotting.scatter", "plot_features")(self, path)
 
     def report(self, path: str | Path, **options: Any) -> Path:
         """Write the evidence report on the run: one HTML file, and its claims as JSON next to it.
@@ -440,7 +442,7 @@ class Run(InNotebook):
 
         **Returns:** the path.
         """
-        return late("verifai_jax.reports", "write_report")(self, path, **options)
+        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
 
     def explore(self) -> Any:
         """Return a view of the table for a notebook: scatter, parallel coordinates, traces.
@@ -448,7 +450,7 @@ class Run(InNotebook):
         A row under the pointer shows its values; a clicked one is simulated again. It needs
         anywidget (extra `widget`); without it this is the picture of `plot`.
         """
-        return late("verifai_jax.reports", "explore")(self)
+        return lazy_import("verifai_jax.reports", "explore")(self)
 
     def save(self, path: str | Path) -> Path:
         """Write the run to a folder: its record, table and state; returns the folder.
@@ -588,4 +590,6 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
 
 def as_made(run: Run) -> Run:
     """Return a run as the verb that made it does: one of `fuzz` has its coverage."""
-    return run if run.derived is None else late("verifai_jax.fuzzing.run", "as_fuzz_run")(run)
+    return (
+        run if run.derived is None else lazy_import("verifai_jax.fuzzing.run", "as_fuzz_run")(run)
+    )

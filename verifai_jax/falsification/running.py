@@ -188,7 +188,7 @@ class Running:
         with rounds.watch.on(REST):
             while stopped is None:
                 rounds.advance(min(rounds.batch, budget - len(rounds.table)), budget)
-                bar.update(len(rounds.table), rounds.tally.claimed, rounds.tally.least)
+                bar.update(len(rounds.table), rounds.tally.claimed, rounds.tally.lowest)
                 notify(callbacks, len(rounds.table), rounds.numbers)
                 stopped = self.ends.reached(rounds)
                 if stopped is None and self._is_hopeless:
@@ -295,17 +295,17 @@ def _hopeless_message(run: Run, said: str, budget: int) -> str:
     )
 
 
-def _failure_message(name: str, simulations: int, place: Path | None, cause: Exception) -> str:
+def _failure_message(name: str, simulations: int, folder: Path | None, cause: Exception) -> str:
     why = str(cause) if isinstance(cause, OSError) else explain_user_error(cause)
     message = f"the run of {name!r} broke down after {simulations} simulations: {why}. "
-    if place is None:
+    if folder is None:
         return f"{message}They are in the .run of this error"
-    if isinstance(cause, OSError) and not place.is_dir():
-        return f"{message}{place} is there no more: all are in the .run of this error, to be saved"
+    if isinstance(cause, OSError) and not folder.is_dir():
+        return f"{message}{folder} is there no more: all are in the .run of this error, to be saved"
     if isinstance(cause, OSError):
         return (
-            f"{message}All of them are in the .run of this error, and in {place} those up to the "
+            f"{message}All of them are in the .run of this error, and in {folder} those up to the "
             "last whole batch that could be written: make room there and resume it, or save the "
             "run elsewhere"
         )
-    return f"{message}They are in the .run of this error and in {place}, which can be resumed"
+    return f"{message}They are in the .run of this error and in {folder}, which can be resumed"

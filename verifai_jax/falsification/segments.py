@@ -58,7 +58,7 @@ class Segment:
 
     @property
     def damage(self) -> str:
-        """Say what has become of the file; empty where it is as it was written."""
+        """Say what has become of the file; empty if it is as it was written."""
         try:
             checksum = 0
             with open(self.path, "rb") as file:
@@ -109,9 +109,9 @@ class Segment:
     def read_standing_out(self) -> "pd.DataFrame":
         """Return those of its rows that stand out, from their own file where it is whole."""
         folder = self.path.parent.parent / FAILURES
-        for beside in list_segments(folder):
-            if (beside.first, beside.stop) == (self.first, self.stop) and not beside.damage:
-                return beside.read()
+        for others in list_segments(folder):
+            if (others.first, others.stop) == (self.first, self.stop) and not others.damage:
+                return others.read()
         frame = self.read()
         return frame.iloc[standing_out({str(name): frame[name].to_numpy() for name in frame})]
 
@@ -136,23 +136,23 @@ def write_segment(run: Path, first: int, columns: Columns) -> Segment:
 
     **Raises:** `OSError` where they cannot be written.
     """
-    places = standing_out(columns)
-    few = {name: values[places] for name, values in columns.items()}
+    indices = standing_out(columns)
+    few = {name: values[indices] for name, values in columns.items()}
     stop = first + len(columns["rho"])
     # First: without its segment it is none, and the segment comes with one.
-    _write(run / FAILURES, first, stop, parquet(few, first + places))
+    _write(run / FAILURES, first, stop, parquet(few, first + indices))
     path = _write(run / SEGMENTS, first, stop, parquet(columns, np.arange(first, stop)))
     return Segment(first, stop, path)
 
 
 def _write(folder: Path, first: int, stop: int, content: "pa.Buffer") -> Path:
     folder.mkdir(exist_ok=True)
-    return write_whole(
+    return write_complete(
         folder / f"rows-{first:012d}-{stop:012d}-{zlib.crc32(content):08x}.parquet", content
     )
 
 
-def write_whole(path: Path, content: "pa.Buffer | bytes") -> Path:
+def write_complete(path: Path, content: "pa.Buffer | bytes") -> Path:
     """Write a file such that a reader never meets a half of it; return its path."""
     partial = path.with_name(f".{path.name}.part")  # Readers of a folder leave it out.
     try:

@@ -43,7 +43,7 @@ from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.evaluation.worker import ARRAYS, evaluate_block
 from verifai_jax.falsification._falsify import falsify
 from verifai_jax.falsification.run import Run
-from verifai_jax.falsification.segments import write_whole
+from verifai_jax.falsification.segments import write_complete
 from verifai_jax.falsification.validation import (
     adapt_search,
     check_options,
@@ -70,7 +70,7 @@ _OPTIONS = (
 class Shard:
     """The part `number` of `of` parts of a run, counted from 1.
 
-    **Raises:** `ValueError` for a part that there is not.
+    **Raises:** `ValueError` for a part that does not exist.
     """
 
     number: int
@@ -125,7 +125,8 @@ def simulate_shard(
 
     - `shard`: the part.
     - `folder`: of this part alone.
-    - the others as in `falsify`, the same for all parts; `confirm` is done when they are merged.
+    - all other arguments: as in `falsify`, the same for all parts; `confirm` is done when they are
+      merged.
 
     **Returns:** the number of simulations of this part.
 
@@ -150,7 +151,7 @@ def simulate_shard(
     problem = resolved(problem, batch=batch, budget=budget, precision=precision, wanted=backend)[0]
     problem.check()
     search, _ = adapt_search(problem, search)
-    place = Path(folder)
+    path = Path(folder)
     record = {
         "name": problem.name,
         "formulas": {name: str(formula) for name, formula in problem.formulas.items()},
@@ -166,12 +167,12 @@ def simulate_shard(
         "shard": [shard.number, shard.of],
         "sources": problem.sources().to_json(),
     }
-    with writing(place):
-        place.mkdir(parents=True, exist_ok=True)
-    with locked(place):
-        _claim(place, record)
+    with writing(path):
+        path.mkdir(parents=True, exist_ok=True)
+    with locked(path):
+        _claim(path, record)
         rows = shard.rows(budget, _unit(problem, batch))
-        _simulate(problem, search, rows, record, place, progress, str(shard))
+        _simulate(problem, search, rows, record, path, progress, str(shard))
     return len(rows)
 
 
@@ -186,7 +187,7 @@ def _simulate(
     search: Search,
     rows: range,
     record: Mapping[str, Any],
-    place: Path,
+    folder: Path,
     progress: bool | None,
     shard: str,
 ) -> None:
@@ -196,8 +197,8 @@ def _simulate(
     key, space = run_keys(record["seed"])[0], problem.space
     proposals = Proposals(search, space.cube, batch, key, space.constraint, 0)
     done = set()
-    for block, path in list(_blocks(place)):
-        if _is_whole(path):
+    for block, path in list(_blocks(folder)):
+        if _is_complete(path):
             done.add((block.start, block.stop))
         else:
             path.unlink()  # It is made anew.
@@ -211,41 +212,41 @@ def _simulate(
                 if (begin, stop) not in done:
                     u = np.asarray(points, np.float32)[begin - first : stop - first]
                     verdicts = evaluate(u, first=begin)
-                    _write(place, begin, u, verdicts)
+                    _write(folder, begin, u, verdicts)
                     found += int(verdicts.violated.sum())
-                    best = float(np.fmin(best, np.fmin.reduce(verdicts.least)))
+                    best = float(np.fmin(best, np.fmin.reduce(verdicts.lowest)))
                 simulated += stop - begin
                 bar.update(simulated, found, best)
             first += len(points)
 
 
-def _claim(place: Path, record: Mapping[str, Any]) -> None:
+def _claim(folder: Path, record: Mapping[str, Any]) -> None:
     """Write the record of a part, or refuse the folder of another one."""
-    if (place / RECORD).exists():
-        known = read_shard(place)
+    if (folder / RECORD).exists():
+        known = read_shard(folder)
         for name, value in json.loads(json.dumps(record)).items():
             if name == "sources":
-                _check_same_model(place, known, Sources.from_json(value))
+                _check_same_model(folder, known, Sources.from_json(value))
             elif known[name] != value:
                 raise ValueError(
-                    f"{place} holds another part: its {name} is {one_line(str(known[name]))}, "
+                    f"{folder} holds another part: its {name} is {one_line(str(known[name]))}, "
                     f"here {one_line(str(value))}; give another folder"
                 )
         return
-    if {path.name for path in place.iterdir()} - {LOCK}:
-        raise ValueError(f"folder {str(place)!r} is not empty; a part of a run needs a new one")
-    with writing(place):
-        write_whole(place / RECORD, json.dumps(sealed(record), indent=2).encode())
+    if {path.name for path in folder.iterdir()} - {LOCK}:
+        raise ValueError(f"folder {str(folder)!r} is not empty; a part of a run needs a new one")
+    with writing(folder):
+        write_complete(folder / RECORD, json.dumps(sealed(record), indent=2).encode())
 
 
-def _check_same_model(place: Path, record: Mapping[str, Any], now: Sources) -> None:
+def _check_same_model(folder: Path, record: Mapping[str, Any], now: Sources) -> None:
     """Refuse a part that another model has simulated.
 
     **Raises:** `ValueError`.
     """
     if "sources" in record and (changes := Sources.from_json(record["sources"]).changes(now)):
         raise ValueError(
-            f"the model has changed since the part in {place} was simulated: "
+            f"the model has changed since the part in {folder} was simulated: "
             f"{list_changes(changes)}. Restore the files, or simulate the part again in a new "
             "folder: rows of one run are of one model"
         )
@@ -271,7 +272,7 @@ def read_shard(folder: Path) -> dict[str, Any]:
     return record
 
 
-def _write(place: Path, first: int, u: Float[np.ndarray, "n d"], verdicts: Verdicts) -> None:
+def _write(folder: Path, first: int, u: Float[np.ndarray, "n d"], verdicts: Verdicts) -> None:
     arrays: dict[str, Any] = {"u": u, "processor": np.array(describe_processor())}
     for name in ARRAYS:
         if (value := getattr(verdicts, name)) is not None:
@@ -284,17 +285,17 @@ def _write(place: Path, first: int, u: Float[np.ndarray, "n d"], verdicts: Verdi
     np.savez(content, **arrays)
     data = content.getvalue()
     stop = first + len(u)
-    with writing(place):
-        write_whole(place / f"block-{first:012d}-{stop:012d}-{zlib.crc32(data):08x}.npz", data)
+    with writing(folder):
+        write_complete(folder / f"block-{first:012d}-{stop:012d}-{zlib.crc32(data):08x}.npz", data)
 
 
-def _blocks(place: Path) -> Iterator[tuple[range, Path]]:
-    for path in sorted(place.iterdir()):
+def _blocks(folder: Path) -> Iterator[tuple[range, Path]]:
+    for path in sorted(folder.iterdir()):
         if (match := _BLOCK.fullmatch(path.name)) is not None:
             yield range(int(match[1]), int(match[2])), path
 
 
-def _is_whole(path: Path) -> bool:
+def _is_complete(path: Path) -> bool:
     return path.name.endswith(f"-{zlib.crc32(path.read_bytes()):08x}.npz")
 
 
@@ -409,14 +410,14 @@ def merge(
     """
     if not folders:
         raise ValueError("there is no part to merge")
-    places = [Path(place) for place in folders]
-    records = [read_shard(place) for place in places]
+    paths = [Path(path) for path in folders]
+    records = [read_shard(path) for path in paths]
     first, of = records[0], records[0]["shard"][1]
-    for place, record in zip(places, records, strict=True):
+    for path, record in zip(paths, records, strict=True):
         for name in _OPTIONS:
             if record[name] != first[name]:
                 raise ValueError(
-                    f"{place} is a part of another run than {places[0]}: its {name} is "
+                    f"{path} is a part of another run than {paths[0]}: its {name} is "
                     f"{one_line(str(record[name]))}, there {one_line(str(first[name]))}"
                 )
     numbers = [record["shard"] for record in records]
@@ -435,9 +436,9 @@ def merge(
             f"{problem.name!r} has now"
         )
     now = problem.sources()
-    for place, record in zip(places, records, strict=True):
-        _check_same_model(place, record, now)
-    stored = _StoredRows([block for place in places for block in _blocks(place)])
+    for path, record in zip(paths, records, strict=True):
+        _check_same_model(path, record, now)
+    stored = _StoredRows([block for path in paths for block in _blocks(path)])
     return falsify(
         problem,
         searches.from_json(first["search"]),

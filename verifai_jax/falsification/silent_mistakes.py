@@ -25,7 +25,7 @@ from verifai_jax.search import Search
 
 ENOUGH = 32
 """Simulations with a verdict from which on what all of them have in common is worth a note."""
-MOST_SAMPLES = 5_000_000
+MAX_SAMPLES = 5_000_000
 """Samples of a whole batch up to which it is simulated for the nominal features alone."""
 HARDLY_MOVES = 0.05
 """Share of its least value within which a robustness hardly moves."""
@@ -80,7 +80,7 @@ def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
         engine = HostEngine(problem, engine.precision, monitor=monitor)
     else:
         assert not isinstance(engine, HostEngine)
-        if not is_quick(problem) or _samples(problem, engine.padded) > MOST_SAMPLES:
+        if not is_quick(problem) or _samples(problem, engine.padded) > MAX_SAMPLES:
             return ()
     space = problem.space
     nominal = problem.nominal or {}
@@ -94,7 +94,7 @@ def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
     if not verdict.violated[0]:
         return ()
     return (
-        f"the nominal features fail themselves, with robustness {verdict.least[0]:z.4g}: "
+        f"the nominal features fail themselves, with robustness {verdict.lowest[0]:z.4g}: "
         "are the formula and its units right?",
     )
 
@@ -128,7 +128,7 @@ def notes_after(
         )
     if len(formulas) == 1:
         # The least robustness is known: most tables need not be read for it.
-        ranges = {"the property": _range(table, "rho")} if table.counts.least > 0 else {}
+        ranges = {"the property": _range(table, "rho")} if table.counts.lowest > 0 else {}
     else:
         ranges = {f"formula {name!r}": _range(table, f"rho.{name}") for name in formulas}
     return tuple(note for which, ends in ranges.items() for note in _never_near(which, ends, count))

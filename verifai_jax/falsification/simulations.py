@@ -18,17 +18,17 @@ from jaxtyping import Float
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.shapes import power_of_two
 from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.evaluation.guidance import Guidance
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.raising import ALIKE, ALWAYS, Raising
-from verifai_jax.evaluation.steering import Steering
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.validation import SLOW
 from verifai_jax.mtl.clauses import goals_of
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 
-MOST_DIFFERENTIATED = 16
+MAX_DIFFERENTIATED = 16
 """Rows whose clauses are differentiated in one call of the engine."""
 MEASURED = 2
 """First rows of a black box that are timed; in the first one a simulator may prepare itself. More
@@ -44,7 +44,7 @@ class Simulations:
     - `search`: what it wants decides what is computed in addition to the robustness.
     - `batch`: simulations of a round at most.
     - `seed`: of the run.
-    - `precision`, `journal`, `executor`, `target`, `steering`, `keep_traces`, `given`: as for
+    - `precision`, `journal`, `executor`, `target`, `guidance`, `keep_traces`, `given`: as for
       `Evaluator`.
 
     `hopeless` is what all of the rows that were timed raised; None if one did not.
@@ -61,7 +61,7 @@ class Simulations:
         journal: Journal | None,
         executor: Executor | None,
         target: str | None,
-        steering: Steering,
+        guidance: Guidance,
         keep_traces: bool,
         given: bool = False,
     ) -> None:
@@ -73,7 +73,7 @@ class Simulations:
             seed=seed,
             executor=executor,
             target=target,
-            steering=steering,
+            guidance=guidance,
         )
         self.evaluate = evaluator(
             batch,
@@ -86,8 +86,8 @@ class Simulations:
         )
         self._differentiate: Evaluator | None = None
         if search.wants.clauses:
-            most = min(batch, MOST_DIFFERENTIATED)
-            self._differentiate = evaluator(most, gradient=True, clauses=True)
+            maximum = min(batch, MAX_DIFFERENTIATED)
+            self._differentiate = evaluator(maximum, gradient=True, clauses=True)
         self._measured: Verdicts | None = None
         self.hopeless: str | None = None
 
@@ -164,7 +164,7 @@ class Simulations:
         seconds, parts = float("inf") if len(points) else 0.0, []
         for row in range(0, len(points), together):
             some = points[row : row + together]
-            verdicts = self.evaluate(some, first=row, padded_to=self._whole_batch, keep_traces=True)
+            verdicts = self.evaluate(some, first=row, padded_to=self._full_batch, keep_traces=True)
             parts.append(verdicts)
             raising.add(verdicts.status, verdicts.messages)
             # Without the compilation of the monitor.
@@ -195,7 +195,7 @@ class Simulations:
         rest = self.evaluate(
             np.asarray(points)[count:],
             first=first + count,
-            padded_to=self._whole_batch,
+            padded_to=self._full_batch,
             keep_traces=self.keep_traces,
             journals=self._journals,
         )
@@ -204,6 +204,6 @@ class Simulations:
         return Verdicts.concatenate([known, rest])
 
     @property
-    def _whole_batch(self) -> int:
+    def _full_batch(self) -> int:
         """Rows that rows on their own are padded to, to be those of a whole batch bit for bit."""
         return power_of_two(self.batch)

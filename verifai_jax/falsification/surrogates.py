@@ -38,7 +38,7 @@ PARENTS = 8
 """Best rows around which half of them are."""
 NEIGHBOUR = 0.1
 """Distance, greatest over the coordinates, up to which one row is the neighbour of another."""
-LEAST_ROWS = 64
+MIN_ROWS = 64
 """Least number of rows that programs are compiled for; fewer are padded, more to four times it."""
 RATE = (0.1, 0.01)
 """First and last step of a descent, in cubes."""
@@ -52,7 +52,7 @@ PATIENCE = 8
 less."""
 PROGRESS = 0.9
 """Share of the least robustness below which a new one is progress."""
-MOST_SPREAD = 5.0
+MAX_SPREAD = 5.0
 """Greatest factor on the standard deviations of a model that is believed less."""
 SPREADS = 4
 """Factors from one to the greatest, in turn."""
@@ -84,7 +84,7 @@ class Surrogate:
 
     def learn(self, u: Float[Any, "n d"], verdicts: Verdicts) -> None:
         """Keep the rows that have a verdict and a trace like that of the others."""
-        proper = verdicts.proper & np.isfinite(verdicts.least)
+        proper = verdicts.proper & np.isfinite(verdicts.lowest)
         given = [
             (i, trace)
             for i, trace in enumerate(verdicts.traces or [])
@@ -105,8 +105,8 @@ class Surrogate:
         # Without rows there is no width yet.
         before = self.traces if len(self.traces) else flat[:0]
         self.traces = np.concatenate([before, flat[finite]])
-        least = verdicts.least[rows][finite].astype(np.float32)
-        self.rho = np.concatenate([self.rho, least])
+        lowest = verdicts.lowest[rows][finite].astype(np.float32)
+        self.rho = np.concatenate([self.rho, lowest])
         self._forget()
 
     def improve(self, points: Float[Any, "batch d"]) -> Float[Any, "batch d"]:
@@ -170,7 +170,7 @@ class Surrogate:
             before = self.form
             self.form = self._form(before.signals, before.dt, trace.length)
             whole = [np.asarray(before.held(row)) for row in self.traces]
-            here = np.minimum(self.form.places, before.length - 1)
+            here = np.minimum(self.form.positions, before.length - 1)
             own = np.arange(before.length)
             each = [np.concatenate([np.interp(here, own, c) for c in row]) for row in whole]
             empty = np.zeros((0, 0), np.float32)
@@ -194,9 +194,9 @@ class Surrogate:
         form = self.form
         assert form is not None
         # Signals count alike, whatever their unit.
-        grouped = self.traces.reshape(len(self.traces), -1, len(form.places))
+        grouped = self.traces.reshape(len(self.traces), -1, len(form.positions))
         scale = np.std(grouped, axis=(0, 2))
-        scale = np.repeat(np.where(scale > 0, scale, 1.0), len(form.places)).astype(np.float32)
+        scale = np.repeat(np.where(scale > 0, scale, 1.0), len(form.positions)).astype(np.float32)
         mean, components = models.principal_components(self.traces / scale)
         coefficients = ((self.traces / scale - mean) @ components.T).astype(np.float32)
         size = _padded(len(self.rho), self.options.capacity)
@@ -290,11 +290,13 @@ class Descents:
             return jnp.where(jnp.isfinite(gradient), gradient, 0.0)
 
         def one(weights: Float[Array, "terms c"]) -> tuple[Array, Array]:
-            least, place = jax.lax.top_k(-_number(values(pool, weights, hard)), self.options.starts)
-            start = pool[place]
+            lowest, index = jax.lax.top_k(
+                -_number(values(pool, weights, hard)), self.options.starts
+            )
+            start = pool[index]
 
             def step(carry: tuple, part: Array) -> tuple:
-                u, first, second, best, least = carry
+                u, first, second, best, lowest = carry
                 tau = TEMPERATURES[0] * (TEMPERATURES[1] / TEMPERATURES[0]) ** part
                 gradient = slope(u, weights, tau)
                 # A common size for all coordinates of a point keeps its direction.
@@ -304,14 +306,14 @@ class Descents:
                 moved = jnp.clip(u - size * first / (jnp.sqrt(second) + 1e-9), 0.0, 1.0)
                 u = moved.at[:, cube.discrete].set(u[:, cube.discrete])
                 value = _number(values(u, weights, hard))
-                better = value < least
+                better = value < lowest
                 best = jnp.where(better[:, None], u, best)
-                return (u, first, second, best, jnp.where(better, value, least)), None
+                return (u, first, second, best, jnp.where(better, value, lowest)), None
 
             zero = jnp.zeros_like(start)
             parts = jnp.linspace(0.0, 1.0, self.options.steps)
             (_, _, _, best, value), _ = jax.lax.scan(
-                step, (start, zero, zero, start, -least), parts
+                step, (start, zero, zero, start, -lowest), parts
             )
             return best, value
 
@@ -331,7 +333,7 @@ def _spread(rho: Float[np.ndarray, " n"], number: int, dim: int) -> float:
     """Return the factor on the model's standard deviations: it grows while no row is progress.
 
     A model that is too sure of itself proposes the neighbours of one hollow again and again; drawn
-    more widely, its simulators have their minima elsewhere. Behind a failure there is no need.
+    more widely, its simulators have their minima elsewhere. After a failure there is no need.
 
     **Arguments:**
 
@@ -339,16 +341,16 @@ def _spread(rho: Float[np.ndarray, " n"], number: int, dim: int) -> float:
     - `number`: of the round.
     - `dim`: of the cube.
     """
-    least = np.minimum.accumulate(rho)
-    if least[-1] <= 0:
+    lowest = np.minimum.accumulate(rho)
+    if lowest[-1] <= 0:
         return 1.0
     best, last = rho[0], 0
-    for i in np.flatnonzero(np.diff(least)) + 1:
+    for i in np.flatnonzero(np.diff(lowest)) + 1:
         if rho[i] < PROGRESS * best:
             best, last = rho[i], i
     idle = len(rho) - 1 - last
-    most = min(max(1.0, idle / (PATIENCE * dim)), MOST_SPREAD)
-    return most ** (number % SPREADS / (SPREADS - 1))
+    maximum = min(max(1.0, idle / (PATIENCE * dim)), MAX_SPREAD)
+    return maximum ** (number % SPREADS / (SPREADS - 1))
 
 
 def _number(value: Float[Array, " m"]) -> Float[Array, " m"]:
@@ -377,7 +379,7 @@ def _embed(u: Float[Any, "n d"], cube: Cube) -> Float[Array, "n x"]:
 
 def _padded(rows: int, capacity: int) -> int:
     """Return the number of rows of the program for so many; each is compiled once."""
-    size = LEAST_ROWS
+    size = MIN_ROWS
     while size < rows:
         size *= 4
     return min(size, capacity)

@@ -49,8 +49,8 @@ from verifai_jax.falsification.segments import (
     parquet,
     remove_segments,
     standing_out,
+    write_complete,
     write_segment,
-    write_whole,
 )
 from verifai_jax.falsification.tail import TAIL, Tail, read_tail, replace_tail
 
@@ -69,7 +69,7 @@ RESERVED = (
     "differentiated",
     "verdict",
     "rho_again",
-    "new_marks",
+    "new_coverage",
     "suggested",
 )
 """Names of the table's own columns, which no feature may have."""
@@ -446,17 +446,17 @@ class ErrorTable(InNotebook):
 
     def _memory(self) -> Iterator[tuple[Int[np.ndarray, " n"], Columns]]:
         """Yield numbers and columns of the rows in memory, in blocks."""
-        most = segments.SEGMENT_ROWS
+        maximum = segments.SEGMENT_ROWS
         group: list[Batch] = []
         for first, batch in self._batches:
-            if group and sum(length(each) for _, each in group) + length(batch) > most:
+            if group and sum(length(each) for _, each in group) + length(batch) > maximum:
                 yield row_numbers(group), merge(group)
                 group = []
-            if length(batch) <= most:
+            if length(batch) <= maximum:
                 group.append((first, batch))
                 continue
-            for begin in range(0, length(batch), most):
-                part = cut((first, batch), first + begin, first + begin + most)
+            for begin in range(0, length(batch), maximum):
+                part = cut((first, batch), first + begin, first + begin + maximum)
                 yield row_numbers([part]), part[1]
         if group:
             yield row_numbers(group), merge(group)
@@ -475,16 +475,16 @@ class ErrorTable(InNotebook):
             frame = segment.read_standing_out()
             yield frame.index.to_numpy(), from_frame(frame)
         for numbers, block in self._memory():
-            places = standing_out(block)
-            yield numbers[places], {name: values[places] for name, values in block.items()}
+            indices = standing_out(block)
+            yield numbers[indices], {name: values[indices] for name, values in block.items()}
 
     def _select(self, wanted: Callable[[Columns], Bool[np.ndarray, " n"]]) -> "pd.DataFrame":
         """Return rows that stand out, in their order."""
         found = []
         for numbers, block in self._standing_out():
-            places = np.flatnonzero(wanted(block))
-            few = {name: values[places] for name, values in block.items()}
-            found.append(to_frame(numbers[places], few))
+            indices = np.flatnonzero(wanted(block))
+            few = {name: values[indices] for name, values in block.items()}
+            found.append(to_frame(numbers[indices], few))
         return self._concatenate(found)
 
     def _close_segment(self, rows: int) -> None:
@@ -500,7 +500,7 @@ class ErrorTable(InNotebook):
     def _write_finished(self, folder: Path) -> None:
         batches = list(self._parts(0, self._next))
         columns = merge(batches) if batches else from_frame(self._empty)
-        write_whole(folder / FINISHED, parquet(columns, np.arange(self._next)))
+        write_complete(folder / FINISHED, parquet(columns, np.arange(self._next)))
 
     def _replace_by(self, parts: Iterator[Batch]) -> None:
         """Take these rows, in place of what the folder holds."""

@@ -15,7 +15,7 @@ import zlib
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
-from verifai_jax.falsification.segments import TableError, write_whole
+from verifai_jax.falsification.segments import TableError, write_complete
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -26,7 +26,7 @@ _MARK = b"VJR1"
 _HEADER = struct.Struct("<4sQQI")
 """Mark, number of the first row, length of the stream, checksum of the stream; its own follows."""
 _CHECKSUM = struct.Struct("<I")
-_MOST_ROWS = 10**12
+_MAX_ROWS = 10**12
 """Numbers of rows beyond it are none, and have more digits than the names of segments."""
 
 
@@ -69,7 +69,7 @@ def replace_tail(folder: Path, first: int, batch: "pa.RecordBatch | None") -> No
 
     **Raises:** `OSError` where it cannot be written.
     """
-    write_whole(folder / TAIL, b"" if batch is None else _frame(first, batch))
+    write_complete(folder / TAIL, b"" if batch is None else _frame(first, batch))
 
 
 def read_tail(folder: Path) -> "list[tuple[int, pa.RecordBatch]]":
@@ -97,7 +97,7 @@ def read_tail(folder: Path) -> "list[tuple[int, pa.RecordBatch]]":
         _, first, length, checksum = _HEADER.unpack(header)
         stream = content[at + head : at + head + length]
         at += head + length
-        if len(stream) < length or zlib.crc32(stream) != checksum or first > _MOST_ROWS:
+        if len(stream) < length or zlib.crc32(stream) != checksum or first > _MAX_ROWS:
             continue
         try:
             for batch in pa.ipc.open_stream(pa.py_buffer(stream)):

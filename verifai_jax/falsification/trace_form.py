@@ -56,7 +56,7 @@ class TraceForm:
         return cls(signals, dt, length, stride)
 
     @property
-    def places(self) -> Float[np.ndarray, " samples"]:
+    def positions(self) -> Float[np.ndarray, " samples"]:
         """Places of the modelled samples among all."""
         return np.linspace(0, self.length - 1, min(self.length, SAMPLES))
 
@@ -77,24 +77,24 @@ class TraceForm:
             signal = signal.reshape(len(signal), -1)
             # A shorter one stays as it ended.
             signal = signal[np.minimum(own, len(signal) - 1)]
-            parts += [np.interp(self.places, own, column) for column in signal.T]
+            parts += [np.interp(self.positions, own, column) for column in signal.T]
         return np.concatenate(parts).astype(np.float32)
 
     def held(self, row: Float[np.ndarray, " values"]) -> Float[np.ndarray, "signals time"]:
         """Return modelled samples at every sample, those between on straight lines."""
         own = np.arange(self.length)
-        columns = row.reshape(-1, len(self.places))
-        return np.stack([np.interp(own, self.places, column) for column in columns])
+        columns = row.reshape(-1, len(self.positions))
+        return np.stack([np.interp(own, self.positions, column) for column in columns])
 
     def trace(self, flat: Float[Array, " values"]) -> Trace:
         """Return the trace of modelled samples, every so many of its own; traced by JAX."""
-        places, own = self.places, np.arange(0, self.length, self.stride)
-        left = own * (len(places) - 1) // max(self.length - 1, 1)
-        left = np.minimum(left, max(len(places) - 2, 0))
-        right = np.minimum(left + 1, len(places) - 1)
-        gap = np.maximum(places[right] - places[left], 1e-9)
-        weight = ((own - places[left]) / gap).astype(np.float32)
-        columns = flat.reshape(-1, len(places))
+        positions, own = self.positions, np.arange(0, self.length, self.stride)
+        left = own * (len(positions) - 1) // max(self.length - 1, 1)
+        left = np.minimum(left, max(len(positions) - 2, 0))
+        right = np.minimum(left + 1, len(positions) - 1)
+        gap = np.maximum(positions[right] - positions[left], 1e-9)
+        weight = ((own - positions[left]) / gap).astype(np.float32)
+        columns = flat.reshape(-1, len(positions))
         columns = columns[:, left] * (1 - weight) + columns[:, right] * weight
         signals, first = {}, 0
         for name, components in self.signals:

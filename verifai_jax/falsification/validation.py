@@ -29,18 +29,18 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def writing(place: Path | None) -> Iterator[None]:
+def writing(folder: Path | None) -> Iterator[None]:
     """Turn what a file system refuses into one line that says what to do."""
     try:
         yield
     except OSError as error:
         raise ValueError(
-            f"folder {str(place)!r} cannot be written ({error.strerror or error}); give one that "
+            f"folder {str(folder)!r} cannot be written ({error.strerror or error}); give one that "
             "can be, or none to keep the run in memory"
         ) from error
 
 
-MOST_AT_ONCE = 32_768
+MAX_AT_ONCE = 32_768
 """Simulations of a round at most, by default; more are no faster."""
 
 
@@ -69,13 +69,13 @@ def usual_batch(
         )
     if not search.learns:
         eighth = 1 << max(0, (int(budget) // 8).bit_length() - 1)
-        return max(search.wants.max_batch, min(MOST_AT_ONCE, eighth) if whole else 0)
-    most = (
+        return max(search.wants.max_batch, min(MAX_AT_ONCE, eighth) if whole else 0)
+    maximum = (
         search.wants.max_batch
         if stop_after is None
         else min(search.wants.max_batch, 16 * stop_after)
     )
-    return min(1 << (most.bit_length() - 1), 1 << max(3, (int(budget) // 20).bit_length() - 1))
+    return min(1 << (maximum.bit_length() - 1), 1 << max(3, (int(budget) // 20).bit_length() - 1))
 
 
 def batch_size(
@@ -312,7 +312,7 @@ def check_first(
     rule: StoppingRule | None,
     precision: str,
 ) -> Float[np.ndarray, "n row"]:
-    """Return the rows that are simulated before the search begins; none where none are given.
+    """Return the rows that are simulated before the search begins; empty if none are given.
 
     **Raises:** as `points_of`; `ValueError` together with a rule that needs independent samples.
     """
@@ -419,22 +419,22 @@ def new_folder(folder: str | Path | None) -> Iterator[Path | None]:
     if folder is None:
         yield None
         return
-    place = Path(folder)
-    if not (place / LOCK).exists():  # Whoever writes there is told by the lock.
-        _check_empty(place)
-    with locked(place):
-        _check_empty(place)  # Another run may have begun in it, and ended, since.
-        yield place
+    path = Path(folder)
+    if not (path / LOCK).exists():  # Whoever writes there is told by the lock.
+        _check_empty(path)
+    with locked(path):
+        _check_empty(path)  # Another run may have begun in it, and ended, since.
+        yield path
 
 
-def _check_empty(place: Path) -> None:
+def _check_empty(folder: Path) -> None:
     # A process that dies before its first record leaves a part of one.
     leftover = {f"{RECORD}.part", LOCK}
-    if place.exists() and (not place.is_dir() or {p.name for p in place.iterdir()} - leftover):
-        if (place / RECORD).is_file():
+    if folder.exists() and (not folder.is_dir() or {p.name for p in folder.iterdir()} - leftover):
+        if (folder / RECORD).is_file():
             raise ValueError(
-                f"folder {str(place)!r} exists and is not empty: it holds a run, with which "
-                f"vj.resume, or verifai-jax falsify --resume {place}, goes on; a new one needs "
+                f"folder {str(folder)!r} exists and is not empty: it holds a run, with which "
+                f"vj.resume, or verifai-jax falsify --resume {folder}, goes on; a new one needs "
                 "another folder"
             )
-        raise ValueError(f"folder {str(place)!r} exists and is not empty; a run needs a new one")
+        raise ValueError(f"folder {str(folder)!r} exists and is not empty; a run needs a new one")

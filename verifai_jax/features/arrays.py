@@ -29,7 +29,7 @@ class Array(Domain):
     - `length`: their number, or a pair with the smallest and the greatest number.
 
     **Raises:** `ValueError` for a length that is not a positive integer, or a pair that is not
-    `0 <= least <= most` with `most >= 1`; `TypeError` for something that is no domain.
+    `0 <= shortest <= longest` with `longest >= 1`; `TypeError` for something that is no domain.
     """
 
     arguments = ("domain", "length")
@@ -172,63 +172,63 @@ class Items:
 
 @dataclass(frozen=True, repr=False)
 class VariableArray(Domain):
-    """From `least` to `most` values of one domain: `Array(domain, length=(1, 3))`.
+    """From `shortest` to `longest` values of one domain: `Array(domain, length=(1, 3))`.
 
     A value is an `Items`; a person may write a list of as many items as there are. The first
-    coordinate is the length, each equally likely (none if `least == most`). In a table the column
-    `cars.length` holds the length; the entries of absent items are empty (NaN or None).
+    coordinate is the length, each equally likely (none if `shortest == longest`). In a table the
+    column `cars.length` holds the length; the entries of absent items are empty (NaN or None).
     """
 
     domain: Domain
-    least: int
-    most: int
+    shortest: int
+    longest: int
 
     @property
     def _varies(self) -> bool:
-        return self.most > self.least
+        return self.longest > self.shortest
 
     @cached_property
     def levels(self) -> tuple[int, ...]:
-        length = (self.most - self.least + 1,) if self._varies else ()
-        return length + self.domain.levels * self.most
+        length = (self.longest - self.shortest + 1,) if self._varies else ()
+        return length + self.domain.levels * self.longest
 
     @property
     def weights(self) -> tuple[tuple[float, ...] | None, ...]:
-        return (None,) * self._varies + self.domain.weights * self.most
+        return (None,) * self._varies + self.domain.weights * self.longest
 
     @property
     def ordered(self) -> tuple[bool, ...]:
-        return (True,) * self._varies + self.domain.ordered * self.most
+        return (True,) * self._varies + self.domain.ordered * self.longest
 
     @property
     def lengths(self) -> tuple[int, ...]:
-        inner = _repeated(self.domain, self.most)
+        inner = _repeated(self.domain, self.longest)
         return (0,) * self._varies + tuple(self._varies + i for i in inner)
 
     @property
     def signals(self) -> tuple[tuple[int, ...], ...]:
-        inner = _repeated_signals(self.domain, self.most)
+        inner = _repeated_signals(self.domain, self.longest)
         return tuple(tuple(self._varies + i for i in signal) for signal in inner)
 
     def coordinates(self, name: str) -> tuple[str, ...]:
-        items = indexed(name, self.most)
+        items = indexed(name, self.longest)
         labels = tuple(label for item in items for label in self.domain.coordinates(item))
         return (f"{name}.length",) * self._varies + labels
 
     def from_unit(self, u: Float[jax.Array, " size"]) -> Items:
-        length = self.least + (cell(u[0], self.levels[0]) if self._varies else jnp.int32(0))
-        units = u[int(self._varies) :].reshape(self.most, self.domain.size)
-        present = jnp.arange(self.most) < length
+        length = self.shortest + (cell(u[0], self.levels[0]) if self._varies else jnp.int32(0))
+        units = u[int(self._varies) :].reshape(self.longest, self.domain.size)
+        present = jnp.arange(self.longest) < length
         units = jnp.where(present[:, None], units, 0.5)
         return Items(jax.vmap(self.domain.from_unit)(units), length)
 
     def to_unit(self, value: Items) -> Float[jax.Array, " size"]:
-        units = jax.vmap(self.domain.to_unit, axis_size=self.most)(value.values)
-        present = jnp.arange(self.most) < value.length
+        units = jax.vmap(self.domain.to_unit, axis_size=self.longest)(value.values)
+        present = jnp.arange(self.longest) < value.length
         units = jnp.ravel(jnp.where(present[:, None], units, self._absent_unit))
         if not self._varies:
             return units
-        return jnp.concatenate([centre(value.length - self.least, self.levels[0]), units])
+        return jnp.concatenate([centre(value.length - self.shortest, self.levels[0]), units])
 
     def coerce(self, value: PyTree) -> "Items":
         if isinstance(value, Items):
@@ -237,7 +237,7 @@ class VariableArray(Domain):
             return items.cleared(self._absent)
         items = [self.domain.coerce(item) for item in _items(value, "the array")]
         length = jnp.asarray(len(items), jnp.int32)
-        items += [self._absent] * (self.most - len(items))
+        items += [self._absent] * (self.longest - len(items))
         return Items(_stacked(items), length)
 
     def check(self, value: object, name: str) -> None:
@@ -245,89 +245,91 @@ class VariableArray(Domain):
             length = int(value.length)
             items = [
                 jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], value.values)
-                for i in range(min(length, self.most))
+                for i in range(min(length, self.longest))
             ]
         else:
             items = _items(value, name)
             length = len(items)
-        if not self.least <= length <= self.most:
-            raise ValueError(f"{name} must have {self.least} to {self.most} items; got {length}")
+        if not self.shortest <= length <= self.longest:
+            raise ValueError(
+                f"{name} must have {self.shortest} to {self.longest} items; got {length}"
+            )
         for i, item in enumerate(items):
             self.domain.check(item, f"{name}[{i}]")
 
     def columns(self, name: str) -> tuple[str, ...]:
-        items = indexed(name, self.most)
+        items = indexed(name, self.longest)
         columns = tuple(column for item in items for column in self.domain.columns(item))
         return (f"{name}.length",) * self._varies + columns
 
     def to_columns(self, values: Items, name: str) -> dict[str, np.ndarray]:
         length = np.asarray(values.length)
         columns: dict[str, np.ndarray] = {f"{name}.length": length} if self._varies else {}
-        for i, item in enumerate(indexed(name, self.most)):
+        for i, item in enumerate(indexed(name, self.longest)):
             element = jax.tree.map(operator.itemgetter((slice(None), i)), values.values)
             for column, entries in self.domain.to_columns(element, item).items():
-                columns[column] = entries if i < self.least else _emptied(entries, length <= i)
+                columns[column] = entries if i < self.shortest else _emptied(entries, length <= i)
         return columns
 
     def from_columns(self, row: Row, name: str) -> Items:
-        length = self.least
+        length = self.shortest
         if self._varies:
             number = as_numbers(row[f"{name}.length"], f"{name}.length").item()
-            if number not in range(self.least, self.most + 1):
+            if number not in range(self.shortest, self.longest + 1):
                 raise ValueError(
-                    f"{name}.length must be an integer from {self.least} to {self.most}; "
+                    f"{name}.length must be an integer from {self.shortest} to {self.longest}; "
                     f"got {number!r}"
                 )
             length = int(number)
         items = [
             self.domain.from_columns(row, item) if i < length else self._absent
-            for i, item in enumerate(indexed(name, self.most))
+            for i, item in enumerate(indexed(name, self.longest))
         ]
         return Items(_stacked(items), jnp.asarray(length, jnp.int32))
 
     @property
     def sequences(self) -> tuple[tuple[int, int, int, int], ...]:
-        return ((0, 1, self.domain.size, self.most),) if self._varies else ()
+        return ((0, 1, self.domain.size, self.longest),) if self._varies else ()
 
     @property
     def items(self) -> int:
-        return self.most * self._varies
+        return self.longest * self._varies
 
     def without(
         self, u: Float[jax.Array, " size"], drop: Bool[jax.Array, " items"]
     ) -> Float[jax.Array, " size"]:
         if not self._varies:
             return u
-        length = self.least + cell(u[0], self.levels[0])
-        stays = (jnp.arange(self.most) < length) & ~drop
+        length = self.shortest + cell(u[0], self.levels[0])
+        stays = (jnp.arange(self.longest) < length) & ~drop
         order = jnp.argsort(~stays, stable=True)
-        units = u[1:].reshape(self.most, self.domain.size)[order]
-        fewer = jnp.maximum(jnp.sum(stays), self.least)
-        unit = centre(fewer - self.least, self.levels[0]).astype(u.dtype)
+        units = u[1:].reshape(self.longest, self.domain.size)[order]
+        fewer = jnp.maximum(jnp.sum(stays), self.shortest)
+        unit = centre(fewer - self.shortest, self.levels[0]).astype(u.dtype)
         return self.settled(jnp.concatenate([unit, jnp.ravel(units)]))
 
     def settled(self, u: Float[jax.Array, " size"]) -> Float[jax.Array, " size"]:
         if not self._varies:
             return u
-        length = self.least + cell(u[0], self.levels[0])
-        units = u[1:].reshape(self.most, self.domain.size)
-        present = jnp.arange(self.most)[:, None] < length
-        own = jax.vmap(self.domain.settled, axis_size=self.most)(units)
+        length = self.shortest + cell(u[0], self.levels[0])
+        units = u[1:].reshape(self.longest, self.domain.size)
+        present = jnp.arange(self.longest)[:, None] < length
+        own = jax.vmap(self.domain.settled, axis_size=self.longest)(units)
         absent = self._absent_unit.astype(u.dtype)
         return jnp.concatenate([u[:1], jnp.ravel(jnp.where(present, own, absent))])
 
     def used(self, u: Float[jax.Array, " size"]) -> Bool[jax.Array, " size"]:
-        length = self.least + (cell(u[0], self.levels[0]) if self._varies else 0)
-        units = u[int(self._varies) :].reshape(self.most, self.domain.size)
-        own = jax.vmap(self.domain.used, axis_size=self.most)(units)
-        mine = jnp.ravel(own & (jnp.arange(self.most)[:, None] < length))
+        length = self.shortest + (cell(u[0], self.levels[0]) if self._varies else 0)
+        units = u[int(self._varies) :].reshape(self.longest, self.domain.size)
+        own = jax.vmap(self.domain.used, axis_size=self.longest)(units)
+        mine = jnp.ravel(own & (jnp.arange(self.longest)[:, None] < length))
         return jnp.concatenate([jnp.ones(int(self._varies), bool), mine])
 
     def refined(self, factor: int) -> "VariableArray":
-        return VariableArray(self.domain.refined(factor), self.least, self.most)
+        return VariableArray(self.domain.refined(factor), self.shortest, self.longest)
 
     def refine(self, value: Items, factor: int) -> Items:
-        finer = jax.vmap(lambda item: self.domain.refine(item, factor), axis_size=self.most)
+        finer = jax.vmap(lambda item: self.domain.refine(item, factor), axis_size=self.longest)
         return Items(finer(value.values), value.length)
 
     @property
@@ -340,17 +342,17 @@ class VariableArray(Domain):
         return self.domain.to_unit(self._absent)
 
     def words(self) -> str:
-        return f"{self.least} to {self.most} items, each {self.domain.words()}"
+        return f"{self.shortest} to {self.longest} items, each {self.domain.words()}"
 
     def parts(self, name: str) -> tuple[tuple[str, Domain], ...]:
-        return tuple((item, self.domain) for item in indexed(name, self.most))
+        return tuple((item, self.domain) for item in indexed(name, self.longest))
 
     def facts(self, name: str) -> Facts:
-        length = {**integer_facts(self.least, self.most), "length": True}
+        length = {**integer_facts(self.shortest, self.longest), "length": True}
         return {**({f"{name}.length": length} if self._varies else {}), **super().facts(name)}
 
     def __repr__(self) -> str:
-        return f"Array({self.domain!r}, length=({self.least}, {self.most}))"
+        return f"Array({self.domain!r}, length=({self.shortest}, {self.longest}))"
 
 
 def _is_stacked(value: PyTree) -> bool:
@@ -372,13 +374,15 @@ def _ends(domain: object, length: tuple | list) -> tuple[int, int]:
     _check_domain(domain)
     whole = all(isinstance(n, int | np.integer) and not isinstance(n, bool) for n in length)
     if len(length) != 2 or not whole:
-        raise ValueError(f"a variable length is a pair of integers, (least, most); got {length!r}")
-    least, most = int(length[0]), int(length[1])
-    if not (0 <= least <= most and most >= 1):
         raise ValueError(
-            f"a variable length needs 0 <= least <= most and most >= 1; got {length!r}"
+            f"a variable length is a pair of integers, (shortest, longest); got {length!r}"
         )
-    return least, most
+    shortest, longest = int(length[0]), int(length[1])
+    if not (0 <= shortest <= longest and longest >= 1):
+        raise ValueError(
+            f"a variable length needs 0 <= shortest <= longest and longest >= 1; got {length!r}"
+        )
+    return shortest, longest
 
 
 def _repeated_signals(domain: Domain, times: int) -> tuple[tuple[int, ...], ...]:

@@ -25,16 +25,16 @@ from verifai_jax.features.written_events import WrittenEvents, where_there
 class Automaton(Domain):
     """Sequences of timed events that an automaton allows, as a domain without a refused point.
 
-        Automaton(start="cruise", most=6, events={
+        Automaton(start="cruise", max_events=6, events={
             ("cruise", "cut_in"): dict(to="crowded", wait=Box(0.5, 4), gap=Box(5, 20)),
             ("crowded", "brake"): dict(to="cruise", wait=Box(0.2, 2), rate=Box(2, 8), weight=2.0),
         })
 
-    A value is an `Events`. The prior: the number of events is uniform over `least` to `most`, and a
-    sequence ends early in a state that no event can leave; each event is drawn among those that
-    are enabled after the ones before it, in proportion to their weights; waiting times and
-    parameters come from their domains. Each of these is one unit coordinate by its inverse
-    cumulative distribution, so every point of the cube is a legal sequence.
+    A value is an `Events`. The prior: the number of events is uniform over `min_events` to
+    `max_events`, and a sequence ends early in a state that no event can leave; each event is drawn
+    among those that are enabled after the ones before it, in proportion to their weights; waiting
+    times and parameters come from their domains. Each of these is one unit coordinate by its
+    inverse cumulative distribution, so every point of the cube is a legal sequence.
 
     **Arguments:**
 
@@ -48,30 +48,37 @@ class Automaton(Domain):
       - `at_most`: how often events of this name may happen,
       - `guard`: a function of the `Past` that must be true, asked when the automaton is made,
       - and parameters by name, each a domain.
-    - `most`: events at most.
-    - `least`: events at least, unless no event is possible any longer.
+    - `max_events`: events at most.
+    - `min_events`: events at least, unless no event is possible any longer.
 
     **Raises:** `ValueError` for events that are none, options that are unknown or out of range,
-    states that no event leads to, a `to` that is nearly the name of another state, a `least` that
-    no sequence reaches, guards that tell too many pasts apart; `TypeError` for a parameter that is
-    no domain.
+    states that no event leads to, a `to` that is nearly the name of another state, a `min_events`
+    that no sequence reaches, guards that tell too many pasts apart; `TypeError` for a parameter
+    that is no domain.
     """
 
     start: str
     transitions: tuple[Transition, ...]
-    least: int
-    most: int
+    min_events: int
+    max_events: int
 
     def __init__(
         self,
         start: str,
         events: Mapping[tuple[str, str], Mapping[str, Any]],
-        most: int = 6,
-        least: int = 0,
+        max_events: int = 6,
+        min_events: int = 0,
     ) -> None:
-        check_count("most", most)
-        if isinstance(least, bool) or not isinstance(least, int) or not 0 <= least <= most:
-            raise ValueError(f"least must be an integer from 0 to most, {most}; got {least!r}")
+        check_count("max_events", max_events)
+        if (
+            isinstance(min_events, bool)
+            or not isinstance(min_events, int)
+            or not 0 <= min_events <= max_events
+        ):
+            raise ValueError(
+                f"min_events must be an integer from 0 to max_events, {max_events}; got "
+                f"{min_events!r}"
+            )
         if not isinstance(events, Mapping) or not events:
             raise ValueError(
                 'events must be a dictionary {("state", "name"): dict(to=..., wait=...), ...}; '
@@ -88,15 +95,16 @@ class Automaton(Domain):
                     raise unknown_name(f"event in after= of {each.label}", name, names)
         object.__setattr__(self, "start", start)
         object.__setattr__(self, "transitions", transitions)
-        object.__setattr__(self, "least", int(least))
-        object.__setattr__(self, "most", int(most))
+        object.__setattr__(self, "min_events", int(min_events))
+        object.__setattr__(self, "max_events", int(max_events))
         self._check_parameters()
         check_states(start, transitions)
-        longest = self.graph.longest(most)
-        if longest < least:
+        longest = self.graph.longest(max_events)
+        if longest < min_events:
             raise ValueError(
-                f"least={least} events are impossible: no sequence from {start!r} has more than "
-                f"{longest}, after which no event is enabled; allow fewer, or add events that go on"
+                f"min_events={min_events} events are impossible: no sequence from {start!r} has "
+                f"more than {longest}, after which no event is enabled; allow fewer, or add "
+                "events that go on"
             )
 
     def _check_parameters(self) -> None:
@@ -125,8 +133,8 @@ class Automaton(Domain):
         waits = [each.wait for each in self.transitions]
         # One program for all, and not one for each operation.
         shortest = jax.jit(lambda: [wait.from_unit(jnp.zeros(wait.size)) for wait in waits])()
-        for each, least in zip(self.transitions, shortest, strict=True):
-            if float(least) < 0:
+        for each, earliest in zip(self.transitions, shortest, strict=True):
+            if float(earliest) < 0:
                 raise ValueError(
                     f"wait of {each.label} is in seconds and must not be negative; got "
                     f"{each.wait!r}"
@@ -148,7 +156,7 @@ class Automaton(Domain):
     @cached_property
     def graph(self) -> Graph:
         """The states and pasts that can be reached, and what can follow what."""
-        return unfold(self.start, self.transitions, self.most)
+        return unfold(self.start, self.transitions, self.max_events)
 
     @cached_property
     def _tables(self) -> EventTables:
@@ -156,17 +164,17 @@ class Automaton(Domain):
 
     @cached_property
     def _written(self) -> WrittenEvents:
-        return WrittenEvents(self._tables, self.least, self.most)
+        return WrittenEvents(self._tables, self.min_events, self.max_events)
 
     @property
     def _varies(self) -> bool:
-        return self.most > self.least
+        return self.max_events > self.min_events
 
     @cached_property
     def levels(self) -> tuple[int, ...]:
-        length = (self.most - self.least + 1,) if self._varies else ()
+        length = (self.max_events - self.min_events + 1,) if self._varies else ()
         # Which cells a coordinate of an event has depends on the events before it.
-        return length + (0,) * (sum(self._tables.widths) * self.most)
+        return length + (0,) * (sum(self._tables.widths) * self.max_events)
 
     @property
     def lengths(self) -> tuple[int, ...]:
@@ -174,16 +182,16 @@ class Automaton(Domain):
 
     @property
     def sequences(self) -> tuple[tuple[int, int, int, int], ...]:
-        return ((0, 1, sum(self._tables.widths), self.most),) if self._varies else ()
+        return ((0, 1, sum(self._tables.widths), self.max_events),) if self._varies else ()
 
     @property
     def nominal(self) -> PyTree:
-        return () if self.least == 0 else None
+        return () if self.min_events == 0 else None
 
     def coordinates(self, name: str) -> tuple[str, ...]:
         parts = ("kind", "wait", *self._tables.domains)
         found = (f"{name}.length",) * self._varies
-        for item in indexed(name, self.most):
+        for item in indexed(name, self.max_events):
             for part, width in zip(parts, self._tables.widths, strict=True):
                 label = dotted(item, part)
                 found += indexed(label, width) if width > 1 else (label,) * width
@@ -193,9 +201,11 @@ class Automaton(Domain):
         taken, _, slots = self._walk(u)
         units = self._split(slots)
         kinds = jnp.where(taken >= 0, jnp.asarray(self._tables.kind_of)[taken], ABSENT)
-        waits = jnp.zeros(self.most, u.dtype)
+        waits = jnp.zeros(self.max_events, u.dtype)
         for domain, users in self._tables.waits.items():
-            values = jax.vmap(domain.from_unit, axis_size=self.most)(units[1][:, : domain.size])
+            values = jax.vmap(domain.from_unit, axis_size=self.max_events)(
+                units[1][:, : domain.size]
+            )
             waits = jnp.where(_among(taken, users), values.astype(u.dtype), waits)
         parameters = {}
         for (name, groups), unit in zip(self._tables.users.items(), units[2:], strict=True):
@@ -203,7 +213,7 @@ class Automaton(Domain):
             for domain, users in groups.items():
                 mine = _among(taken, users)[:, None]
                 own = jnp.where(mine, unit[:, : domain.size], 0.5)
-                values = jax.vmap(domain.from_unit, axis_size=self.most)(own)
+                values = jax.vmap(domain.from_unit, axis_size=self.max_events)(own)
                 # The first domain's middle stands where there is no such parameter.
                 chosen = values if chosen is None else where_there(mine[:, 0], values, chosen)
             parameters[name] = chosen
@@ -221,9 +231,9 @@ class Automaton(Domain):
             self._tables.widths[1:],
             strict=True,
         ):
-            units = jnp.full((self.most, width), 0.5, waits.dtype)
+            units = jnp.full((self.max_events, width), 0.5, waits.dtype)
             for domain, users in groups.items():
-                own = jax.vmap(domain.to_unit, axis_size=self.most)(jnp.asarray(values))
+                own = jax.vmap(domain.to_unit, axis_size=self.max_events)(jnp.asarray(values))
                 own = jnp.clip(own, 0.0, 1.0).astype(waits.dtype)
                 mine = _among(taken, users)[:, None]
                 units = units.at[:, : domain.size].set(
@@ -235,7 +245,7 @@ class Automaton(Domain):
             return whole
         length = self._wanted(taken, nodes)
         return jnp.concatenate(
-            [centre(length - self.least, self.levels[0]).astype(whole.dtype), whole]
+            [centre(length - self.min_events, self.levels[0]).astype(whole.dtype), whole]
         )
 
     def settled(self, u: Float[jax.Array, " size"]) -> Float[jax.Array, " size"]:
@@ -256,7 +266,7 @@ class Automaton(Domain):
 
     @property
     def items(self) -> int:
-        return self.most
+        return self.max_events
 
     def without(
         self, u: Float[jax.Array, " size"], drop: Bool[jax.Array, " items"]
@@ -279,22 +289,22 @@ class Automaton(Domain):
         slots = slots.at[:, 0].set(jnp.where(stays, unit.astype(u.dtype), 0.5))
         slots = jnp.where(stays[:, None], slots, 0.5)
         order = jnp.argsort(~stays, stable=True)
-        length = jnp.maximum(jnp.sum(stays), self.least)
+        length = jnp.maximum(jnp.sum(stays), self.min_events)
         return self._joined(u, length, slots[order])
 
     def _joined(self, u: Any, length: Any, slots: Any) -> Any:
         whole = jnp.ravel(slots)
         if not self._varies:
             return whole
-        unit = centre(length - self.least, self.levels[0]).astype(u.dtype)
+        unit = centre(length - self.min_events, self.levels[0]).astype(u.dtype)
         return jnp.concatenate([unit, whole])
 
     def _walk(self, u: Float[jax.Array, " size"]) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return the transition of each event, -1 after the end, its node, and coordinates."""
-        length = jnp.int32(self.most)
+        length = jnp.int32(self.max_events)
         if self._varies:
-            length = self.least + cell(u[0], self.levels[0])
-        slots = u[int(self._varies) :].reshape(self.most, sum(self._tables.widths))
+            length = self.min_events + cell(u[0], self.levels[0])
+        slots = u[int(self._varies) :].reshape(self.max_events, sum(self._tables.widths))
         edges, last = jnp.asarray(self.graph.edges), jnp.asarray(self.graph.last)
         following = jnp.asarray(self.graph.following)
 
@@ -305,7 +315,7 @@ class Automaton(Domain):
             number = jnp.where(index < length, number, ABSENT)
             return jnp.where(number >= 0, following[node, number], node), (number, node)
 
-        indices = jnp.arange(self.most, dtype=jnp.int32)
+        indices = jnp.arange(self.max_events, dtype=jnp.int32)
         _, (taken, nodes) = jax.lax.scan(step, jnp.int32(0), (slots[:, 0], indices))
         return taken, nodes, slots
 
@@ -324,20 +334,20 @@ class Automaton(Domain):
     def _wanted(self, taken: jax.Array, nodes: jax.Array) -> jax.Array:
         """Return the length that stands for this sequence; the greatest where it had to end."""
         count = jnp.sum(taken >= 0).astype(jnp.int32)
-        ended = jnp.asarray(self.graph.last)[nodes[jnp.minimum(count, self.most - 1)]] < 0
-        forced = (count < self.most) & ended
-        return jnp.where(forced, self.most, count)
+        ended = jnp.asarray(self.graph.last)[nodes[jnp.minimum(count, self.max_events - 1)]] < 0
+        forced = (count < self.max_events) & ended
+        return jnp.where(forced, self.max_events, count)
 
     def _split(self, slots: jax.Array) -> list[jax.Array]:
         return jnp.split(slots, np.cumsum(self._tables.widths)[:-1].tolist(), axis=1)
 
     @property
-    def mark_count(self) -> int:
+    def coverage_id_count(self) -> int:
         return len(self.transitions) + len(self.graph.pairs)
 
-    def marks(self, value: Events) -> Int[jax.Array, " marks"]:
+    def coverage_ids(self, value: Events) -> Int[jax.Array, " ids"]:
         taken, _ = self._follow(jnp.asarray(value.kinds))
-        pairs = jnp.asarray(self._tables.pair_marks)[taken[:-1], taken[1:]]
+        pairs = jnp.asarray(self._tables.pair_ids)[taken[:-1], taken[1:]]
         both = (taken[:-1] >= 0) & (taken[1:] >= 0)
         return jnp.concatenate([taken, jnp.where(both, pairs, ABSENT)])
 
@@ -358,8 +368,8 @@ class Automaton(Domain):
 
     def facts(self, name: str) -> Facts:
         """Return what is known of the events' columns: kinds, and bounds over all their kinds."""
-        found = {f"{name}.length": {**integer_facts(0, self.most), "length": True}}
-        for item in indexed(name, self.most):
+        found = {f"{name}.length": {**integer_facts(0, self.max_events), "length": True}}
+        for item in indexed(name, self.max_events):
             # An absent event is a choice of its own.
             found[f"{item}.kind"] = {"ordered": False, "choices": (*self.names, "")}
             for each in self.transitions:
@@ -370,8 +380,8 @@ class Automaton(Domain):
 
     def __repr__(self) -> str:
         events = ", ".join(describe_event(each) for each in self.transitions)
-        least = f", least={self.least}" if self.least else ""
-        return f"Automaton({self.start!r}, {{{events}}}, most={self.most}{least})"
+        minimum = f", min_events={self.min_events}" if self.min_events else ""
+        return f"Automaton({self.start!r}, {{{events}}}, max_events={self.max_events}{minimum})"
 
 
 def _among(taken: jax.Array, numbers: tuple[int, ...]) -> jax.Array:

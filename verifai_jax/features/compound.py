@@ -183,15 +183,15 @@ class Struct(Domain):
         return jnp.concatenate(parts)
 
     @property
-    def mark_count(self) -> int:
-        return sum(domain.mark_count for _, domain in self.fields)
+    def coverage_id_count(self) -> int:
+        return sum(domain.coverage_id_count for _, domain in self.fields)
 
-    def marks(self, value: Mapping[str, PyTree]) -> Int[jax.Array, " marks"]:
+    def coverage_ids(self, value: Mapping[str, PyTree]) -> Int[jax.Array, " ids"]:
         parts, start = [jnp.zeros(0, jnp.int32)], 0
         for name, domain in self.fields:
-            own = domain.marks(value[name])
+            own = domain.coverage_ids(value[name])
             parts.append(jnp.where(own >= 0, own + start, own))
-            start += domain.mark_count
+            start += domain.coverage_id_count
         return jnp.concatenate(parts)
 
     def refined(self, factor: int) -> "Struct":

@@ -65,7 +65,7 @@ class Continuous(Domain):
 
     @property
     def closed(self) -> str:
-        """The ends of the support that are values themselves, in the words of `Box`."""
+        """The ends of the support that are values themselves, as in `Box`."""
         return "both"
 
     def log_density(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:

@@ -109,9 +109,9 @@ def _log_density(domain: Domain, values: PyTree, name: str) -> Float[np.ndarray,
         case VariableArray():
             items = (
                 np.where(i < np.asarray(values.length), _log_density(domain.domain, item, name), 0)
-                for i, item in ((i, _item(values.values, i)) for i in range(domain.most))
+                for i, item in ((i, _item(values.values, i)) for i in range(domain.longest))
             )
-            return _sum(items) - math.log(domain.most - domain.least + 1)
+            return _sum(items) - math.log(domain.longest - domain.shortest + 1)
     raise NoDensityError(f"the prior of {name} has no density: {domain!r}")
 
 

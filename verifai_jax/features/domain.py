@@ -7,7 +7,7 @@
     Array(Box(0, 50), length=(1, 3))                                        # arrays.py
     Normal(0, 1), TruncatedNormal(0, 1, -2, 2), LogUniform(0.05, 0.5)       # distributions.py
     Signal(Box(-1, 1), knots=16, hold="linear")                             # signal.py
-    Automaton("idle", {("idle", "gust"): dict(wait=Box(1, 5))}, most=3)     # automaton.py
+    Automaton("idle", {("idle", "gust"): dict(wait=Box(1, 5))}, max_events=3)     # automaton.py
 
 The unit cube is the probability space: uniform coordinates give the prior on the values.
 """
@@ -91,8 +91,10 @@ class Domain(ForUsers, abc.ABC):
 
     _internal = frozenset((
         "arguments", "check_reachable", "closed", "coerce", "coordinates", "ends", "facts",
-        "from_columns", "graph", "held_at", "items", "labels", "lengths", "levels", "mark_count",
-        "marks", "named", "nominal", "numeric", "ordered", "parts", "refine", "refined", "rounded",
+        "from_columns", "graph", "held_at", "items", "labels", "lengths", "levels",
+        "coverage_id_count",
+        "coverage_ids", "named", "nominal", "numeric", "ordered", "parts", "refine", "refined",
+        "rounded",
         "sequences", "settled", "signals", "spans", "tail", "tailed", "to_columns", "tuning",
         "uniform", "used", "weights", "without", "words",
     ))  # fmt: skip
@@ -208,12 +210,12 @@ class Domain(ForUsers, abc.ABC):
         return jnp.ones(self.size, bool)
 
     @property
-    def mark_count(self) -> int:
+    def coverage_id_count(self) -> int:
         """Number of things that values can cover, such as transitions of an automaton."""
         return 0
 
-    def marks(self, value: PyTree) -> Int[Array, " marks"]:
-        """Return the numbers of what a value covers, below `mark_count`; -1 for nothing."""
+    def coverage_ids(self, value: PyTree) -> Int[Array, " ids"]:
+        """Return the numbers of what a value covers, below `coverage_id_count`; -1 for nothing."""
         return jnp.zeros(0, jnp.int32)
 
     # What other rooms ask. Each has a default, so that a domain defines what is special about it.

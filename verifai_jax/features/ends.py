@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from verifai_jax.core.errors import unknown_name
 
 CLOSED = ("both", "left", "right", "neither")
-"""Which ends of an interval belong to it, in the words of pandas."""
+"""Which ends of an interval belong to it, as in pandas."""
 
 End: TypeAlias = float | tuple[float, ...]
 """An end of an interval, or of several; infinite where there is none."""

@@ -100,7 +100,7 @@ class EventTables:
         return table
 
     @cached_property
-    def pair_marks(self) -> Int[np.ndarray, "transitions transitions"]:
+    def pair_ids(self) -> Int[np.ndarray, "transitions transitions"]:
         count = len(self.transitions)
         table = np.full((count, count), ABSENT, np.int32)
         for i, (one, other) in enumerate(self.graph.pairs):

@@ -237,7 +237,7 @@ def _check_absent(space: FeatureSpace, columns: Mapping[str, Any]) -> None:
         if not (isinstance(domain, VariableArray) and f"{name}.length" in space.columns):
             continue
         lengths = np.asarray(columns[f"{name}.length"], np.float64)
-        for i in range(domain.least, domain.most):
+        for i in range(domain.shortest, domain.longest):
             for column in domain.domain.columns(f"{name}[{i}]"):
                 entries = np.asarray(columns[column], object)
                 present = np.array([entry is not None and entry == entry for entry in entries])

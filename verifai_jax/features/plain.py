@@ -36,7 +36,7 @@ def to_plain(domain: Domain) -> dict[str, Any]:
             fields = [[name, to_plain(field)] for name, field in domain.fields]
             return {"kind": "Struct", "fields": fields}
         case VariableArray():
-            length = [domain.least, domain.most]
+            length = [domain.shortest, domain.longest]
             return {"kind": "Array", "domain": to_plain(domain.domain), "length": length}
         case Categorical():
             for choice in domain.choices:
@@ -148,7 +148,7 @@ def _automaton_to_plain(domain: Automaton) -> dict[str, Any]:
         domains = [[name, to_plain(part)] for name, part in each.parameters]
         event = {**options, "at_most": each.at_most, "wait": to_plain(each.wait)}
         events.append([each.source, each.name, {**event, "parameters": domains}])
-    ends = {"least": domain.least, "most": domain.most}
+    ends = {"min_events": domain.min_events, "max_events": domain.max_events}
     return {"kind": "Automaton", "start": domain.start, "events": events, **ends}
 
 
@@ -161,7 +161,7 @@ def _automaton_from_plain(
         options["wait"] = from_plain(event["wait"], distributions)
         parameters = {key: from_plain(part, distributions) for key, part in event["parameters"]}
         events[source, name] = {**options, **parameters}
-    return Automaton(data["start"], events, data["most"], data["least"])
+    return Automaton(data["start"], events, data["max_events"], data["min_events"])
 
 
 def _lists(value: PyTree) -> PyTree:

@@ -81,7 +81,7 @@ class Signal(Domain):
             )
         if self.hold not in HOLDS:
             raise unknown_name("hold", self.hold, HOLDS)
-        fewest, knots = 1 if self.hold in HELD else 2, self.knots
+        minimum, knots = 1 if self.hold in HELD else 2, self.knots
         times = None if self.times is None else check_times(self.times)
         if times is not None:
             # The default cannot be distinguished from a 16 that was given.
@@ -91,9 +91,9 @@ class Signal(Domain):
                     f"{len(times)} times"
                 )
             knots = len(times)
-        if isinstance(knots, bool) or not isinstance(knots, int | np.integer) or knots < fewest:
+        if isinstance(knots, bool) or not isinstance(knots, int | np.integer) or knots < minimum:
             raise ValueError(
-                f"a Signal with {self.hold} hold needs at least {fewest} knots; got {knots!r}"
+                f"a Signal with {self.hold} hold needs at least {minimum} knots; got {knots!r}"
             )
         check_width(self.hold, times, self.width)
         object.__setattr__(self, "knots", int(knots))

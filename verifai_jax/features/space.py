@@ -64,7 +64,8 @@ class FeatureSpace(ForUsers):
     _internal = frozenset((
         "accepts_points", "breaks_constraint", "check_where", "coerce", "completed",
         "constraint", "convert", "cube", "distance", "feature_form", "features_at", "fixed",
-        "items", "labels", "lengths", "levels", "marks_at", "nudged", "ordered", "point_form",
+        "items", "labels", "lengths", "levels", "coverage_ids_at", "nudged", "ordered",
+        "point_form",
         "point_of", "points", "points_at", "refined", "root", "settle", "signals",
         "unflatten_given", "used", "weights", "width", "without_items",
     ))  # fmt: skip
@@ -357,7 +358,7 @@ class FeatureSpace(ForUsers):
 
     @cached_property
     def without_items(self) -> Callable[[Numbers, Numbers], Float[Array, "n dim"]]:
-        """Take those items away from points `[n, dim]` that `[n, items]` marks; compiled."""
+        """Take those items away from points `[n, dim]` that `[n, items]` selects; compiled."""
         return jax.jit(jax.vmap(self.root.without))
 
     @cached_property
@@ -371,9 +372,9 @@ class FeatureSpace(ForUsers):
         return jax.jit(jax.vmap(self.root.used))
 
     @cached_property
-    def marks_at(self) -> Callable[[Numbers], Int[Array, "n marks"]]:
+    def coverage_ids_at(self) -> Callable[[Numbers], Int[Array, "n ids"]]:
         """Return what points `[n, dim]` cover, such as transitions of an automaton; compiled."""
-        return jax.jit(jax.vmap(lambda u: self.root.marks(self.unflatten(u))))
+        return jax.jit(jax.vmap(lambda u: self.root.coverage_ids(self.unflatten(u))))
 
     @property
     def constraint(self) -> Callable[[Numbers], Bool[Array, " n"]] | None:

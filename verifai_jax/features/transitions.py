@@ -151,8 +151,8 @@ def check_states(start: str, transitions: tuple[Transition, ...]) -> None:
                 )
     reached, added = {start}, True
     while added:
-        ways = {each.to for each in transitions if each.source in reached}
-        reached, added = reached | ways, not ways <= reached
+        leads = {each.to for each in transitions if each.source in reached}
+        reached, added = reached | leads, not leads <= reached
     for each in transitions:
         if each.source not in reached:
             raise ValueError(
@@ -184,14 +184,14 @@ def unfold(start: str, transitions: tuple[Transition, ...], limit: int) -> Graph
         found: list[tuple[str, Past]] = []
         for state, past in frontier:
             node = nodes[state, past]
-            ways: dict[int, int] = {}
+            leads: dict[int, int] = {}
             for number, each in enumerate(transitions):
                 if each.source != state or not each.enabled(past):
                     continue
                 target = (each.to, past.then(each.name) if guarded else Past())
                 if target not in nodes:
                     if depth == limit:
-                        ways[number] = 0
+                        leads[number] = 0
                         continue
                     nodes[target] = len(nodes)
                     found.append(target)
@@ -200,12 +200,12 @@ def unfold(start: str, transitions: tuple[Transition, ...], limit: int) -> Graph
                             f"the guards tell more than {MAX_NODES} pasts of at most {limit} "
                             "events apart; allow fewer events, or let fewer have guards"
                         )
-                ways[number] = nodes[target]
-            following.append(ways)
+                leads[number] = nodes[target]
+            following.append(leads)
         frontier = found
     depths = _min_depths(following)
-    for node, ways in enumerate(following):
-        for number, target in ways.items():
+    for node, leads in enumerate(following):
+        for number, target in leads.items():
             if depths[node] < limit:
                 taken.add(number)
                 if depths[node] < limit - 1:
@@ -239,8 +239,8 @@ def _tables(
 ) -> Graph:
     shape = (len(nodes), len(transitions))
     enabled, target = np.zeros(shape, bool), np.zeros(shape, np.int32)
-    for node, ways in enumerate(following):
-        for number, to in ways.items():
+    for node, leads in enumerate(following):
+        for number, to in leads.items():
             enabled[node, number], target[node, number] = True, to
     weights = np.where(enabled, [each.weight for each in transitions], 0.0)
     total = weights.sum(axis=1, keepdims=True)

@@ -1,6 +1,6 @@
 """Sequences of events as a person writes them, and as the columns of a table.
 
-written = WrittenEvents(tables, least=0, most=6)
+written = WrittenEvents(tables, min_events=0, max_events=6)
 written.check([{"kind": "brake", "wait": 1.0, "rate": 4.0}], "events")
 value = written.coerce([{"kind": "brake", "wait": 1.0, "rate": 4.0}])
 written.to_columns(values, "events")            # events.length, events[0].kind, ...
@@ -26,12 +26,12 @@ class WrittenEvents:
     """The written forms of an automaton's sequences.
 
     - `tables`: the automaton's tables.
-    - `least`, `most`: number of events of a sequence.
+    - `min_events`, `max_events`: number of events of a sequence.
     """
 
     tables: EventTables
-    least: int
-    most: int
+    min_events: int
+    max_events: int
 
     def coerce(self, value: PyTree) -> Events:
         """Return a checked list of events, or an `Events`, as a value of the domain."""
@@ -64,7 +64,7 @@ class WrittenEvents:
         """Return the value with these transitions, waits and parameters."""
         tables = self.tables
         dtype = jnp.result_type(float)
-        missing = self.most - len(events)
+        missing = self.max_events - len(events)
         kinds = [tables.kind_of[number] for number, _, _ in events] + [ABSENT] * missing
         waits = [as_real(wait) for _, wait, _ in events] + [jnp.zeros(())] * missing
         parameters = {}
@@ -98,13 +98,15 @@ class WrittenEvents:
                 f'{name} must be a list of events such as {{"kind": {tables.names[0]!r}, '
                 f'"wait": 1.0}}; got {value!r}'
             )
-        if not len(value) <= self.most:
-            raise ValueError(f"{name} must have at most {self.most} events; got {len(value)}")
+        if not len(value) <= self.max_events:
+            raise ValueError(f"{name} must have at most {self.max_events} events; got {len(value)}")
         node, now = 0, 0.0
         for i, event in enumerate(value):
             node, now = self._check_event(event, f"{name}[{i}]", node, now)
-        if len(value) < self.least and tables.graph.last[node] >= 0:
-            raise ValueError(f"{name} must have at least {self.least} events; got {len(value)}")
+        if len(value) < self.min_events and tables.graph.last[node] >= 0:
+            raise ValueError(
+                f"{name} must have at least {self.min_events} events; got {len(value)}"
+            )
 
     def _check_event(self, event: object, name: str, node: int, now: float) -> tuple[int, float]:
         tables = self.tables
@@ -159,7 +161,7 @@ class WrittenEvents:
     def columns(self, name: str) -> tuple[str, ...]:
         """Return the names of the columns of a table."""
         found = (f"{name}.length",)
-        for item in indexed(name, self.most):
+        for item in indexed(name, self.max_events):
             found += (dotted(item, "kind"), dotted(item, "wait"))
             for parameter, domains in self.tables.domains.items():
                 found += domains[0].columns(dotted(item, parameter))
@@ -175,7 +177,7 @@ class WrittenEvents:
         }
         # Texts throughout, so that a column has one type in every batch, on the disk too.
         shown = np.array([*tables.names, ""], object)
-        for i, item in enumerate(indexed(name, self.most)):
+        for i, item in enumerate(indexed(name, self.max_events)):
             columns[dotted(item, "kind")] = shown[kinds[:, i]]
             columns[dotted(item, "wait")] = np.where(kinds[:, i] >= 0, waits[:, i], np.nan)
             for parameter, groups in tables.users.items():
@@ -188,12 +190,12 @@ class WrittenEvents:
         """Return the value in a row of a table."""
         tables = self.tables
         length = as_numbers(row[f"{name}.length"], f"{name}.length").item()
-        if length not in range(self.most + 1):
+        if length not in range(self.max_events + 1):
             raise ValueError(
-                f"{name}.length must be an integer from 0 to {self.most}; got {length!r}"
+                f"{name}.length must be an integer from 0 to {self.max_events}; got {length!r}"
             )
         node, written = 0, []
-        for item in indexed(name, self.most)[: int(length)]:
+        for item in indexed(name, self.max_events)[: int(length)]:
             kind = row[dotted(item, "kind")]
             if kind not in tables.names:
                 raise unknown_name(dotted(item, "kind"), kind, tables.names)

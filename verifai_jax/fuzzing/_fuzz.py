@@ -61,7 +61,7 @@ def fuzz(
       together. When left out those of the problem's `behaviour`, or each signal with a range is cut
       in four, where these are few.
     - `search`: another search; `search.Coverage` when left out.
-    - the others as in `falsify`.
+    - all other arguments: as in `falsify`.
 
     With formulas a simulation that raises or hangs has a status and no verdict, as in `falsify`;
     `run.failures` has these rows too.

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from verifai_jax.core.figure import Figure
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.trace import Status
 from verifai_jax.features import Automaton, Domain
 from verifai_jax.problem.problem import Problem
 
-MOST_NAMED = 4
+MAX_NAMED = 4
 """Names of what is not covered that are written out."""
 
 
@@ -56,8 +56,8 @@ class Covered:
             return share
         if self.what == "cells":
             return share
-        shown = ", ".join(self.missing[:MOST_NAMED])
-        more = len(self.missing) - MOST_NAMED
+        shown = ", ".join(self.missing[:MAX_NAMED])
+        more = len(self.missing) - MAX_NAMED
         return f"{share}; missing {shown}{f' and {more} more' if more > 0 else ''}"
 
 
@@ -78,15 +78,15 @@ class FuzzCoverage(InNotebook):
     automata: tuple[tuple[str, Automaton], ...] = ()
 
     @classmethod
-    def of(cls, problem: Problem, counts: Int[np.ndarray, " marks"]) -> "FuzzCoverage":
-        """Read the coverage from the counts of marks of a run."""
+    def of(cls, problem: Problem, counts: Int[np.ndarray, " ids"]) -> "FuzzCoverage":
+        """Read the coverage from the counts of coverage ids of a run."""
         parts: list[Covered] = []
         first = len(Status)
         automata = tuple(_automata(problem.space.root, ""))
         for name, automaton in automata:
-            own = counts[first : first + automaton.mark_count]
+            own = counts[first : first + automaton.coverage_id_count]
             parts += _of_automaton(name, automaton, own)
-            first += automaton.mark_count
+            first += automaton.coverage_id_count
         behaviour = problem.behaviour
         if behaviour is not None and behaviour.cells:
             own = counts[first : first + behaviour.cells]
@@ -120,7 +120,7 @@ class FuzzCoverage(InNotebook):
 
         **Raises:** `ValueError` for a run without an automaton.
         """
-        return late("verifai_jax.plotting.events", "plot_pairs")(self, path)
+        return lazy_import("verifai_jax.plotting.events", "plot_pairs")(self, path)
 
     def __str__(self) -> str:
         width = max((len(part.where) for part in self.parts), default=0)
@@ -130,7 +130,7 @@ class FuzzCoverage(InNotebook):
 
 
 def _automata(domain: Domain, name: str) -> Iterator[tuple[str, Automaton]]:
-    """Yield the automata of a space in the order of their marks."""
+    """Yield the automata of a space in the order of their coverage ids."""
     if domain.graph is not None:
         yield name, cast(Automaton, domain)
     for field, part in domain.named:
@@ -138,7 +138,7 @@ def _automata(domain: Domain, name: str) -> Iterator[tuple[str, Automaton]]:
 
 
 def _of_automaton(
-    name: str, automaton: Automaton, counts: Int[np.ndarray, " marks"]
+    name: str, automaton: Automaton, counts: Int[np.ndarray, " ids"]
 ) -> list[Covered]:
     graph, labels = automaton.graph, [each.label for each in automaton.transitions]
     taken, pairs = counts[: len(labels)], counts[len(labels) :]

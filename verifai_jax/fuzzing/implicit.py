@@ -44,7 +44,7 @@ Cells = Mapping[str, tuple[float, float, int]]
 CELLS_OF_A_RANGE = 4
 """Cells into which a signal with a range is cut where nobody says how many."""
 
-MOST_CUT = 4
+MAX_CUT = 4
 """Signals with ranges that are cut at most where nobody says which."""
 
 
@@ -230,7 +230,7 @@ def with_implicit(
     own_behaviour = None if problem is None or cells is not None else problem.behaviour
     given = cells
     if cells is None:
-        cut = ranges if len(ranges) <= MOST_CUT else {}
+        cut = ranges if len(ranges) <= MAX_CUT else {}
         cells = {key: (low, high, CELLS_OF_A_RANGE) for key, (low, high) in cut.items()}
     if problem is not None:
         if space is not None or system is not None:

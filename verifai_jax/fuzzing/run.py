@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from verifai_jax.core.text import printable
-from verifai_jax.falsification.marks import SEEN
+from verifai_jax.falsification.coverage_counts import SEEN
 from verifai_jax.falsification.run import Run
 from verifai_jax.fuzzing.coverage import FuzzCoverage
 
@@ -39,7 +39,7 @@ class FuzzRun(Run):
         """The rows that extended coverage: each covered something that no row before it did."""
         table = self.table.all
         # A run that was interrupted before its first batch has no row, nor this column.
-        return table.loc[table["new_marks"] > 0] if len(table) else table
+        return table.loc[table["new_coverage"] > 0] if len(table) else table
 
     @property
     def failures(self) -> "pd.DataFrame":

@@ -241,9 +241,9 @@ class Arithmetic(Expression):
     def __post_init__(self) -> None:
         if self.name not in (*PRECEDENCE, *FUNCTIONS):
             raise unknown_name("function", self.name, FUNCTIONS)
-        n, fewest = len(self.arguments), FUNCTIONS.get(self.name)
-        if fewest is not None and (n != 1 if fewest == 1 else n < fewest):
-            wanted = "one argument" if fewest == 1 else "two arguments or more"
+        n, minimum = len(self.arguments), FUNCTIONS.get(self.name)
+        if minimum is not None and (n != 1 if minimum == 1 else n < minimum):
+            wanted = "one argument" if minimum == 1 else "two arguments or more"
             raise ValueError(f"{self.name} takes {wanted}; got {n}")
         values = [constant_value(argument) for argument in self.arguments]
         if self.name == "/" and values[1] == 0.0:

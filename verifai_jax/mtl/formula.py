@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar, TypeAlias, Union
 
 from verifai_jax.core.errors import unknown_name
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.mtl.node import Node
 from verifai_jax.mtl.tree import EVERYTHING as EVERYTHING
 from verifai_jax.mtl.tree import Interval as Interval
@@ -146,7 +146,7 @@ class Formula(Tree):
         return self.text().text
 
     def _repr_latex_(self) -> str:
-        return f"${late('verifai_jax.mtl._latex', 'latex')(self)}$"
+        return f"${lazy_import('verifai_jax.mtl._latex', 'latex')(self)}$"
 
     def _repr_html_(self) -> str:
         # Notebooks set mathematics within HTML, and prefer HTML to LaTeX.

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.figure import Axes, Figure, new_figure
 from verifai_jax.core.text import format_seconds
-from verifai_jax.core.whole_files import replacing
 from verifai_jax.mtl._explain import Explanation, Node, heading
 from verifai_jax.mtl.evaluate import Evaluator
 from verifai_jax.mtl.formula import Term
@@ -63,7 +63,7 @@ def draw(explanation: Explanation, path: str | Path | None = None) -> Figure:
         0.02, 0.14 / size[1], "green: holds   red: fails   dashed: bound", fontsize=9, color=QUIET
     )
     clock = np.asarray(explanation.trace.clock())
-    marks = []
+    ticks = []
     axes = []
     for k, (depth, node) in enumerate(rows):
         axis = figure.add_subplot(grid[k])
@@ -76,8 +76,8 @@ def draw(explanation: Explanation, path: str | Path | None = None) -> Figure:
         _label(figure, axis, depth, node, size[0])
         _dress(axis, clock, last=k == len(rows) - 1)
         if node.decides:
-            marks.append((axis, node.time, y))
-    for (upper, t0, y0), (lower, t1, y1) in itertools.pairwise(marks):
+            ticks.append((axis, node.time, y))
+    for (upper, t0, y0), (lower, t1, y1) in itertools.pairwise(ticks):
         figure.add_artist(
             ConnectionPatch(
                 (t0, y0),
@@ -95,8 +95,8 @@ def draw(explanation: Explanation, path: str | Path | None = None) -> Figure:
                 zorder=20,
             )
         )
-    for n, (axis, t, y) in enumerate(marks):
-        final = n == len(marks) - 1
+    for n, (axis, t, y) in enumerate(ticks):
+        final = n == len(ticks) - 1
         axis.plot(
             [t],
             [y],

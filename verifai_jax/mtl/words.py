@@ -187,7 +187,7 @@ def operator_text(word: str, interval: str, operands: Sequence[Text]) -> Text:
     **Arguments:**
 
     - `word`: operator, a key of `OPERATORS`.
-    - `interval`: text of its interval; empty where it has none.
+    - `interval`: text of its interval; empty if it has none.
     - `operands`: text of its operands.
     """
     symbol = OPERATORS[word].symbol

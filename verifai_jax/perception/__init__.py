@@ -6,7 +6,7 @@ lies in the room `compositional`, above this one, and is imported when it is fir
 
 from typing import Any
 
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.perception._detector import (
     Detection,
     Detector,
@@ -39,7 +39,7 @@ abstract: Any
 
 def __getattr__(name: str) -> Any:
     if name in ("Compositional", "abstract"):
-        return late("verifai_jax.compositional", name)
+        return lazy_import("verifai_jax.compositional", name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

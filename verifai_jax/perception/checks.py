@@ -1,4 +1,4 @@
-"""Checks of a scene before it is rendered, in words."""
+"""Checks of a scene before it is rendered."""
 
 import dataclasses
 from typing import Any
@@ -90,7 +90,7 @@ def _shape(value: Any) -> tuple[int, ...]:
 
 
 def _known(value: Any) -> np.ndarray | None:
-    """Return numbers that are not traced; None where any is."""
+    """Return numbers that are not traced; None if any is."""
     leaves = jax.tree.leaves(value)
     if not leaves or any(isinstance(leaf, Tracer) for leaf in leaves):
         return None

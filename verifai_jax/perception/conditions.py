@@ -137,8 +137,8 @@ def blurred(image: Float[Array, "3 height width"], sigma: Number) -> Float[Array
     sigma = jnp.maximum(jnp.asarray(sigma, float), 0.05)
 
     def kernel(pixels: int) -> Array:
-        places = jnp.arange(pixels, dtype=image.dtype)
-        weights = _bell(places[:, None] - places, sigma)
+        positions = jnp.arange(pixels, dtype=image.dtype)
+        weights = _bell(positions[:, None] - positions, sigma)
         return weights / jnp.sum(weights, axis=1, keepdims=True)
 
     _, height, width = image.shape

@@ -28,7 +28,7 @@ from verifai_jax.perception.camera import (
     vector,
 )
 
-Place: TypeAlias = PyTree
+Position: TypeAlias = PyTree
 """Two numbers, x and y in m, or an array `[2]`."""
 
 WHITE: Vector = (0.9, 0.9, 0.9)
@@ -45,7 +45,7 @@ class Line:
     - `dash`, `gap`: lengths in m of what is painted and of what is not; no gap paints all of it.
     """
 
-    position: Place = (0.0, 0.0)
+    position: Position = (0.0, 0.0)
     yaw: Number = 0.0
     width: Number = 0.15
     colour: Vector = WHITE
@@ -57,7 +57,7 @@ class Line:
 class Rectangle:
     """A rectangle about `position`, `size` its length along the heading `yaw` and its width."""
 
-    position: Place = (0.0, 0.0)
+    position: Position = (0.0, 0.0)
     size: PyTree = (1.0, 1.0)
     colour: Vector = WHITE
     yaw: Number = 0.0
@@ -67,7 +67,7 @@ class Rectangle:
 class Disc:
     """A disc about `position`."""
 
-    position: Place = (0.0, 0.0)
+    position: Position = (0.0, 0.0)
     radius: Number = 1.0
     colour: Vector = WHITE
 
@@ -76,7 +76,7 @@ class Disc:
 class Ring:
     """A ring about `position`, `radius` that of the middle of its `width`."""
 
-    position: Place = (0.0, 0.0)
+    position: Position = (0.0, 0.0)
     radius: Number = 1.0
     width: Number = 0.15
     colour: Vector = WHITE
@@ -86,7 +86,7 @@ class Ring:
 class Cross:
     """A cross about `position`: two bars of length `size` and of `width`, one along `yaw`."""
 
-    position: Place = (0.0, 0.0)
+    position: Position = (0.0, 0.0)
     size: Number = 1.0
     width: Number = 0.2
     colour: Vector = WHITE
@@ -130,7 +130,7 @@ def _vertical() -> Float[Array, "3"]:
     return jnp.asarray([0.0, 0.0, 1.0])
 
 
-def _point(position: Place) -> Float[Array, "3"]:
+def _point(position: Position) -> Float[Array, "3"]:
     x, y = vector(position)
     return jnp.stack([x, y, jnp.zeros_like(x)])
 
@@ -142,7 +142,7 @@ def _heading(yaw: Number) -> tuple[Array, Array]:
     return jnp.stack([cos, sin, zero]), jnp.stack([-sin, cos, zero])
 
 
-def _bar(rays: Rays, position: Place, yaw: Number, width: Number) -> Array:
+def _bar(rays: Rays, position: Position, yaw: Number, width: Number) -> Array:
     """Return the share of each pixel within half a width of a line along `yaw`."""
     _, left = _heading(yaw)
     offset = dot(left, rays.eye - _point(position))
@@ -153,12 +153,12 @@ def _bar(rays: Rays, position: Place, yaw: Number, width: Number) -> Array:
     return strip(rays.pixels(far), -rays.pixels(near))
 
 
-def _rectangle(rays: Rays, position: Place, yaw: Number, length: Number, width: Number) -> Array:
+def _rectangle(rays: Rays, position: Position, yaw: Number, length: Number, width: Number) -> Array:
     along = _bar(rays, position, yaw, width)
     return along * _bar(rays, position, yaw + jnp.pi / 2, length)
 
 
-def _circle(rays: Rays, position: Place, radius: Number) -> Array:
+def _circle(rays: Rays, position: Position, radius: Number) -> Array:
     """Return the distance in pixels within a circle."""
     away = _point(position) - rays.eye
     x, y, z = -away

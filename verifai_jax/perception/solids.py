@@ -126,9 +126,9 @@ def _thin(cover: Array, rays: Rays, centre: Array, size: Array, reach: Array) ->
     The least of two ramps of one pixel about a bar of width w < 1 integrates to (1 + w)^2 / 4
     instead of w. `reach` is how far a solid extends from its centre.
     """
-    ahead = dot(centre - rays.eye, rays.forward)
-    width = jnp.clip(size * rays.focal / jnp.maximum(ahead, 1e-3), 0.0, 1.0)
-    width = jnp.where(ahead + reach > 0, width, 0.0)
+    forward = dot(centre - rays.eye, rays.forward)
+    width = jnp.clip(size * rays.focal / jnp.maximum(forward, 1e-3), 0.0, 1.0)
+    width = jnp.where(forward + reach > 0, width, 0.0)
     return cover * computed_once(4 * width / (1 + width) ** 2)[:, None, None]
 
 
@@ -314,8 +314,8 @@ def _between_ends(
     low, high = [], []
     for sign in (-1.0, 1.0):
         along = x * cosine - sign * y * sine
-        beside = y * cosine + sign * x * sine
-        radial = along[:, None] * shape.frame[:, 0] + beside[:, None] * shape.frame[:, 1]
+        sideways = y * cosine + sign * x * sine
+        radial = along[:, None] * shape.frame[:, 0] + sideways[:, None] * shape.frame[:, 1]
         normal = -(shape.height[:, None] * radial + shape.taper[:, None] * shape.frame[:, 2])
         top = shape.base + shape.height[:, None] * shape.frame[:, 2]
         low.append(shape.base + shape.radius[:, None] * radial)

@@ -25,7 +25,7 @@ class Labels(NamedTuple):
 
     - `present`: whether the object is in the image.
     - `values`: numbers of it, `[n, values]`; ignored where it is absent.
-    - `kinds`: its kind, from 0; None where there is one kind only.
+    - `kinds`: its kind, from 0; None if there is one kind only.
     """
 
     present: Bool[Array, " n"] | Float[Array, " n"] | np.ndarray

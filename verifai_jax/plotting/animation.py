@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
-from verifai_jax.core.whole_files import replacing
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.evaluation.replay import Replay
-from verifai_jax.plotting.film import LAST, MOST_FRAMES, MOST_WANTED, check_film
+from verifai_jax.plotting.film import LAST, MAX_FRAMES, MAX_WANTED, check_film
 from verifai_jax.plotting.gymnasium_film import episode_of, film_episode
 from verifai_jax.plotting.mujoco_motion import can_draw, record
 from verifai_jax.plotting.mujoco_scene import film
@@ -86,8 +86,8 @@ def animate(
         animation = Animation(_drawn(replay, draw, pixels or SIZE, fps))
     elif can_draw(system):
         with TemporaryDirectory() as folder:
-            place = Path(folder) / "animation.gif"
-            file = film(record(replay), place, pixels, camera=camera, fps=fps)
+            file_path = Path(folder) / "animation.gif"
+            file = film(record(replay), file_path, pixels, camera=camera, fps=fps)
             animation = Animation(file.read_bytes())
     elif episode_of(system) is not None:
         animation = Animation(film_episode(replay, pixels, fps))
@@ -114,8 +114,8 @@ def _drawn(
 
     clock = np.asarray(replay.trace.clock())
     seconds = float(clock[-1] - clock[0])
-    rate, most = (FRAMES_PER_SECOND, MOST_FRAMES) if fps is None else (fps, MOST_WANTED)
-    count = max(2, min(most, round(seconds * rate)))
+    rate, maximum = (FRAMES_PER_SECOND, MAX_FRAMES) if fps is None else (fps, MAX_WANTED)
+    count = max(2, min(maximum, round(seconds * rate)))
     samples = np.searchsorted(clock, np.linspace(clock[0], clock[-1], count)).clip(
         max=len(clock) - 1
     )
@@ -137,7 +137,7 @@ def _drawn(
 class _Layout(NamedTuple):
     """Where the axes are in a frame, and what decides on it."""
 
-    place: Any
+    position: Any
     reasons: tuple[Any, ...]
 
 
@@ -165,7 +165,7 @@ def _frame(
     alone = figure.axes == [axes] and not figure.texts and axes.get_legend() is None
     if alone and before is not None and before.reasons == reasons:
         figure.set_layout_engine("none")
-        axes.set_position(before.place)
+        axes.set_position(before.position)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     layout = _Layout(axes.get_position(original=True), reasons) if alone else None

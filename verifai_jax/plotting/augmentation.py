@@ -36,19 +36,19 @@ def plot_arms(
     figure = new_figure(figsize=(9.0, 1.2 + 0.34 * len(arms)))
     left, right = figure.subplots(1, 2, sharey=True)
     scale, unit = (100.0, " (%)") if metric in SHARES else (1.0, "")
-    for place, arm in enumerate(arms):
+    for height, arm in enumerate(arms):
         values = result.table.loc[result.table["arm"] == arm, metric].to_numpy(np.float64)
-        left.plot(scale * values, np.full(len(values), place), "o", color=BOUND, alpha=0.35, ms=4)
+        left.plot(scale * values, np.full(len(values), height), "o", color=BOUND, alpha=0.35, ms=4)
         if np.isfinite(values).any():
-            left.plot(scale * np.nanmean(values), place, "|", color=BOUND, ms=15, mew=2)
+            left.plot(scale * np.nanmean(values), height, "|", color=BOUND, ms=15, mew=2)
         difference = differences.get(arm)
         if difference is None or not difference.pairs:
             continue
         color = SAFE if difference.negative else FAILING if difference.positive else BOUND
         if np.isfinite(difference.low):
             ends = [scale * difference.low, scale * difference.high]
-            right.plot(ends, [place, place], color=color, linewidth=3, alpha=0.5)
-        right.plot(scale * difference.mean, place, "o", color=color)
+            right.plot(ends, [height, height], color=color, linewidth=3, alpha=0.5)
+        right.plot(scale * difference.mean, height, "o", color=color)
     left.set_yticks(range(len(arms)), [arm.replace("_", " ") for arm in arms])
     # The marks of the first and the last arm are as high as a row.
     left.set_ylim(len(arms) - 0.4, -0.6)
@@ -93,10 +93,10 @@ def plot_montage(
     rows = -(-len(images) // columns)
     height, width = images.shape[1:3]
     figure = new_figure(figsize=(1.6 * columns, 1.6 * rows * height / width + 0.4))
-    places: list[Axes] = list(np.ravel(figure.subplots(rows, columns, squeeze=False)))
-    for axes, image in zip(places, images, strict=False):
+    panels: list[Axes] = list(np.ravel(figure.subplots(rows, columns, squeeze=False)))
+    for axes, image in zip(panels, images, strict=False):
         axes.imshow(image, cmap=None if image.ndim == 3 else "gray", vmin=0, vmax=1)
-    for axes in places:
+    for axes in panels:
         axes.set_axis_off()
     figure.suptitle(f"{result.task.name}: {len(images)} of {len(examples)}, {arm}", fontsize=10)
     return show_or_save(figure, path)

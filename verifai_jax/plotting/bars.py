@@ -21,8 +21,8 @@ from verifai_jax.plotting.style import (
 
 SECOND = "#8d99ae"
 """Colour of what is shown next to failures and to total influence."""
-MOST_IMPORTANCES = 15
-MOST_SENSITIVITIES = 20
+MAX_IMPORTANCES = 15
+MAX_SENSITIVITIES = 20
 
 
 def plot_importance(importance: Importance, path: str | Path | None = None) -> Figure:
@@ -44,7 +44,7 @@ def plot_importance(importance: Importance, path: str | Path | None = None) -> F
     if weak:
         what = " and of ".join(NAMES[target] for target in weak)
         title += f"\nmeaningless for {what}: the model does not predict"
-    shown = importance.table.head(MOST_IMPORTANCES)
+    shown = importance.table.head(MAX_IMPORTANCES)
     return plot_bars(shown, columns, title, "loss of score when shuffled", path)
 
 
@@ -58,7 +58,7 @@ def plot_sensitivity(sensitivity: Sensitivity, path: str | Path | None = None) -
 
     **Returns:** the figure.
     """
-    shown = sensitivity.table.head(MOST_SENSITIVITIES)
+    shown = sensitivity.table.head(MAX_SENSITIVITIES)
     title = (
         f"{sensitivity.method} of {sensitivity.problem}, {sensitivity.simulations:,} simulations"
     )
@@ -103,7 +103,7 @@ def plot_bars(
 def draw_bars(axes: Axes, table: pd.DataFrame, columns: Mapping[str, str]) -> None:
     """Draw the bars of `plot_bars` into `axes`, the first row on top."""
     height = 0.76 / len(columns)
-    place = np.arange(len(table))
+    position = np.arange(len(table))
     for j, (column, name) in enumerate(columns.items()):
         values = table[column].to_numpy(float)
         low, high = (
@@ -113,7 +113,7 @@ def draw_bars(axes: Axes, table: pd.DataFrame, columns: Mapping[str, str]) -> No
         # An interval of resampled values need not contain the value itself.
         reach = np.nan_to_num([np.maximum(values - low, 0), np.maximum(high - values, 0)])
         axes.barh(
-            place + (j - (len(columns) - 1) / 2) * height,
+            position + (j - (len(columns) - 1) / 2) * height,
             np.nan_to_num(values),
             height * 0.92,
             color=SECOND if column in ("first", "rho") else FAILING,
@@ -121,7 +121,7 @@ def draw_bars(axes: Axes, table: pd.DataFrame, columns: Mapping[str, str]) -> No
             xerr=reach,
             error_kw={"ecolor": BOUND, "elinewidth": 1, "capsize": 2},
         )
-    axes.set_yticks(place, [wrap_name(str(name)) for name in table.index])
+    axes.set_yticks(position, [wrap_name(str(name)) for name in table.index])
     axes.invert_yaxis()
     axes.axvline(0, color=BOUND, linewidth=0.8)
     tidy(axes)
@@ -144,8 +144,8 @@ def plot_effects(table: pd.DataFrame, title: str, path: str | Path | None = None
     figure = new_figure(figsize=(5.6, 4.4))
     axes = figure.subplots()
     across, up = table["mu_star"].to_numpy(float), table["sigma"].to_numpy(float)
-    most = 1.12 * max(np.max(across, initial=0), np.max(up, initial=0)) or 1.0
-    axes.plot([0, most], [0, most], color=BOUND, linewidth=0.8, linestyle=":")
+    maximum = 1.12 * max(np.max(across, initial=0), np.max(up, initial=0)) or 1.0
+    axes.plot([0, maximum], [0, maximum], color=BOUND, linewidth=0.8, linestyle=":")
     axes.errorbar(
         across,
         up,
@@ -155,8 +155,8 @@ def plot_effects(table: pd.DataFrame, title: str, path: str | Path | None = None
         ecolor=BOUND,
         elinewidth=0.8,
     )
-    axes.set_xlim(0, most)
-    axes.set_ylim(-0.03 * most, most)
+    axes.set_xlim(0, maximum)
+    axes.set_ylim(-0.03 * maximum, maximum)
     axes.set_xlabel("mean size of the effect on the robustness")
     axes.set_ylabel("standard deviation of the effect\n(interaction or curvature)")
     tidy(axes)

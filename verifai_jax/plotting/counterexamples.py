@@ -31,9 +31,9 @@ from verifai_jax.plotting.style import (
 )
 
 QUIET = "#8d99ae"
-MOST_BARS = 12
+MAX_BARS = 12
 """Features drawn as bars."""
-MOST_SIGNALS = 3
+MAX_SIGNALS = 3
 """Input signals drawn."""
 
 
@@ -48,7 +48,7 @@ def plot_explanation(explained: Explained, path: str | Path | None = None) -> Fi
     **Returns:** the figure.
     """
     features = explained.replay.features
-    inputs = [i for i in explained.influences if is_waveform(features.get(i.name))][:MOST_SIGNALS]
+    inputs = [i for i in explained.influences if is_waveform(features.get(i.name))][:MAX_SIGNALS]
     figure = new_figure(figsize=(10.5, 3.4 + 1.3 * len(inputs)))
     halves: Any = figure.subfigures(1, 2, width_ratios=(1.6, 1))
     left, right = halves
@@ -101,14 +101,14 @@ def draw_decision(axes: Axes, why: Explanation) -> None:
     )  # fmt: skip
     decided = ""
     if np.isfinite(why.time):
-        place = int(np.argmin(np.abs(clock - why.time)))
-        axes.axvline(clock[place], color=FAILING, linewidth=1, linestyle=":")
-        axes.plot([clock[place]], [values[place]], "o", color=FAILING, markersize=6)
-        shown = format_number(float(values[place]))
+        index = int(np.argmin(np.abs(clock - why.time)))
+        axes.axvline(clock[index], color=FAILING, linewidth=1, linestyle=":")
+        axes.plot([clock[index]], [values[index]], "o", color=FAILING, markersize=6)
+        shown = format_number(float(values[index]))
         if bounds:
-            nearest = min(bounds, key=lambda b: abs(b - values[place]))
-            shown = format_apart(float(values[place]), nearest)[0]
-        decided = f"\n{shown} at {format_seconds(clock[place], 4)}"
+            nearest = min(bounds, key=lambda b: abs(b - values[index]))
+            shown = format_apart(float(values[index]), nearest)[0]
+        decided = f"\n{shown} at {format_seconds(clock[index], 4)}"
     axes.set_ylabel(wrap_name(label, 28))
     # Above the axes, where no curve runs through it.
     title = f"decides: {_short(str(predicate), 100)}{decided}"
@@ -134,10 +134,10 @@ def _draw_input(axes: Axes, influence: Influence, explained: Explained) -> None:
         axes.legend(fontsize=7, frameon=False, loc="upper right")
     gain = np.nan_to_num(influence.each - explained.rho)
     every = [np.nan_to_num(i.each - explained.rho) for i in explained.influences]
-    most = max((float(g.max(initial=0.0)) for g in every), default=0.0)
+    maximum = max((float(g.max(initial=0.0)) for g in every), default=0.0)
     for span, one in zip(influence.spans or (), gain, strict=False):
-        if most > 0 and one > 0.02 * most:
-            axes.axvspan(*span, color=FAILING, alpha=0.25 * one / most, linewidth=0)
+        if maximum > 0 and one > 0.02 * maximum:
+            axes.axvspan(*span, color=FAILING, alpha=0.25 * one / maximum, linewidth=0)
     axes.set_ylabel(wrap_name(influence.name, 14))
     tidy(axes)
 
@@ -167,7 +167,7 @@ def _course(
 
 def _draw_bars(axes: Axes, explained: Explained) -> None:
     """Draw the robustness with each feature back at nominal; or gradients, if not known."""
-    shown = explained.influences[:MOST_BARS]
+    shown = explained.influences[:MAX_BARS]
     names = [i.name for i in shown]
     where = np.arange(len(shown))
     if any(np.isfinite(i.reverted) for i in shown):
@@ -214,8 +214,8 @@ def plot_shrunk(shrunk: Shrunk, path: str | Path | None = None) -> Figure:
     draw_decision(right, replay.explain())
     right.set_xlabel("time [s]")
     space = shrunk.problem.space
-    places = [space.coordinates.index(name) for name in shown if name in space.coordinates]
-    for y, (i, name) in enumerate(zip(places, shown, strict=False)):
+    indices = [space.coordinates.index(name) for name in shown if name in space.coordinates]
+    for y, (i, name) in enumerate(zip(indices, shown, strict=False)):
         was, now = shrunk.changed[name]
         left.plot([0, 1], [y, y], color=QUIET, linewidth=3, alpha=0.25, solid_capstyle="round")
         if was is not None:
@@ -227,9 +227,9 @@ def plot_shrunk(shrunk: Shrunk, path: str | Path | None = None) -> Figure:
             (0.5, y), xytext=(0, 5), ha="center",
             textcoords="offset points", fontsize=7, color=BOUND,
         )  # fmt: skip
-    labels = [wrap_name(label, 24) for label in shrunk.labels[: len(places)]]
-    left.set_yticks(range(len(places)), labels)
-    left.set_ylim(max(len(places), 1) - 0.4, -0.8)
+    labels = [wrap_name(label, 24) for label in shrunk.labels[: len(indices)]]
+    left.set_yticks(range(len(indices)), labels)
+    left.set_ylim(max(len(indices), 1) - 0.4, -0.8)
     left.set_xlim(-0.03, 1.03)
     left.set_xlabel("share of the range: green nominal, red failing")
     title = f"{shrunk.count} of {len(shrunk.u)} depart, by {shrunk.distance:z.3g}"
@@ -240,5 +240,5 @@ def plot_shrunk(shrunk: Shrunk, path: str | Path | None = None) -> Figure:
     return show_or_save(figure, path)
 
 
-def _short(text: str, most: int = 110) -> str:
-    return text if len(text) <= most else f"{text[: most - 3]}..."
+def _short(text: str, maximum: int = 110) -> str:
+    return text if len(text) <= maximum else f"{text[: maximum - 3]}..."

@@ -17,7 +17,7 @@ from verifai_jax.plotting.style import (
     wrap_name,
 )
 
-MOST_SHOWN = 12
+MAX_SHOWN = 12
 """Features drawn, the least covered first."""
 
 
@@ -35,20 +35,20 @@ def plot_coverage(coverage: Coverage, path: str | Path | None = None) -> Figure:
     worst = coverage.table.sort_values("occupied", kind="stable")
     figure = new_figure(figsize=(9.6, 4.2))
     left, right = figure.subplots(1, 2)
-    shown = worst.head(MOST_SHOWN)
-    place = np.arange(len(shown))
+    shown = worst.head(MAX_SHOWN)
+    position = np.arange(len(shown))
     several = len(coverage.table) > 1
     for k, (column, label, color) in enumerate(
         [("occupied", "its cells", SAFE), ("pairs", "pairs of cells with others", "#8d99ae")]
     ):
         if column == "pairs" and not several:
             continue
-        at = place + (0.38 * k - 0.19) * several
+        at = position + (0.38 * k - 0.19) * several
         left.barh(at, np.nan_to_num(shown[column]), 0.34, color=color, label=label)
         expected = shown["expected_pairs" if k else "expected"]
         left.plot(expected, at, "|", color=BOUND, markersize=10, markeredgewidth=1.5)
     left.plot([], [], "|", color=BOUND, label="of as many uniform samples")
-    left.set_yticks(place, [wrap_name(str(name)) for name in shown.index])
+    left.set_yticks(position, [wrap_name(str(name)) for name in shown.index])
     left.invert_yaxis()
     left.set_xlim(0, 1.02)
     left.set_xlabel("share occupied")

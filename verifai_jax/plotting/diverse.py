@@ -28,8 +28,8 @@ def plot_diverse(diverse: Diverse, path: str | Path | None = None) -> Figure:
     )
     for i, (x, y) in enumerate(drawn[:12]):
         if np.isfinite(x) and np.isfinite(y):
-            place = {"xytext": (5, 4), "textcoords": "offset points", "fontsize": 8}
-            cloud.annotate(str(i + 1), (x, y), **place)
+            style = {"xytext": (5, 4), "textcoords": "offset points", "fontsize": 8}
+            cloud.annotate(str(i + 1), (x, y), **style)
     curve.plot(
         np.arange(2, len(diverse.rows) + 1),
         diverse.distances[1:],

@@ -51,15 +51,15 @@ def _draw_interval(axes: Axes, estimate: Estimate) -> None:
     rows: list[Any] = [("bound by the prior alone", None, 0.0, estimate.upper_bound, BOUND)]
     if estimate.probability is not None:
         rows.append(("estimate", estimate.probability, estimate.low, estimate.high, FAILING))
-    least = min([estimate.upper_bound, *(low for *_, low, _, _ in rows if low > 0)]) / 5
-    for place, (_, value, low, high, color) in enumerate(rows):
-        axes.plot([max(low, least), high], [place, place], color=color, linewidth=4, alpha=0.6)
+    lowest = min([estimate.upper_bound, *(low for *_, low, _, _ in rows if low > 0)]) / 5
+    for height, (_, value, low, high, color) in enumerate(rows):
+        axes.plot([max(low, lowest), high], [height, height], color=color, linewidth=4, alpha=0.6)
         if value is not None:
-            axes.plot(value, place, "o", color=color)
+            axes.plot(value, height, "o", color=color)
         else:
-            axes.plot(high, place, "|", color=color, markersize=14)
+            axes.plot(high, height, "|", color=color, markersize=14)
     axes.set_xscale("log")
-    axes.set_xlim(least, min(1.5, estimate.upper_bound * 4))
+    axes.set_xlim(lowest, min(1.5, estimate.upper_bound * 4))
     log_ticks(axes.xaxis)
     axes.set_yticks(range(len(rows)), [wrap_name(row[0], 14) for row in rows])
     axes.set_ylim(-0.8, len(rows) - 0.2)

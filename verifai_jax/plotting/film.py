@@ -13,9 +13,9 @@ from verifai_jax.plotting.replay import decisive_instant
 
 Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]
 
-MOST_FRAMES = 150
+MAX_FRAMES = 150
 """Frames of a film for which nobody says how many a second has; a longer one is played faster."""
-MOST_WANTED = 1000
+MAX_WANTED = 1000
 """Frames of a film for which somebody does."""
 COLORS = 128
 """Colours of a GIF."""
@@ -54,9 +54,9 @@ def film_samples(
     **Returns:** the samples, and the milliseconds of each frame.
     """
     seconds = float(clock[-1] - clock[0])
-    most = MOST_FRAMES if fps is None else MOST_WANTED
+    maximum = MAX_FRAMES if fps is None else MAX_WANTED
     rate = usual if fps is None else fps
-    count = max(2, min(most, round(seconds * rate) + 1))
+    count = max(2, min(maximum, round(seconds * rate) + 1))
     instants = np.linspace(clock[0], clock[-1], count)
     samples = np.searchsorted(clock, instants - 1e-9).clip(max=len(clock) - 1)
     return samples, max(20, round(1000 * seconds / (count - 1) / 10) * 10)

@@ -29,13 +29,13 @@ def plot_frequent_patterns(patterns: FrequentPatterns, path: str | Path | None =
     longest = max((len(text) for text in shown["combination"]), default=0)
     figure = new_figure(figsize=(5.2 + 0.055 * min(longest, 60), 1.5 + 0.34 * max(2, len(shown))))
     axes = figure.subplots()
-    place = np.arange(len(shown))
+    position = np.arange(len(shown))
     color = SAFE if patterns.samples.which == "safe" else FAILING
-    axes.barh(place, shown["share"], 0.66, color=color, label="share of the rows looked at")
+    axes.barh(position, shown["share"], 0.66, color=color, label="share of the rows looked at")
     if compared:
         axes.plot(
             shown["expected"],
-            place,
+            position,
             linestyle="",
             marker="|",
             markersize=13,
@@ -44,11 +44,11 @@ def plot_frequent_patterns(patterns: FrequentPatterns, path: str | Path | None =
             label="of all rows" if patterns.against == "table" else "in the prior",
         )
         rows: Any = shown.itertuples()
-        for y, row in zip(place, rows, strict=True):
+        for y, row in zip(position, rows, strict=True):
             if np.isfinite(row.lift):
                 right = max(row.share, row.expected)
                 axes.text(right + 0.015, float(y), f"{row.lift:z.2f}x", va="center", fontsize=8)
-    axes.set_yticks(place, [shorten(text) for text in shown["combination"]])
+    axes.set_yticks(position, [shorten(text) for text in shown["combination"]])
     axes.invert_yaxis()
     axes.set_xlim(0, min(1.1, 1.15 * max(shown[["share", "expected"]].max().max(), 0.05)))
     axes.set_xlabel("share")

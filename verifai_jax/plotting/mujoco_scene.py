@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int, UInt8
 
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.errors import require
-from verifai_jax.core.whole_files import replacing
 from verifai_jax.plotting.film import BACKGROUND, Frame, check_film, film_samples, gif, labelled
 from verifai_jax.plotting.mujoco_motion import Motion
 from verifai_jax.plotting.mujoco_view import best_view, named_view
@@ -231,12 +231,12 @@ def _arrows(motion: Motion, data: Any, sample: int) -> list[tuple[np.ndarray, np
     for body, force in enumerate(forces[sample]):
         strength = float(np.linalg.norm(force))
         if strength > 0.02 * greatest:
-            way = force / strength
+            direction = force / strength
             # The first size of most shapes is their radius or half their width.
             radius = model.geom_size[model.geom_bodyid == body, 0].max(initial=0.0)
-            tip = data.xipos[body] - 1.2 * radius * way
+            tip = data.xipos[body] - 1.2 * radius * direction
             longest = max(0.2 * model.stat.extent, 3.0 * radius)
-            arrows.append((tip - longest * strength / greatest * way, tip))
+            arrows.append((tip - longest * strength / greatest * direction, tip))
     return arrows
 
 

@@ -48,14 +48,14 @@ def best_view(motion: Motion, draw: Callable[..., Any], size: tuple[int, int]) -
     mujoco = require("mujoco", extra="mujoco")
     model, data = motion.model, mujoco.MjData(motion.model)
     samples = np.unique(np.linspace(0, len(motion.clock) - 1, TRIED).round().astype(int))
-    places = []
+    positions = []
     for sample in samples:
         data.qpos[:] = motion.qpos[sample]
         mujoco.mj_fwdPosition(model, data)
-        places.append((data.geom_xpos.copy(), data.geom_xmat.copy()))
-    moving = _moving(model, places)
+        positions.append((data.geom_xpos.copy(), data.geom_xmat.copy()))
+    moving = _moving(model, positions)
     own = [_fixed(number) for number in range(model.ncam)]
-    made = _made(model, moving, [place for place, _ in places])
+    made = _made(model, moving, [position for position, _ in positions])
     option = mujoco.MjvOption()
     scores = []
     for view in [*own, *made]:
@@ -75,14 +75,16 @@ def _fixed(number: int) -> Any:
     return view
 
 
-def _moving(model: Any, places: list[tuple[np.ndarray, np.ndarray]]) -> Bool[np.ndarray, " geoms"]:
+def _moving(
+    model: Any, positions: list[tuple[np.ndarray, np.ndarray]]
+) -> Bool[np.ndarray, " geoms"]:
     """Return which geoms move; all that belong to a body with joints where nothing does."""
     drawn = (model.geom_group < 3) & (model.geom_rgba[:, 3] > 0)
-    (first, turned), *others = places
+    (first, turned), *others = positions
     far = np.zeros(model.ngeom)
-    for place, way in others:
-        shift = np.linalg.norm(place - first, axis=1)
-        turn = np.linalg.norm(way - turned, axis=1) * model.geom_rbound
+    for position, rotation in others:
+        shift = np.linalg.norm(position - first, axis=1)
+        turn = np.linalg.norm(rotation - turned, axis=1) * model.geom_rbound
         far = np.maximum(far, np.maximum(shift, turn))
     # What shakes a little beside what moves is not what one looks at.
     moving = drawn & (far > max(0.02 * far[drawn].max(initial=0.0), 1e-6))
@@ -92,12 +94,12 @@ def _moving(model: Any, places: list[tuple[np.ndarray, np.ndarray]]) -> Bool[np.
 
 
 def _made(
-    model: Any, moving: Bool[np.ndarray, " geoms"], places: list[Float[np.ndarray, "geoms 3"]]
+    model: Any, moving: Bool[np.ndarray, " geoms"], positions: list[Float[np.ndarray, "geoms 3"]]
 ) -> list[Any]:
     """Return cameras around what moves: still, or carried along where it goes far."""
     mujoco = require("mujoco", extra="mujoco")
     radius = model.geom_rbound[moving][:, None]
-    ends = [np.array([(p[moving] - radius).min(0), (p[moving] + radius).max(0)]) for p in places]
+    ends = [np.array([(p[moving] - radius).min(0), (p[moving] + radius).max(0)]) for p in positions]
     whole = np.array([np.min([e[0] for e in ends], 0), np.max([e[1] for e in ends], 0)])
     once = max(float(np.linalg.norm(e[1] - e[0])) for e in ends)
     far = float(np.linalg.norm(whole[1] - whole[0]))

@@ -8,12 +8,12 @@ from verifai_jax.analysis.overview import Analysis
 from verifai_jax.core.figure import Axes, Figure
 from verifai_jax.core.text import format_percent
 from verifai_jax.plotting.bars import draw_bars
-from verifai_jax.plotting.panels import draw_rule, draw_samples, places, two_features
+from verifai_jax.plotting.panels import cells, draw_rule, draw_samples, two_features
 from verifai_jax.plotting.style import BOUND, new_figure, show_or_save
 
-MOST_BARS = 10
-MOST_MARKED = 6
-MOST_RULES = 2
+MAX_BARS = 10
+MAX_MARKED = 6
+MAX_RULES = 2
 
 
 def plot_overview(analysis: Analysis, path: str | Path | None = None) -> Figure:
@@ -35,7 +35,7 @@ def plot_overview(analysis: Analysis, path: str | Path | None = None) -> Figure:
         )
         return show_or_save(figure, path)
     importance, rules = analysis["importance"], analysis["rules"]
-    bars = 0 if importance is None else min(len(importance.table), MOST_BARS)
+    bars = 0 if importance is None else min(len(importance.table), MAX_BARS)
     figure = new_figure(figsize=(10.4 if bars else 6.2, 4.8))
     widths = [1.5, 1] if bars else [1]
     panels = figure.subplots(1, len(widths), squeeze=False, width_ratios=widths)[0]
@@ -45,12 +45,12 @@ def plot_overview(analysis: Analysis, path: str | Path | None = None) -> Figure:
     ranked = importance.ranked if importance is not None else []
     across, up = two_features(samples, [*used, *ranked])
     draw_samples(axes, samples, across, up)
-    for number, rule in enumerate(rules.rules[:MOST_RULES] if rules else (), 1):
+    for number, rule in enumerate(rules.rules[:MAX_RULES] if rules else (), 1):
         draw_rule(axes, samples, rule, across, up, f"rule {number}")
     _mark_representatives(axes, analysis, across, up)
     if importance is not None:
         columns = {target: _NAMES[target] for target in importance.scores}
-        draw_bars(panels[1], importance.table.head(MOST_BARS), columns)
+        draw_bars(panels[1], importance.table.head(MAX_BARS), columns)
         panels[1].set_xlabel("loss of a model's score without the feature")
     lines = [f"{analysis.name}: {title}"]
     if rules is not None and rules.rules:
@@ -67,14 +67,14 @@ def _mark_representatives(axes: Axes, analysis: Analysis, across: str, up: str) 
     """Mark with numbers the rows that stand for the clusters of failures."""
     samples = analysis.samples
     assert samples is not None
-    rows = analysis.representatives[:MOST_MARKED]
-    x, y = places(samples, across, up)
+    rows = analysis.representatives[:MAX_MARKED]
+    x, y = cells(samples, across, up)
     for number, row in enumerate(rows):
-        place = int(np.flatnonzero(samples.rows == row)[0])
-        if not np.isfinite([x[place], y[place]]).all():
+        index = int(np.flatnonzero(samples.rows == row)[0])
+        if not np.isfinite([x[index], y[index]]).all():
             continue
-        axes.plot(x[place], y[place], "o", ms=13, mfc="white", mec=BOUND, mew=1.2)
-        axes.annotate(str(number), (x[place], y[place]), ha="center", va="center", fontsize=8)
+        axes.plot(x[index], y[index], "o", ms=13, mfc="white", mec=BOUND, mew=1.2)
+        axes.annotate(str(number), (x[index], y[index]), ha="center", va="center", fontsize=8)
     if rows:
         axes.plot([], [], "o", mfc="white", mec=BOUND, label="typical row of a cluster of failures")
         axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(0, 1.1))

@@ -15,7 +15,7 @@ DOTS = 3000
 """Rows drawn of each verdict."""
 JITTER = 0.25
 """Spread of unordered values around their place."""
-MOST_LABELS = 12
+MAX_LABELS = 12
 """Choices that an axis names."""
 
 
@@ -55,7 +55,7 @@ def draw_samples(axes: Axes, samples: Samples, across: str, up: str, size: float
     Unordered values are spread a little around their place.
     """
     columns = {column.name: column for column in samples.columns}
-    x, y = places(samples, across, up)
+    x, y = cells(samples, across, up)
     for part, color, dot in (
         (~samples.failing, SAFE, size * 0.6),
         (samples.failing, FAILING, size),
@@ -69,14 +69,14 @@ def draw_samples(axes: Axes, samples: Samples, across: str, up: str, size: float
     for name, axis in drawn:
         column = columns[name]
         if not column.ordered:
-            step = -(-len(column.choices) // MOST_LABELS)
+            step = -(-len(column.choices) // MAX_LABELS)
             ticks = np.arange(0, len(column.choices), max(step, 1))
             axis.set_ticks(ticks, [str(column.choices[i])[:16] for i in ticks])
         elif column.integer:
             axis.get_major_locator().set_params(integer=True)
 
 
-def places(
+def cells(
     samples: Samples, across: str, up: str
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return where the rows are drawn; over a single feature the robustness is the other axis."""

@@ -38,9 +38,9 @@ def plot_components(components: Components, path: str | Path | None = None) -> F
     projected = components.project().to_numpy()
     along = [projected[:, i] if i < len(directions) else np.zeros(len(samples)) for i in (0, 1)]
     for part, color in ((~samples.failing, SAFE), (samples.failing, FAILING)):
-        places = np.flatnonzero(part)
-        places = places[:: max(1, len(places) // DOTS)]
-        cloud.scatter(along[0][places], along[1][places], c=color, s=9, alpha=0.55, linewidths=0)
+        indices = np.flatnonzero(part)
+        indices = indices[:: max(1, len(indices) // DOTS)]
+        cloud.scatter(along[0][indices], along[1][indices], c=color, s=9, alpha=0.55, linewidths=0)
     for i, axis in ((0, cloud.xaxis), (1, cloud.yaxis)):
         share = " (none)"
         if i < len(directions):
@@ -52,9 +52,9 @@ def plot_components(components: Components, path: str | Path | None = None) -> F
     for i, color in zip(
         range(min(3, len(directions))), (BOUND, "#31688e", "#b8b8b8"), strict=False
     ):
-        place = np.arange(len(shown)) + (i - (min(3, len(directions)) - 1) / 2) * height
+        position = np.arange(len(shown)) + (i - (min(3, len(directions)) - 1) / 2) * height
         bars.barh(
-            place, directions[i][shown], height * 0.9, color=color, label=f"component {i + 1}"
+            position, directions[i][shown], height * 0.9, color=color, label=f"component {i + 1}"
         )
     bars.set_yticks(np.arange(len(shown)), [wrap_name(names[j]) for j in shown])
     bars.invert_yaxis()

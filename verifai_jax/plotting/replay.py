@@ -30,11 +30,11 @@ from verifai_jax.plotting.style import (
     wrap_name,
 )
 
-MOST_PANELS = 6
+MAX_PANELS = 6
 """Signals drawn at most, unless more are monitored."""
-MOST_INPUTS = 3
+MAX_INPUTS = 3
 """Features that are functions of time drawn at least, however many signals are monitored."""
-MOST_BOUNDS = 4
+MAX_BOUNDS = 4
 """Predicates named above a panel at most."""
 WIDEST_NAME = 18
 """Characters of a signal's name in one line."""
@@ -62,7 +62,7 @@ def plot_replay(
 
     **Returns:** the figure.
 
-    **Raises:** `UnknownNameError` for a signal that there is not; `ValueError` for none.
+    **Raises:** `UnknownNameError` for a signal that does not exist; `ValueError` for none.
     """
     trace, formulas = replay.trace, replay.problem.formulas
     if isinstance(signals, str):
@@ -78,8 +78,8 @@ def plot_replay(
         check_names("signal", signals, ordered)
         if not signals:
             raise ValueError("signals names what is drawn; got none")
-    needed = len(monitored) + min(len(inputs), MOST_INPUTS)
-    shown = list(signals or ordered[: max(MOST_PANELS, needed)])
+    needed = len(monitored) + min(len(inputs), MAX_INPUTS)
+    shown = list(signals or ordered[: max(MAX_PANELS, needed)])
     name = replay.worst
     clock = np.asarray(trace.clock())
     decisive = decisive_instant(formulas[name], trace, replay.problem.end)
@@ -174,8 +174,8 @@ def _telling(
         n: np.array_equal(curves[n], np.broadcast_to(curves[n][:1], curves[n].shape)) for n in names
     }
     # Each once, in their own order, before they are sorted.
-    place = {name: (still[name], 0 if still[name] else turn(name)) for name in names}
-    return sorted(names, key=place.__getitem__)
+    rank = {name: (still[name], 0 if still[name] else turn(name)) for name in names}
+    return sorted(names, key=rank.__getitem__)
 
 
 def _left_out(names: list[str]) -> str:
@@ -187,7 +187,7 @@ def _left_out(names: list[str]) -> str:
 
 
 def decisive_instant(formula: Formula, trace: Trace, end: End = "hold") -> tuple[str, int] | None:
-    """Return the signal and the sample that decide the verdict; None where there are none.
+    """Return the signal and the sample that decide the verdict; None if there are none.
 
     A predicate over several signals is marked on the first.
     """
@@ -280,9 +280,9 @@ def _name_bounds(axes: Axes, predicates: dict[str, tuple[str, float]], decided: 
     - `decided`: what decided there, for a line above them; empty for nothing.
     """
     ranks = [FAILING, BOUND, SAFE]
-    place = {text: (ranks.index(color), least) for text, (color, least) in predicates.items()}
-    ranked = sorted(predicates, key=place.__getitem__)
-    named, others = ranked[:MOST_BOUNDS], ranked[MOST_BOUNDS:]
+    rank = {text: (ranks.index(color), lowest) for text, (color, lowest) in predicates.items()}
+    ranked = sorted(predicates, key=rank.__getitem__)
+    named, others = ranked[:MAX_BOUNDS], ranked[MAX_BOUNDS:]
     lines = [(text, predicates[text][0]) for text in named]
     if others:
         lines.append((f"and {len(others)} more", predicates[others[0]][0]))

@@ -43,12 +43,12 @@ def pair(samples: Samples, names: Sequence[str]) -> tuple[str, str]:
 
 def positions(samples: Samples, name: str, frame: pd.DataFrame) -> Float[np.ndarray, " n"]:
     """Return where rows are drawn along a column; NaN for an absent entry."""
-    place = {column.name: j for j, column in enumerate(samples.columns)}.get(name)
-    if place is None or samples.columns[place].ordered:
+    index = {column.name: j for j, column in enumerate(samples.columns)}.get(name)
+    if index is None or samples.columns[index].ordered:
         return frame[name].to_numpy(np.float64)
-    codes = samples.columns[place].codes(frame[name])
+    codes = samples.columns[index].codes(frame[name])
     # Rows with the same choice lie side by side: shifted by row number, not at random.
-    step = np.sqrt(_PRIMES[place % len(_PRIMES)])
+    step = np.sqrt(_PRIMES[index % len(_PRIMES)])
     shift = 0.5 * (frame.index.to_numpy() * step % 1 - 0.5)
     return np.where(codes < 0, np.nan, codes + shift)
 
@@ -65,7 +65,7 @@ def draw_rows(
     across, up = names or two_columns(samples)
     everything = samples.frame.iloc[:: max(1, len(samples) // DOTS)]
     chosen = samples.at(rows[:DOTS])
-    places = np.stack([positions(samples, name, chosen) for name in (across, up)], axis=1)
+    points = np.stack([positions(samples, name, chosen) for name in (across, up)], axis=1)
     axes.scatter(
         positions(samples, across, everything),
         positions(samples, up, everything),
@@ -75,10 +75,10 @@ def draw_rows(
         alpha=0.7,
         label="others",
     )
-    axes.scatter(*places.T, facecolors="none", edgecolors=color, s=36, label=label)
+    axes.scatter(*points.T, facecolors="none", edgecolors=color, s=36, label=label)
     name_axes(axes, samples, across, up)
     axes.legend(frameon=False, fontsize=8)
-    return places
+    return points
 
 
 def name_axes(axes: Axes, samples: Samples, across: str, up: str) -> None:

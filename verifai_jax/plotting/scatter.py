@@ -31,7 +31,7 @@ def plot_features(
     run: Run,
     path: str | Path | None = None,
     features: list[str] | None = None,
-    most: int = 4,
+    maximum: int = 4,
 ) -> Figure:
     """Draw safe (green) and failing (red) samples over pairs of features.
 
@@ -42,8 +42,8 @@ def plot_features(
 
     - `run`: what `falsify` returned.
     - `path`: of a picture to write; none when left out.
-    - `features`: names; by default the `most` that distinguish failing from safe samples best.
-    - `most`: features at most, where they are not named.
+    - `features`: names; by default the `maximum` that distinguish failing from safe samples best.
+    - `maximum`: features at most, where they are not named.
 
     **Returns:** the figure.
 
@@ -51,7 +51,7 @@ def plot_features(
     """
     table = run.table.all
     if features is None:
-        features = distinguishing_features(run)[:most]
+        features = distinguishing_features(run)[:maximum]
     else:
         check_names("feature", features, run.table.features)
     if not features:
@@ -124,7 +124,7 @@ def distinguishing_features(run: Run) -> list[str]:
     ranks with the robustness.
     """
     table = run.table.all
-    # Items that there are not have no value, which is told apart from all others.
+    # Items that do not exist have no value, which is told apart from all others.
     varying = [name for name in run.table.features if len(table[[name]].drop_duplicates()) > 1]
     numeric = [n for n in varying if np.issubdtype(table[n].to_numpy().dtype, np.number)]
     failing, safe = run.table.counterexamples, run.table.safe

@@ -63,5 +63,5 @@ def _draw_ground(axes: Axes, polygons: Any) -> None:
     """Draw the borders of a workspace of polygons."""
     for polygon in getattr(polygons, "geoms", ()):
         for ring in (polygon.exterior, *polygon.interiors):
-            places = np.array(ring.coords)[:, :2]
-            axes.plot(*places.T, color=GROUND, linewidth=1.2, zorder=0)
+            points = np.array(ring.coords)[:, :2]
+            axes.plot(*points.T, color=GROUND, linewidth=1.2, zorder=0)

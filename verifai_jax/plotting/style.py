@@ -9,16 +9,16 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax.core import figure
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.figure import Axes, Figure
 from verifai_jax.core.text import shorten
-from verifai_jax.core.whole_files import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axis import Axis
 else:
     Axis = object
 
-Places = Float[np.ndarray, " n"]
+Positions = Float[np.ndarray, " n"]
 
 SAFE = "#3a9e7d"
 FAILING = "#d1495b"
@@ -74,7 +74,7 @@ def log_ticks(axis: Axis) -> None:
 
 
 def name_points(
-    axes: Axes, names: Sequence[str], x: Places, y: Places, low: Places, high: Places
+    axes: Axes, names: Sequence[str], x: Positions, y: Positions, low: Positions, high: Positions
 ) -> None:
     """Write names beside points, none on another; call it when the limits are set.
 
@@ -107,13 +107,13 @@ def name_points(
                 continue
             away = 8 if abs(shift) < step else 18
             x0 = px - away - box.width if left else px + away
-            place = (x0, py + shift - box.height / 2, x0 + box.width, py + shift + box.height / 2)
-            if not any(_overlap(place, other) for other in taken):
+            area = (x0, py + shift - box.height / 2, x0 + box.width, py + shift + box.height / 2)
+            if not any(_overlap(area, other) for other in taken):
                 break
         else:
             text.remove()
             continue
-        taken.append(place)
+        taken.append(area)
         text.remove()
         # In the units of the data, so that it stays there in a picture of another size.
         at = axes.transData.inverted().transform((px, py))

@@ -40,7 +40,7 @@ RETURN = "#31688e"
 """Colour of the return."""
 BARS = {"failure_rate": (FAILING, "failing", ""), "nominal_return": (RETURN, "return", "//")}
 """Colour, name and hatching of the targets of an importance."""
-MOST_BARS = 8
+MAX_BARS = 8
 """Hyper-parameters in a panel, at most."""
 
 
@@ -101,8 +101,8 @@ def _draw_safety(axes: Axes, sweep: Sweep) -> None:
         axes.set_axis_off()
         return
     crowded = len(table) > 60
-    least = _least_shown(table, sweep.p)
-    shown = _spread(table, least)
+    lowest = _lowest_shown(table, sweep.p)
+    shown = _spread(table, lowest)
     final = shown.index.isin(last_checkpoints(sweep.table).index)
     for verdict, (colour, marker) in LOOKS.items():
         of_kind = is_safe(table) if verdict == "safe" else (table["verdict"] == verdict).to_numpy()
@@ -136,9 +136,9 @@ def _draw_safety(axes: Axes, sweep: Sweep) -> None:
         zorder=4,
     )
     # Linear up to the least rate, so that none at all has a place; logarithmic from there on.
-    axes.set_yscale("symlog", linthresh=least, linscale=0.6)
-    axes.set_ylim(-0.25 * least, 1.6)
-    ticks = [0.0, *(10.0**k for k in range(-6, 1) if 10.0**k >= least * 0.999)]
+    axes.set_yscale("symlog", linthresh=lowest, linscale=0.6)
+    axes.set_ylim(-0.25 * lowest, 1.6)
+    ticks = [0.0, *(10.0**k for k in range(-6, 1) if 10.0**k >= lowest * 0.999)]
     axes.set_yticks(ticks, [format_percent(tick) for tick in ticks])
     axes.set_yticks([], minor=True)
     if sweep.p is not None:
@@ -178,27 +178,27 @@ def _legend_below(axes: Axes, columns: int) -> None:
     )
 
 
-def _least_shown(table: "pd.DataFrame", wanted: float | None) -> float:
+def _lowest_shown(table: "pd.DataFrame", wanted: float | None) -> float:
     """Return the power of ten below which the axis is linear, less than every positive rate."""
     rates = table["failure_rate"].to_numpy(np.float64)
-    least = min([*rates[rates > 0], 0.01 if wanted is None else wanted])
-    return float(10.0 ** np.floor(np.log10(least)))
+    lowest = min([*rates[rates > 0], 0.01 if wanted is None else wanted])
+    return float(10.0 ** np.floor(np.log10(lowest)))
 
 
-def _spread(table: "pd.DataFrame", least: float) -> "pd.DataFrame":
+def _spread(table: "pd.DataFrame", lowest: float) -> "pd.DataFrame":
     """Shift points that would hide each other a little to the side."""
     shown = table.copy()
     shown["nominal_return"] = shown["nominal_return"].astype(float)
     span = float(np.ptp(shown["nominal_return"])) or 1.0
     cell = list(zip(
         np.round(shown["nominal_return"] / span * 60),
-        np.round(np.log10(np.maximum(shown["failure_rate"].to_numpy(float), least / 3)) * 8),
+        np.round(np.log10(np.maximum(shown["failure_rate"].to_numpy(float), lowest / 3)) * 8),
         strict=True,
     ))  # fmt: skip
     counts: dict[tuple[float, float], int] = {}
-    for i, place in zip(shown.index, cell, strict=True):
-        turn = counts.get(place, 0)
-        counts[place] = turn + 1
+    for i, index in zip(shown.index, cell, strict=True):
+        turn = counts.get(index, 0)
+        counts[index] = turn + 1
         side = (turn + 1) // 2 * (-1 if turn % 2 else 1)
         shown.loc[i, "nominal_return"] += np.clip(side, -4, 4) * span / 200
     return shown
@@ -280,11 +280,11 @@ def _draw_shares(axes: Axes, importance: HyperparameterImportance) -> None:
     """Draw the share of the variance that each hyper-parameter explains."""
     targets = [target for target in importance.scores if importance.is_reliable(target)]
     targets = targets or list(importance.scores)
-    shown = importance.table.head(MOST_BARS)
-    height, place = 0.76 / len(targets), np.arange(len(shown))
+    shown = importance.table.head(MAX_BARS)
+    height, position = 0.76 / len(targets), np.arange(len(shown))
     for k, target in enumerate(targets):
         colour, what, hatch = BARS[target]
-        at = place + (k - (len(targets) - 1) / 2) * height
+        at = position + (k - (len(targets) - 1) / 2) * height
         axes.barh(
             at,
             shown[f"{target}_total"].to_numpy(float),
@@ -304,7 +304,7 @@ def _draw_shares(axes: Axes, importance: HyperparameterImportance) -> None:
             linewidth=1.6,
             label="without interactions" if k == len(targets) - 1 else "",
         )
-    axes.set_yticks(place, [wrap_name(str(name), 18) for name in shown.index])
+    axes.set_yticks(position, [wrap_name(str(name), 18) for name in shown.index])
     axes.invert_yaxis()
     axes.set_xlim(0, 1.02)
     axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0", "25 %", "50 %", "75 %", "100 %"])
@@ -320,14 +320,14 @@ def _draw_trends(axes: Axes, importance: HyperparameterImportance) -> None:
     names = [f"{target}_trend" for target in importance.scores]
     shown = importance.table.loc[importance.table[names].notna().any(axis=1)]
     order = shown[names].abs().max(axis=1).sort_values(ascending=False, kind="stable").index
-    shown = shown.loc[order[:MOST_BARS]]
-    height, place = 0.76 / len(names), np.arange(len(shown))
+    shown = shown.loc[order[:MAX_BARS]]
+    height, position = 0.76 / len(names), np.arange(len(shown))
     chance = max(importance.chance.values())
     axes.axvspan(-chance, chance, color=WITHOUT_VERDICT, alpha=0.18, linewidth=0, label="by chance")
     for k, target in enumerate(importance.scores):
         colour, what, hatch = BARS[target]
         axes.barh(
-            place + (k - (len(names) - 1) / 2) * height,
+            position + (k - (len(names) - 1) / 2) * height,
             shown[f"{target}_trend"].to_numpy(float),
             height * 0.9,
             color=colour,
@@ -337,7 +337,7 @@ def _draw_trends(axes: Axes, importance: HyperparameterImportance) -> None:
             label=what,
         )
     axes.axvline(0, color=BOUND, linewidth=0.8)
-    axes.set_yticks(place, [wrap_name(str(name), 18) for name in shown.index])
+    axes.set_yticks(position, [wrap_name(str(name), 18) for name in shown.index])
     axes.invert_yaxis()
     axes.set_xlim(-1, 1)
     axes.set_xlabel("rank correlation with each alone")

@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.errors import require
-from verifai_jax.core.whole_files import replacing
 from verifai_jax.policies.errors import PolicyError
 from verifai_jax.policies.onnx_graph import OPSET, Graph
 from verifai_jax.policies.onnx_operators import Node
@@ -60,7 +60,7 @@ def traced(
     **Arguments:**
 
     - `function`: a pure function of JAX.
-    - `weights`: pytree of arrays, which keep their places in it as names.
+    - `weights`: pytree of arrays, which keep their paths in it as names.
     - `observation`: an example; several arrays by name become several inputs.
     - `memory`: pytree at the start of an episode; None for none.
 
@@ -264,8 +264,8 @@ class _Translation:
             case "reshape" | "squeeze" | "expand_dims":
                 return self.reshaped(x, form.shape)
             case "broadcast_in_dim":
-                places = dict(zip(options["broadcast_dimensions"], shapes[0].shape, strict=True))
-                ones = [places.get(i, 1) for i in range(len(form.shape))]
+                sizes = dict(zip(options["broadcast_dimensions"], shapes[0].shape, strict=True))
+                ones = [sizes.get(i, 1) for i in range(len(form.shape))]
                 return node("Expand", [self.reshaped(x, ones), _i(form.shape)])
             case "transpose":
                 return node("Transpose", [x], perm=tuple(options["permutation"]))

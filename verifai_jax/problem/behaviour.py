@@ -1,7 +1,7 @@
 """Behaviour of a trace as numbers: cells that its signals visit, the clause nearest to breaking.
 
 behaviour = Behaviour({"mode": (0, 4, 5), "speed": (0, 40, 4)})
-behaviour(trace)                                    # [marks], -1 for what it does not show
+behaviour(trace)                                    # [ids], -1 for what it does not show
 """
 
 import math
@@ -19,7 +19,7 @@ from verifai_jax.mtl.clauses import Goals, goals_of
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.semantics import hard
 
-MOST_CELLS = 512
+MAX_CELLS = 512
 """Cells of all signals together at most."""
 
 
@@ -32,7 +32,7 @@ class Axis:
     high: float
     cells: int
 
-    def place(self, trace: Trace) -> Int[Array, " time"]:
+    def cell_of(self, trace: Trace) -> Int[Array, " time"]:
         """Return the cell of each sample; -1 where the signal is not finite."""
         signal = as_array(trace.signals[self.name])
         values = signal.astype(jnp.result_type(float))
@@ -72,10 +72,10 @@ class Behaviour:
             check_count(f"the number of cells of signal {name!r}", count)
             axes.append(Axis(name, float(low), float(high), int(count)))
         total = math.prod(axis.cells for axis in axes)
-        if total > MOST_CELLS:
+        if total > MAX_CELLS:
             raise ValueError(
                 f"the signals {', '.join(cells)} have {total} cells together, and at most "
-                f"{MOST_CELLS} can be told apart; give fewer cells or fewer signals"
+                f"{MAX_CELLS} can be told apart; give fewer cells or fewer signals"
             )
         object.__setattr__(self, "axes", tuple(axes))
         object.__setattr__(self, "formulas", tuple(formulas))
@@ -92,12 +92,12 @@ class Behaviour:
 
     @property
     def size(self) -> int:
-        """Number of marks of a trace."""
+        """Number of coverage ids of a trace."""
         return self.cells + bool(self.formulas)
 
     @property
     def total(self) -> int:
-        """Number of different marks: cells first, then clauses."""
+        """Number of different coverage_ids: cells first, then clauses."""
         goals = self.goals
         return self.cells + (0 if goals is None else len(goals.goals))
 
@@ -105,14 +105,14 @@ class Behaviour:
         """Return a cell in words, such as `mode 2 to 3, speed 10 to 20`."""
         parts = []
         for axis in reversed(self.axes):
-            number, place = divmod(number, axis.cells)
+            number, cell = divmod(number, axis.cells)
             width = (axis.high - axis.low) / axis.cells
-            begin = axis.low + place * width
+            begin = axis.low + cell * width
             parts.append(f"{axis.name} {begin:z.4g} to {begin + width:z.4g}")
         return ", ".join(reversed(parts))
 
-    def __call__(self, trace: Trace, end: End = "hold") -> Int[Array, " marks"]:
-        """Return the marks of a trace; traced by JAX. A trace without the signals has no cells."""
+    def __call__(self, trace: Trace, end: End = "hold") -> Int[Array, " ids"]:
+        """Return the ids of a trace; traced by JAX. A trace without the signals has no cells."""
         trace = trace.hold()
         parts = []
         if self.axes:
@@ -120,8 +120,8 @@ class Behaviour:
             if all(axis.name in trace.signals for axis in self.axes):
                 joint, there = jnp.zeros(trace.length, jnp.int32), jnp.array(True)
                 for axis in self.axes:
-                    place = axis.place(trace)
-                    joint, there = joint * axis.cells + jnp.maximum(place, 0), there & (place >= 0)
+                    cell = axis.cell_of(trace)
+                    joint, there = joint * axis.cells + jnp.maximum(cell, 0), there & (cell >= 0)
                 # Counting visits would cost a pass for each cell; a scatter costs one.
                 visited = jnp.zeros(self.cells, bool).at[joint].max(there)
                 cells = jnp.where(visited, np.arange(self.cells, dtype=np.int32), -1)

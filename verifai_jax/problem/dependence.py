@@ -72,7 +72,7 @@ def has_gradient(problem: Problem) -> bool:
 def without_derivative(problem: Problem) -> str | None:
     """Return which steps from the features to the robustness have no derivative; traced once.
 
-    None where all have one, and for a black box, which JAX does not trace.
+    None if all have one, and for a black box, which JAX does not trace.
     """
     lacking = () if problem.black_box else _slopes(problem).lacking
     return " and ".join(lacking) if lacking else None
@@ -175,15 +175,15 @@ class _Sweep:
         call, inputs = as_function(program, step)
         pairs = zip(step.invars, moved, strict=True)
         moving = {each for each, moves in pairs if moves and _is_real(each)}
-        places = [i for i, each in enumerate(inputs) if each in moving]
+        indices = [i for i, each in enumerate(inputs) if each in moving]
         forms = [jax.ShapeDtypeStruct(each.aval.shape, each.aval.dtype) for each in inputs]
 
         def along(values: list[Array], direction: list[Array]) -> list[Any]:
-            function = of_some(call, values, places)
-            return jax.jvp(function, [values[i] for i in places], direction)[1]
+            function = of_some(call, values, indices)
+            return jax.jvp(function, [values[i] for i in indices], direction)[1]
 
         try:
-            derivative = jax.make_jaxpr(along)(forms, [forms[i] for i in places]).jaxpr
+            derivative = jax.make_jaxpr(along)(forms, [forms[i] for i in indices]).jaxpr
         except Exception:
             # JAX says by errors of many kinds that there is none, each operation by its own.
             self.lacking.setdefault(describe_step(step))

@@ -73,8 +73,8 @@ class Guide:
     ) -> Float[Array, ""]:
         """Return the value of the term on one trace; traced by JAX.
 
-        **Raises:** what the formula does for a signal that there is not; `TypeError` for a function
-        that returns no number.
+        **Raises:** what the formula does for a signal that does not exist; `TypeError` for a
+        function that returns no number.
         """
         if isinstance(self.term, Formula):
             return robustness(self.term, trace, hard, end)
@@ -93,21 +93,21 @@ class Guide:
         return jnp.where(jnp.isnan(value), 1.0, 0.5 * (1 + part))
 
     def steer(
-        self, told: Float[np.ndarray, " n"], value: Float[np.ndarray, " n"]
+        self, observed: Float[np.ndarray, " n"], value: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"]:
         """Return what a search is told instead; failures, and rows without a verdict, as they are.
 
         **Arguments:**
 
-        - `told`: the robustness, or whatever a search is told otherwise.
+        - `observed`: the robustness, or whatever a search is told otherwise.
         - `value`: of the term.
         """
         # In NumPy: of an array of JAX each first use of this kind compiles a program.
         known = np.where(np.isfinite(value), value, 0.0).astype(np.float64)
         part = np.where(np.isinf(value), np.sign(value), known / (np.abs(known) + self.scale))
         share = np.where(np.isnan(value), 1.0, 0.5 * (1 + part))
-        steered = (1 - self.weight) * told + self.weight * share
-        return np.where(told >= 0, steered, told).astype(told.dtype)
+        steered = (1 - self.weight) * observed + self.weight * share
+        return np.where(observed >= 0, steered, observed).astype(observed.dtype)
 
     def describe(self) -> str:
         """Return the formula, or the name of the function."""

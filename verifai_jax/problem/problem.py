@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.checks import check_name
 from verifai_jax.core.errors import missing_name
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook, text_html
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import ProgramCache, Slot
@@ -245,9 +245,9 @@ class Problem(InNotebook):
         constraint of the space, is not checked.
 
         **Raises:** `ProblemError` for a system that JAX does not trace; `UnknownNameError` for an
-        `of` or a formula that there is not; what `check` raises.
+        `of` or a formula that does not exist; what `check` raises.
         """
-        function = late("verifai_jax.evaluation.objective", "objective")
+        function = lazy_import("verifai_jax.evaluation.objective", "objective")
         return function(self, semantics, of, key, formula)
 
     @truncate_silently()
@@ -294,7 +294,7 @@ class Problem(InNotebook):
     def form(self) -> Trace | None:
         """Return the form of the system's traces, signals as `jax.ShapeDtypeStruct`; traced once.
 
-        None where nothing but a simulation can tell.
+        None if nothing but a simulation can tell.
 
         **Raises:** `ProblemError` for a system that raises, or returns no `Trace`.
         """
@@ -302,7 +302,7 @@ class Problem(InNotebook):
 
     @property
     def duration(self) -> float | None:
-        """Seconds of a whole trace; None where nothing but a simulation can tell."""
+        """Seconds of a whole trace; None if nothing but a simulation can tell."""
         form = self.form()
         return None if form is None or form.dt is None else (form.length - 1) * form.dt
 

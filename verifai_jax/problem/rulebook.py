@@ -24,7 +24,7 @@ from verifai_jax.core.errors import check_names
 Violation: TypeAlias = Sequence[float] | Shaped[np.ndarray, " k"]
 """By how much a row breaks each rule: numbers, 0 where a rule is kept, or truth values."""
 
-MOST_RULES = 30
+MAX_RULES = 30
 """Rules at most: beyond, a lexicographic number would not be exact."""
 
 
@@ -36,7 +36,7 @@ class Rulebook:
     order of `names` where the edges leave it open.
 
     **Raises:** `ValueError` for a name that is no rule, edges that go round in a circle, or more
-    than `MOST_RULES` rules.
+    than `MAX_RULES` rules.
     """
 
     names: tuple[str, ...]
@@ -52,8 +52,8 @@ class Rulebook:
             check_names("rule", edge, self.names)
             pairs.append((edge[0], edge[1]))
         object.__setattr__(self, "edges", tuple(pairs))
-        if len(self.names) > MOST_RULES:
-            raise ValueError(f"a rulebook has at most {MOST_RULES} rules; got {len(self.names)}")
+        if len(self.names) > MAX_RULES:
+            raise ValueError(f"a rulebook has at most {MAX_RULES} rules; got {len(self.names)}")
         object.__setattr__(self, "order", self._sorted())
 
     def graver(self, one: Violation, other: Violation) -> bool:
@@ -74,13 +74,13 @@ class Rulebook:
         Equal rows are all in it or all not. Rows that break nothing are in it only if all do.
         """
         broken = np.asarray(violations, np.float64).reshape(-1, len(self.names))
-        unique, place = np.unique(broken, axis=0, return_inverse=True)
+        unique, index = np.unique(broken, axis=0, return_inverse=True)
         kept = np.ones(len(unique), bool)
         # In blocks, so that memory stays small with thousands of different rows.
         for start in range(0, len(unique), 256):
             block = slice(start, start + 256)
             kept[block] = ~np.any(self._outdone(unique[block], unique), axis=1)
-        return kept[place.ravel()]
+        return kept[index.ravel()]
 
     def grade(
         self, violated: Bool[np.ndarray, "n k"] | Float[np.ndarray, "n k"]
@@ -89,9 +89,9 @@ class Rulebook:
 
         A linear extension of the order: of two rows that cannot be compared one is larger too.
         """
-        places = [self.names.index(name) for name in self.order]
-        weights = 2.0 ** np.arange(len(places) - 1, -1, -1)
-        return np.asarray(violated, np.float64)[..., places] @ weights
+        indices = [self.names.index(name) for name in self.order]
+        weights = 2.0 ** np.arange(len(indices) - 1, -1, -1)
+        return np.asarray(violated, np.float64)[..., indices] @ weights
 
     def _outdone(
         self, rows: Float[np.ndarray, "n k"], others: Float[np.ndarray, "m k"]

@@ -243,8 +243,8 @@ def _same_value(one: object, other: object) -> bool:
 
 def _line_of_constant(program: Program, constant: object) -> str | None:
     """Return the line of the first operation on a constant."""
-    place = next(i for i, value in enumerate(program.consts) if value is constant)
-    variable = program.jaxpr.constvars[place]
+    index = next(i for i, value in enumerate(program.consts) if value is constant)
+    variable = program.jaxpr.constvars[index]
     for step in program.jaxpr.eqns:
         if any(value is variable for value in step.invars):
             return _line(step)

@@ -14,7 +14,7 @@ from verifai_jax.search import named
 
 
 def run_command(run: Run) -> str | None:
-    """Return the command that repeats a run; None where no command can.
+    """Return the command that repeats a run; None if no command can.
 
     A run of a problem that no file names, or with a search that has no name, is repeated in Python.
     """

@@ -24,7 +24,7 @@ PAIRED = (
     "random key; the interval holds whenever sampling stops."
 )
 """Assumption of the interval of a difference."""
-MOST_PAIRS = 10
+MAX_PAIRS = 10
 """Pairs in which only one side fails that are listed."""
 
 
@@ -35,7 +35,7 @@ def comparison_page(comparison: Comparison, about: About, problem: Problem | Non
 
     - `comparison`: the comparison.
     - `about`: units and reasons of the features.
-    - `problem`: the baseline; None where it is not at hand.
+    - `problem`: the baseline; None if it is not at hand.
     """
     # That of one side says nothing of the files of the others.
     model = Model.of(comparison.sources.values())
@@ -147,7 +147,7 @@ def _pairs(comparison: Comparison) -> list[Markup]:
                 each.name if bool(row["worse"]) else comparison.baseline,
                 *(number(row[name]) for name in names),
             ]
-            for row in each.discordant.head(MOST_PAIRS).to_dict("records")
+            for row in each.discordant.head(MAX_PAIRS).to_dict("records")
         ]
         content += [
             element("h3", f"Pairs in which only one of {each.name} and the baseline fails"),

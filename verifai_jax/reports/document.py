@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from verifai_jax.comparison.result import Comparison
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.progress import shows_progress
-from verifai_jax.core.whole_files import replacing
 from verifai_jax.estimation.result import Estimate
 from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
@@ -60,7 +60,7 @@ def write_report(
 
     **Returns:** the path of the HTML file.
 
-    **Raises:** `UnknownNameError` for a unit or a reason of a feature that there is not;
+    **Raises:** `UnknownNameError` for a unit or a reason of a feature that does not exist;
     `ValueError` for a number of simulations that is none, and for a run whose rows have changed
     since they were written;
     `TypeError` for something that is no result.

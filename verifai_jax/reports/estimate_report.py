@@ -29,7 +29,7 @@ def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> 
 
     - `estimate`: the estimate.
     - `about`: units and reasons of the features.
-    - `problem`: what was asked; None where it is not at hand.
+    - `problem`: what was asked; None if it is not at hand.
     """
     model = Model.of([estimate.sources], None if problem is None else problem.sources())
     links = tuple(chained(model.inputs))

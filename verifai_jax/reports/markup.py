@@ -118,7 +118,7 @@ def picture(content: bytes, alternative: str, caption: str = "", kind: str = "pn
     **Arguments:**
 
     - `content`: of the file.
-    - `alternative`: words for who does not see it.
+    - `alternative`: text for readers who cannot see the picture.
     - `caption`: below it; the words again when left out.
     - `kind`: `"png"` or `"gif"`.
     """

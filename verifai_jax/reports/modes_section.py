@@ -9,7 +9,7 @@ from verifai_jax.reports.run_question import About
 from verifai_jax.reports.sections import MODEL, NOT_SEEN, SAMPLES
 from verifai_jax.reports.studies import png
 
-MOST_MODES = 8
+MAX_MODES = 8
 """Ways of failing that are written out."""
 
 
@@ -29,7 +29,7 @@ def modes_section(found: Modes, about: About) -> Section:
         ]
         content.append(table(["mode", "where", "probability", "of the failures"], rows))
         content.append(picture(png(found.plot()), "The ways of failing, with their probabilities"))
-    for mode in found.modes[:MOST_MODES]:
+    for mode in found.modes[:MAX_MODES]:
         content.append(element("h3", f"Mode {mode.number}: its likeliest failure"))
         out = f"It lies {mode.distance:z.3g} standard deviations from the middle of the prior."
         content.append(paragraph(f"{_sentence(mode.cause)} {out}" if mode.cause else out))
@@ -38,7 +38,7 @@ def modes_section(found: Modes, about: About) -> Section:
             for name, value in mode.features.items()
         ]
         content.append(table(["feature", "value"], values))
-    if (left := len(found.modes) - MOST_MODES) > 0:
+    if (left := len(found.modes) - MAX_MODES) > 0:
         content.append(paragraph(f"{left} further ones stand in the table alone."))
     if found.notes:
         content.append(bullets([f"{note}." for note in found.notes]))
@@ -52,7 +52,7 @@ def mode_claims(found: Modes) -> list[tuple[str, tuple[str, ...], tuple[str, ...
     claims: list[tuple[str, tuple[str, ...], tuple[str, ...]]] = [
         (_whole(found), evidence, assumptions)
     ]
-    for mode in found.modes[:MOST_MODES]:
+    for mode in found.modes[:MAX_MODES]:
         sentence = (
             f"A failure of mode {mode.number} ({mode.name}) has probability "
             f"{_probability(mode, found)}."

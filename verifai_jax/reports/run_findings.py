@@ -30,7 +30,7 @@ from verifai_jax.reports.studies import Failure, Studies, png
 
 DRAWN = ("clusters", "importance", "coverage")
 """Analyses of the table that a report draws."""
-MOST_FEATURES = 40
+MAX_FEATURES = 40
 """Features of a failure that are listed one by one."""
 
 
@@ -117,7 +117,7 @@ def _failure(run: Run, failure: Failure, studies: Studies, about: About) -> Mark
             f"{number(row[name])} {about.units.get(name, '')}".strip(),
             *([format_percent(rare[name]) if name in rare else ""] if rare else []),
         )
-        for name in features[:MOST_FEATURES]
+        for name in features[:MAX_FEATURES]
     ]
     heads = ["feature", "value", *(["the prior has one as far out in"] if rare else [])]
     verdict = str(row.get("verdict", "") or "not looked at more closely")
@@ -128,8 +128,8 @@ def _failure(run: Run, failure: Failure, studies: Studies, about: About) -> Mark
         *(paragraph(text) for text in (failure.replay.warnings if failure.replay else ())),
         table(heads, values),
     ]
-    if len(features) > MOST_FEATURES:
-        content.append(paragraph(f"{len(features) - MOST_FEATURES} further features are left out."))
+    if len(features) > MAX_FEATURES:
+        content.append(paragraph(f"{len(features) - MAX_FEATURES} further features are left out."))
     if len(run.formulas) > 1:
         margins = [(name, number(row[f"rho.{name}"])) for name in run.formulas]
         content.append(table(["property", "robustness"], margins))
@@ -223,15 +223,15 @@ def explore(run: Run, view: dict, studies: Studies) -> Section:
     return Section("table", "The table, to look at", tuple(content))
 
 
-def not_claimed_rows(run: Run, most: int = 20) -> Iterable[Child]:
+def not_claimed_rows(run: Run, maximum: int = 20) -> Iterable[Child]:
     """Write rows that violate as simulated, and that closer replays did not let be claimed."""
     rows = run.table.unconfirmed.sort_values("rho")
-    for row_number, row in list(rows.to_dict("index").items())[:most]:
+    for row_number, row in list(rows.to_dict("index").items())[:maximum]:
         again = float(row.get("rho_again", math.nan))
         then = "" if math.isnan(again) else f", {again:z.4g} when simulated again"
         yield f"row {row_number}: {row.get('verdict', '')}, robustness {row['rho']:z.4g}{then}"
-    if len(rows) > most:
-        yield f"and {len(rows) - most:,} more"
+    if len(rows) > maximum:
+        yield f"and {len(rows) - maximum:,} more"
 
 
 def limits(run: Run, studies: Studies, assumptions: list[str]) -> Section:

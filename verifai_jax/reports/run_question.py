@@ -48,7 +48,7 @@ def question(run: Run, about: About) -> Section:
 
 
 def space_of(run: Run) -> FeatureSpace | None:
-    """Return the feature space of a run; None where the record cannot say."""
+    """Return the feature space of a run; None if the record cannot say."""
     if run.problem is not None:
         return run.problem.space
     try:
@@ -68,7 +68,7 @@ def property_content(texts: Mapping[str, str], problem: Problem | None) -> list[
     **Arguments:**
 
     - `texts`: of the formulas by name.
-    - `problem`: for what else is known; None where it is not.
+    - `problem`: for what else is known; None if it is not.
     """
     rows = [
         (name, element("code", text), formula_words(parse(text))) for name, text in texts.items()

@@ -101,7 +101,7 @@ def _comparison(data: Mapping[str, Any], space: FeatureSpace | None) -> Comparis
 
 
 def _sources(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the record of what a result was made of, empty where it has none.
+    """Return the record of what a result was made of, empty if it has none.
 
     **Raises:** `ValueError` for one of another form.
     """

@@ -26,7 +26,7 @@ from verifai_jax.reports.view import rows_to_trace, trace_data
 
 Result = TypeVar("Result")
 
-MOST_FAILURES = 5
+MAX_FAILURES = 5
 """Failures that are shown one by one."""
 TRACES = 24
 """Rows that are simulated beforehand, unless that takes long."""
@@ -64,9 +64,9 @@ class Studies:
     - `failures`: a few, the worst first.
     - `traces`: data of rows that were simulated beforehand, by number.
     - `animation`: of the first failure, a GIF; None without one.
-    - `explained`, `shrunk`: of the worst failure; None where that was not possible.
+    - `explained`, `shrunk`: of the worst failure; None if that was not possible.
     - `analysis`: of the table.
-    - `modes`: ways of failing with their probabilities; None where they were not asked for.
+    - `modes`: ways of failing with their probabilities; None if they were not asked for.
     - `left_out`: what was not done and why, as whole sentences.
     - `findings`: rows that did not give their numbers when they were simulated again, likewise.
     """
@@ -140,7 +140,7 @@ def study(
                 "The worst failure was not explained and not shrunk, since simulations of this "
                 "black box take long; studies=True does both."
             )
-    ways = None if modes is None else _attempt(MODES, lambda: _modes(run, modes), left_out)
+    directions = None if modes is None else _attempt(MODES, lambda: _modes(run, modes), left_out)
     return Studies(
         tuple(failures),
         data,
@@ -148,7 +148,7 @@ def study(
         explained,
         shrunk,
         found,
-        ways,
+        directions,
         tuple(left_out),
         tuple(findings),
     )
@@ -176,11 +176,11 @@ def _failures_to_show(run: Run, found: Analysis) -> list[tuple[int, str]]:
     for number, row in enumerate(found.representatives):
         if row in failing.index:
             chosen.setdefault(row, f"it stands for kind {number + 1} of the failures")
-    if len(chosen) < MOST_FAILURES:
+    if len(chosen) < MAX_FAILURES:
         chosen.setdefault(by_rho[-1], "the one nearest to the bound")
-    for row in by_rho[:MOST_FAILURES]:
+    for row in by_rho[:MAX_FAILURES]:
         chosen.setdefault(row, "among the worst")
-    return list(chosen.items())[:MOST_FAILURES]
+    return list(chosen.items())[:MAX_FAILURES]
 
 
 def _animated(replay: Replay, left_out: list[str]) -> bytes | None:

@@ -36,7 +36,7 @@ TOGETHER = (
 """Assumption of every certificate."""
 COLUMNS = ("verdict", "nominal_return", "failures", "simulations", "failure_low", "failure_high")
 """Columns of the table that a report shows beside the hyper-parameters."""
-MOST_ROWS = 40
+MAX_ROWS = 40
 """Policies that are listed at most."""
 
 
@@ -67,7 +67,7 @@ def sweep_page(sweep: Sweep, about: About) -> Page:
         ),
     ]
     names = [*sweep.hyperparameters, *(name for name in COLUMNS if name in frame.columns)]
-    best = [*safe.index, *(i for i in frame.index if i not in safe.index)][:MOST_ROWS]
+    best = [*safe.index, *(i for i in frame.index if i not in safe.index)][:MAX_ROWS]
     rows: list[Any] = [
         [f"row {i}", *(number(frame[name][i]) for name in names)] for i in best
     ]  # fmt: skip

@@ -29,21 +29,21 @@ GROUPS = (
     ("failing", FAILING, 2000),
 )
 """Verdicts from the least grave on: name, colour, and rows shown at most."""
-MOST_ROWS = 4000
+MAX_ROWS = 4000
 """Rows shown at most."""
-MOST_CELLS = 160_000
+MAX_CELLS = 160_000
 """Values shown at most; of a wide table there are fewer rows and columns."""
-MOST_COLUMNS = 40
+MAX_COLUMNS = 40
 """Features shown at most, those that distinguish failing from safe rows first."""
-MOST_PARALLEL = 12
+MAX_PARALLEL = 12
 """Axes of the parallel coordinates at most."""
-MOST_CHOICES = 60
+MAX_CHOICES = 60
 """Different texts of a feature up to which it is shown."""
-MOST_SAMPLES = 160
+MAX_SAMPLES = 160
 """Samples of a trace at most."""
-MOST_SIGNALS = 4
+MAX_SIGNALS = 4
 """Signals of a trace at most."""
-MOST_COMPONENTS = 6
+MAX_COMPONENTS = 6
 """Components of a signal that is a vector, at most."""
 
 
@@ -66,13 +66,13 @@ def view_data(
     group[columns["status"] != "ok"] = 1
     group[violating_rows(columns)] = 2
     group[claimed_rows(columns)] = 3
-    features = [*distinguishing_features(run)[:MOST_COLUMNS]]
+    features = [*distinguishing_features(run)[:MAX_COLUMNS]]
     features += [name for name in run.table.features if name not in features]
-    features = features[:MOST_COLUMNS]
-    most = max(200, min(MOST_ROWS, MOST_CELLS // (len(features) + 1)))
+    features = features[:MAX_COLUMNS]
+    maximum = max(200, min(MAX_ROWS, MAX_CELLS // (len(features) + 1)))
     numbers = table.index.to_numpy()
-    places = _thinned(group, most, np.flatnonzero(np.isin(numbers, list(traces))))
-    shown = table.iloc[places]
+    indices = _thinned(group, maximum, np.flatnonzero(np.isin(numbers, list(traces))))
+    shown = table.iloc[indices]
     described = [_column("robustness", shown["rho"])]
     described += [_column(name, shown[name]) for name in features]
     described = [column for column in described if column is not None]
@@ -82,33 +82,33 @@ def view_data(
     counts = [int(np.sum(group == i)) for i in range(len(GROUPS))]
     return {
         "columns": described,
-        "rows": [int(number) for number in numbers[places]],
-        "group": [int(each) for each in group[places]],
+        "rows": [int(number) for number in numbers[indices]],
+        "group": [int(each) for each in group[indices]],
         "groups": [
             {"name": name, "color": color, "count": f"{count:,}"}
             for (name, color, _), count in zip(GROUPS, counts, strict=True)
         ],
         "axes": axes,
-        "parallel": [*wanted[: MOST_PARALLEL - 1], 0],
+        "parallel": [*wanted[: MAX_PARALLEL - 1], 0],
         "traces": {str(number): dict(trace) for number, trace in traces.items()},
         "replay": "This command simulates it again:" if command else "",
         "command": command,
-        "shown": len(places),
+        "shown": len(indices),
         "simulations": run.simulations,
     }
 
 
 def _thinned(
-    group: Int[np.ndarray, " n"], most: int, kept: Int[np.ndarray, " k"]
+    group: Int[np.ndarray, " n"], maximum: int, kept: Int[np.ndarray, " k"]
 ) -> Int[np.ndarray, " shown"]:
     """Return places of rows, evenly spread over each verdict, the graver ones first."""
-    chosen, left = [kept], most - len(kept)
+    chosen, left = [kept], maximum - len(kept)
     for verdict in reversed(range(len(GROUPS))):
-        places = np.flatnonzero(group == verdict)
-        count = min(len(places), left, GROUPS[verdict][2] * most // MOST_ROWS)
+        indices = np.flatnonzero(group == verdict)
+        count = min(len(indices), left, GROUPS[verdict][2] * maximum // MAX_ROWS)
         if count:
-            spread = np.linspace(0, len(places) - 1, count).astype(int)
-            chosen.append(places[np.unique(spread)])
+            spread = np.linspace(0, len(indices) - 1, count).astype(int)
+            chosen.append(indices[np.unique(spread)])
             left -= count
     return np.unique(np.concatenate(chosen))
 
@@ -120,13 +120,13 @@ def _column(name: str, values: "pd.Series") -> dict[str, Any] | None:
         return {"name": name, "values": numbers_of(array)}
     texts = [None if pd.isna(value) else one_line(str(value), 80) for value in array]
     levels = sorted({text for text in texts if text is not None})
-    if not levels or len(levels) > MOST_CHOICES:
+    if not levels or len(levels) > MAX_CHOICES:
         return None
-    place = {text: i for i, text in enumerate(levels)}
+    codes = {text: i for i, text in enumerate(levels)}
     return {
         "name": name,
         "levels": levels,
-        "values": [None if text is None else place[text] for text in texts],
+        "values": [None if text is None else codes[text] for text in texts],
     }
 
 
@@ -152,11 +152,11 @@ def trace_data(replay: Replay, label: str = "") -> dict[str, Any]:
     """
     trace, problem = replay.trace, replay.problem
     clock = np.asarray(trace.clock())
-    samples = np.unique(np.linspace(0, len(clock) - 1, MOST_SAMPLES).astype(int))
+    samples = np.unique(np.linspace(0, len(clock) - 1, MAX_SAMPLES).astype(int))
     monitored = [name for name in problem.monitored if name in trace.signals]
     others = [name for name in trace.signals if name not in monitored]
     signals = []
-    for name in [*monitored, *others][:MOST_SIGNALS]:
+    for name in [*monitored, *others][:MAX_SIGNALS]:
         values = np.asarray(trace.signals[name], float).reshape(len(clock), -1)
         bounds = [
             limit
@@ -168,7 +168,7 @@ def trace_data(replay: Replay, label: str = "") -> dict[str, Any]:
         signals.append(
             {
                 "name": one_line(name),
-                "values": [numbers_of(each) for each in values[samples].T[:MOST_COMPONENTS]],
+                "values": [numbers_of(each) for each in values[samples].T[:MAX_COMPONENTS]],
                 "bounds": numbers_of(list(dict.fromkeys(bounds))),
             }
         )
@@ -186,7 +186,7 @@ def trace_data(replay: Replay, label: str = "") -> dict[str, Any]:
     }
 
 
-def rows_to_trace(run: Run, most: int, first: Sequence[int] = ()) -> dict[int, str]:
+def rows_to_trace(run: Run, maximum: int, first: Sequence[int] = ()) -> dict[int, str]:
     """Choose the rows that matter most, with a word on each.
 
     The worst ones that are claimed, those nearest to the bound on either side, those not claimed.
@@ -194,12 +194,12 @@ def rows_to_trace(run: Run, most: int, first: Sequence[int] = ()) -> dict[int, s
     **Arguments:**
 
     - `run`: a run.
-    - `most`: rows at most.
+    - `maximum`: rows at most.
     - `first`: rows that come first, such as the failures that a report shows.
     """
-    chosen = {int(number): f"row {number}: shown above" for number in first[:most]}
+    chosen = {int(number): f"row {number}: shown above" for number in first[:maximum]}
     table = run.table
-    share = max(most // 4, 1)
+    share = max(maximum // 4, 1)
     for words, rows in (
         ("failing, among the worst", table.counterexamples.sort_values("rho")),
         ("failing, near the bound", table.counterexamples.sort_values("rho", ascending=False)),
@@ -208,6 +208,6 @@ def rows_to_trace(run: Run, most: int, first: Sequence[int] = ()) -> dict[int, s
         ("safe, far from the bound", table.safe.sort_values("rho", ascending=False)),
     ):
         new = [int(number) for number in rows.index if int(number) not in chosen][:share]
-        for number in new[: max(most - len(chosen), 0)]:
+        for number in new[: max(maximum - len(chosen), 0)]:
             chosen[number] = f"row {number}: {words}"
     return chosen

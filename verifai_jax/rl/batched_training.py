@@ -94,7 +94,7 @@ class _Lane:
     """A run on its way: the batch that it was last part of, and its place there."""
 
     batch: _Batch
-    place: int
+    index: int
     done: int
     seconds: float
 
@@ -157,20 +157,20 @@ class BatchedTraining:
             configuration = self.configurations[number]
             until = min(configuration.updates_for(steps), configuration.updates)
             lane = self._lanes.get(number)
-            place = (self._structures[number], lane.done if lane else 0, until)
-            groups.setdefault(place, []).append(number)
-        most = len(self.devices) * self.per_device
+            key = (self._structures[number], lane.done if lane else 0, until)
+            groups.setdefault(key, []).append(number)
+        maximum = len(self.devices) * self.per_device
         for (structure, done, until), numbers in groups.items():
-            for start in range(0, len(numbers), most):
-                part = numbers[start : start + most]
+            for start in range(0, len(numbers), maximum):
+                part = numbers[start : start + maximum]
                 self._advance(structure, part, done, until)
                 yield from part
 
     def policy(self, number: int) -> Policy:
         """Return the policy that a run has reached, on the host, without exploration."""
         configuration, lane = self.configurations[number], self._lanes[number]
-        task, place = StaticTask(configuration.task), np.int32(lane.place)
-        return jax.device_get(_policy(configuration.algorithm, task, lane.batch.states, place))
+        task, index = StaticTask(configuration.task), np.int32(lane.index)
+        return jax.device_get(_policy(configuration.algorithm, task, lane.batch.states, index))
 
     def curve(
         self, number: int
@@ -183,7 +183,7 @@ class BatchedTraining:
         lane = self._lanes[number]
         per_update = self.configurations[number].algorithm.steps_per_update
         steps = np.arange(1, lane.done + 1) * per_update
-        return steps, np.asarray(lane.batch.curves)[lane.place, : lane.done]
+        return steps, np.asarray(lane.batch.curves)[lane.index, : lane.done]
 
     def seconds(self, number: int) -> float:
         """Return the seconds of a core that a run has taken so far, compilation not counted."""
@@ -232,14 +232,14 @@ class BatchedTraining:
             done += updates
             if self._watch is not None:
                 so_far = np.asarray(curves)
-                for place, number in enumerate(numbers):
-                    self._watch(number, so_far[place, :done])
+                for index, number in enumerate(numbers):
+                    self._watch(number, so_far[index, :done])
         share = seconds / max(1, -(-len(numbers) // len(devices)))
-        for place, number in enumerate(numbers):
+        for index, number in enumerate(numbers):
             before = self._lanes.get(number)
             earlier = before.seconds if before else 0.0
             batch = _Batch(states, curves)
-            self._lanes[number] = _Lane(batch, place, done, share + earlier)
+            self._lanes[number] = _Lane(batch, index, done, share + earlier)
 
     def _gather(self, numbers: list[int], devices: tuple[Device, ...]) -> _Batch:
         """Stack the states of runs that go on side by side from now on."""
@@ -247,14 +247,14 @@ class BatchedTraining:
         first = lanes[0].batch
         width = len(first.curves)
         if len(lanes) == width and all(
-            lane.batch.curves is first.curves and lane.place == place
-            for place, lane in enumerate(lanes)
+            lane.batch.curves is first.curves and lane.index == index
+            for index, lane in enumerate(lanes)
         ):
             return first
         selected = _Batch(
             *_select_lanes(
                 tuple(tuple(lane.batch) for lane in lanes),
-                np.array([lane.place for lane in lanes], np.int32),
+                np.array([lane.index for lane in lanes], np.int32),
             )
         )
         if len(devices) > 1:
@@ -388,11 +388,11 @@ def _advance_updates(
         algorithm = jax.tree.unflatten(structure, numbers)
 
         def update(
-            place: Int[Array, ""], carry: tuple[AlgorithmState, Float[Array, " capacity"]]
+            index: Int[Array, ""], carry: tuple[AlgorithmState, Float[Array, " capacity"]]
         ) -> tuple[AlgorithmState, Float[Array, " capacity"]]:
             state, curve = carry
             state, progress = algorithm.step(task, state)
-            return state, curve.at[place].set(progress.mean_return)
+            return state, curve.at[index].set(progress.mean_return)
 
         return jax.lax.fori_loop(done, until, update, (state, curve))
 
@@ -403,18 +403,18 @@ def _advance_updates(
 @jax.jit
 def _select_lanes(
     batches: tuple[tuple[AlgorithmState, Float[Array, "lanes capacity"]], ...],
-    places: Int[Array, " selected"],
+    indices: Int[Array, " selected"],
 ) -> tuple[AlgorithmState, Float[Array, "selected capacity"]]:
     """Stack one lane of each batch. In one program, not one for each shape."""
-    lanes = [jax.tree.map(lambda leaf, i=i: leaf[places[i]], one) for i, one in enumerate(batches)]
+    lanes = [jax.tree.map(lambda leaf, i=i: leaf[indices[i]], one) for i, one in enumerate(batches)]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *lanes)
 
 
 @partial(jax.jit, static_argnums=1)
 def _policy(
-    algorithm: Algorithm, static_task: StaticTask, states: AlgorithmState, place: Int[Array, ""]
+    algorithm: Algorithm, static_task: StaticTask, states: AlgorithmState, index: Int[Array, ""]
 ) -> Policy:
     # A policy is made of the state alone, so any numbers of the task will do.
     numbers = [0.0] * static_task.structure.num_leaves
-    state = jax.tree.map(lambda leaf: leaf[place], states)
+    state = jax.tree.map(lambda leaf: leaf[index], states)
     return algorithm.policy(static_task.with_numbers(numbers), state)

@@ -23,12 +23,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.checks import check_count, is_number
 from verifai_jax.core.errors import check_names
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.sources import made_here, sources_of
 from verifai_jax.core.text import one_line
-from verifai_jax.core.whole_files import replacing
 from verifai_jax.rl.task.task import Action, Continuous, Discrete
 
 Layer = tuple[Float[Array | np.ndarray, "... _ _"], Float[Array | np.ndarray, "... _"]]
@@ -112,11 +112,13 @@ class Policy:
             save_policy(self, path)
             return Path(path)
         graph, arrays, start = self.as_graph()
-        return late("verifai_jax.policies.writing", "write")(graph, arrays, start, Path(path))
+        return lazy_import("verifai_jax.policies.writing", "write")(
+            graph, arrays, start, Path(path)
+        )
 
     def as_graph(self, observation: object = None) -> tuple[Any, Any, Any]:
         """Return the policy as a graph of ONNX operators, as policies of other frameworks do."""
-        as_any = late("verifai_jax.policies.base", "Policy")(self, _act)
+        as_any = lazy_import("verifai_jax.policies.base", "Policy")(self, _act)
         return as_any.as_graph(np.zeros(self.layers[0][0].shape[0]))
 
 

@@ -265,8 +265,8 @@ def _exploration_chances(
     With these the part of steps that explore is epsilon, whatever the hold: the stationary
     distribution of the chain of two states, exploring or not.
     """
-    way = jnp.clip(done / (pqn.exploration * updates), 0.0, 1.0)
-    epsilon = pqn.epsilon_start + way * (pqn.epsilon_end - pqn.epsilon_start)
+    progress = jnp.clip(done / (pqn.exploration * updates), 0.0, 1.0)
+    epsilon = pqn.epsilon_start + progress * (pqn.epsilon_end - pqn.epsilon_start)
     keep = 1.0 - 1.0 / pqn.hold
     return jnp.asarray(keep), epsilon * (1.0 - keep) / jnp.maximum(1.0 - epsilon * keep, 1e-6)
 

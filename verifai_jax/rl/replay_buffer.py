@@ -20,12 +20,12 @@ class ReplayBuffer(NamedTuple):
 
     - `rows`: `[capacity, 2 * size + actions + 2]`. The widths of an observation and an action are
       not stored: `unpack` is given the second.
-    - `place`: the row that is written next.
+    - `index`: the row that is written next.
     - `filled`: the number of rows that hold a transition.
     """
 
     rows: Float[Array, "capacity width"]
-    place: Int[Array, ""]
+    index: Int[Array, ""]
     filled: Int[Array, ""]
 
 
@@ -58,9 +58,9 @@ def add(buffer: ReplayBuffer, new: StoredTransitions) -> ReplayBuffer:
     rows = jnp.concatenate([part.astype(jnp.float32) for part in (*columns, *scalars)], axis=1)
     capacity, count = len(buffer.rows), len(rows)
     assert capacity % count == 0, (capacity, count)
-    written = jax.lax.dynamic_update_slice(buffer.rows, rows, (buffer.place, 0))
+    written = jax.lax.dynamic_update_slice(buffer.rows, rows, (buffer.index, 0))
     filled = jnp.minimum(buffer.filled + count, capacity)
-    return ReplayBuffer(written, (buffer.place + count) % capacity, filled)
+    return ReplayBuffer(written, (buffer.index + count) % capacity, filled)
 
 
 def sample(
@@ -73,8 +73,8 @@ def sample(
     - `count`: the number of transitions.
     - `actions`: the numbers in an action.
     """
-    places = jax.random.randint(key, (count,), 0, buffer.filled)
-    return unpack(buffer.rows[places], actions)
+    indices = jax.random.randint(key, (count,), 0, buffer.filled)
+    return unpack(buffer.rows[indices], actions)
 
 
 def unpack(rows: Float[Array, "batch width"], actions: int) -> StoredTransitions:

@@ -16,7 +16,7 @@ from verifai_jax.scenes.recipe import Recipe
 from verifai_jax.scenes.requirements import Constraint
 from verifai_jax.scenes.sampling import Sampling
 
-LEAST = 2e-6
+MIN_CHANCE = 2e-6
 """Probability of a soft requirement to be off, or on, at least."""
 
 FAST, SLOW = 16_384, 1024
@@ -104,13 +104,15 @@ def _soft_domains(
     accepted = np.asarray(space.accepts_points(u))
     features = space.features_at(u)
     on = np.stack([np.asarray(features[name]) for name in names], axis=1)[accepted]
-    wanted = np.clip([float(sampling.soft[name].prob) for name in names], LEAST, 1 - LEAST)
+    wanted = np.clip(
+        [float(sampling.soft[name].prob) for name in names], MIN_CHANCE, 1 - MIN_CHANCE
+    )
     weights = wanted.copy()
     for _ in range(ROUNDS if len(on) else 0):
         mass = np.prod(np.where(on, weights, 1 - weights), axis=1)
-        share = np.clip((mass[:, None] * on).sum(0) / mass.sum(), LEAST, 1 - LEAST)
+        share = np.clip((mass[:, None] * on).sum(0) / mass.sum(), MIN_CHANCE, 1 - MIN_CHANCE)
         odds = weights / (1 - weights) * (wanted / (1 - wanted)) / (share / (1 - share))
-        weights = np.clip(odds / (1 + odds), LEAST, 1 - LEAST)
+        weights = np.clip(odds / (1 + odds), MIN_CHANCE, 1 - MIN_CHANCE)
     return {
         name: Categorical(False, True, weights=[float(1 - weight), float(weight)])
         for name, weight in zip(names, weights, strict=True)

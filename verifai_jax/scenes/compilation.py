@@ -89,8 +89,8 @@ def compile_program(
     try:
         with _without_verifai():
             try:
-                place = None if path is None else str(path)
-                with translator.topLevelNamespace(place) as namespace:
+                file_name = None if path is None else str(path)
+                with translator.topLevelNamespace(file_name) as namespace:
                     stream = io.BytesIO(source.encode())
                     translator.compileStream(stream, namespace, options, filename)
             finally:

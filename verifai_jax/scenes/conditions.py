@@ -181,12 +181,12 @@ class _Evaluation:
         if isinstance(thing, Body) and "width" in thing.names:
             box = rectangle_of(thing)
             return box_inside(box, edges_of(region.polygons), is_convex(region.polygons))
-        place = as_vec(thing)
+        position = as_vec(thing)
         if kind_of(region) == "CircularRegion":
-            return place.distanceTo(as_vec(self.values(region.center))) <= region.radius
+            return position.distanceTo(as_vec(self.values(region.center))) <= region.radius
         if kind_of(region) == "SectorRegion":
             raise Unsupported("containment in a sector")
-        return point_inside(place.x, place.y, edges_of(region.polygons))
+        return point_inside(position.x, position.y, edges_of(region.polygons))
 
     def _Call(self, tree: Any) -> Any:
         name = getattr(tree.func, "id", "")
@@ -235,8 +235,10 @@ def _compared(op: ast.AST, one: Any, other: Any) -> Any:
     if type(op) not in OPERATORS:
         raise Unsupported(f"{type(op).__name__} in a requirement")
     if isinstance(op, ast.Eq | ast.NotEq) and isinstance(one, Choice) and isinstance(other, str):
-        places = [i for i, option in enumerate(one.options) if option == other]
-        held = jnp.isin(one.index, jnp.asarray(places, jnp.int32)) if places else jnp.asarray(False)
+        indices = [i for i, option in enumerate(one.options) if option == other]
+        held = (
+            jnp.isin(one.index, jnp.asarray(indices, jnp.int32)) if indices else jnp.asarray(False)
+        )
         return held if isinstance(op, ast.Eq) else _not(held)
     for value in (one, other):
         if isinstance(value, Yaw | Vec | Body | Choice | tuple | str) or value is None:

@@ -32,23 +32,23 @@ class Rectangle(NamedTuple):
     @property
     def corners(self) -> Float[Array, "4 2"]:
         """The corners, counterclockwise."""
-        places = []
+        points = []
         for across, along in ((1, 1), (-1, 1), (-1, -1), (1, -1)):
             right, forward = across * self.half_width, along * self.half_length
-            places.append(self.x + self.cos * right - self.sin * forward)
-            places.append(self.y + self.sin * right + self.cos * forward)
-        return jnp.stack([jnp.asarray(place, jnp.result_type(float)) for place in places]).reshape(
-            4, 2
-        )
+            points.append(self.x + self.cos * right - self.sin * forward)
+            points.append(self.y + self.sin * right + self.cos * forward)
+        return jnp.stack(
+            [jnp.asarray(corner, jnp.result_type(float)) for corner in points]
+        ).reshape(4, 2)
 
 
 def rectangle_of(body: Body) -> Rectangle:
     """Return the rectangle that an object covers."""
-    place = as_vec(body.get("position"))
+    position = as_vec(body.get("position"))
     yaw = jnp.asarray(body.get("orientation").angle, jnp.result_type(float))
     return Rectangle(
-        place.x,
-        place.y,
+        position.x,
+        position.y,
         yaw,
         jnp.cos(yaw),
         jnp.sin(yaw),
@@ -76,8 +76,8 @@ def edges_of(polygons: Any) -> Float[np.ndarray, "n 2 2"]:
     edges = []
     for polygon in getattr(polygons, "geoms", [polygons]):
         for ring in (polygon.exterior, *polygon.interiors):
-            places = np.array(ring.coords, float)[:, :2]
-            edges.append(np.stack([places[:-1], places[1:]], axis=1))
+            points = np.array(ring.coords, float)[:, :2]
+            edges.append(np.stack([points[:-1], points[1:]], axis=1))
     return np.concatenate(edges)
 
 
@@ -126,8 +126,8 @@ def _crosses(box: Rectangle, edges: Float[np.ndarray, "n 2 2"]) -> Bool[Array, "
     enter = jnp.zeros(len(edges), right.dtype)
     leave = jnp.ones(len(edges), right.dtype)
     misses = jnp.zeros(len(edges), bool)
-    for place, half in ((right, box.half_width), (forward, box.half_length)):
-        start, step = place[:, 0], place[:, 1] - place[:, 0]
+    for offset, half in ((right, box.half_width), (forward, box.half_length)):
+        start, step = offset[:, 0], offset[:, 1] - offset[:, 0]
         still = step == 0
         safe = jnp.where(still, 1.0, step)
         one, two = (-half - start) / safe, (half - start) / safe
@@ -148,12 +148,12 @@ def sees_all_around(x: Any, y: Any, radius: Any, box: Rectangle) -> Bool[Array, 
     dx, dy = box.x - x, box.y - y
     right, forward = dx * box.cos + dy * box.sin, -dx * box.sin + dy * box.cos
     apart = jnp.asarray(False)
-    for place, half, direction in (
+    for offset, half, direction in (
         (right, box.half_width, box.heading),
         (forward, box.half_length, box.heading + math.pi / 2),
     ):
         off = direction - step * jnp.round(direction / step)
-        apart = apart | (jnp.abs(place) - half > radius * jnp.cos(off))
+        apart = apart | (jnp.abs(offset) - half > radius * jnp.cos(off))
     nearest_right = right - jnp.clip(right, -box.half_width, box.half_width)
     nearest_forward = forward - jnp.clip(forward, -box.half_length, box.half_length)
     towards = jnp.arctan2(nearest_forward, nearest_right) + box.heading
@@ -161,7 +161,7 @@ def sees_all_around(x: Any, y: Any, radius: Any, box: Rectangle) -> Bool[Array, 
     for normal in (below * step, (below + 1) * step):
         local = normal - box.heading
         cos, sin = jnp.cos(local), jnp.sin(local)
-        least = right * cos + forward * sin
-        least = least - box.half_width * jnp.abs(cos) - box.half_length * jnp.abs(sin)
-        apart = apart | (least > radius * math.cos(step / 2))
+        lowest = right * cos + forward * sin
+        lowest = lowest - box.half_width * jnp.abs(cos) - box.half_length * jnp.abs(sin)
+        apart = apart | (lowest > radius * math.cos(step / 2))
     return ~apart

@@ -154,7 +154,7 @@ class Histogram(Leaf):
 class Chosen(Leaf):
     """An integer, or the place of an option.
 
-    - `values`: what the feature's choices stand for; None where the feature is the integer.
+    - `values`: what the feature's choices stand for; None if the feature is the integer.
     """
 
     values: tuple[int, ...] | None = None
@@ -179,7 +179,7 @@ class Chosen(Leaf):
         return {self.feature: index if tuning is None else tuning.choices[index]}
 
 
-class Place(Leaf):
+class ChoiceIndex(Leaf):
     """An integer between ends that are random, or far apart: its feature is a share of the way."""
 
     def _ends(self, given: Given, xp: Any) -> tuple[Any, Any]:
@@ -191,8 +191,8 @@ class Place(Leaf):
         if xp is np and high < low:
             raise NothingToDrawError(f"there is no integer from {low:zg} to {high:zg}")
         count = xp.maximum(high - low + 1, 1)
-        place = low + xp.minimum(xp.floor(parts[self.feature] * count), count - 1)
-        return int(place) if xp is np else place
+        index = low + xp.minimum(xp.floor(parts[self.feature] * count), count - 1)
+        return int(index) if xp is np else index
 
     def invert(self, value: Any, given: Given) -> dict[str, Any]:
         low, high = self._ends(given, np)
@@ -380,7 +380,7 @@ def leaf_of(node: Any, name: str, options: Sequence[Any] | None = None) -> Leaf 
         case "DiscreteRange":
             low, high = field(drawn, "low"), field(drawn, "high")
             if is_random(low) or is_random(high):
-                return Place(node, name, {f"{name}.share": Box(0, 1)})
+                return ChoiceIndex(node, name, {f"{name}.share": Box(0, 1)})
             return _discrete(node, name, low, high, field(drawn, "weights"), options)
         case "VerifaiRange":
             if field(drawn, "probs") is not None:
@@ -424,7 +424,7 @@ def _discrete(
 ) -> Leaf | None:
     first, last = math.ceil(low), math.floor(high)
     if last - first >= MAX_LEVELS:
-        return Place(node, name, {f"{name}.share": Box(0, 1)})
+        return ChoiceIndex(node, name, {f"{name}.share": Box(0, 1)})
     values = tuple(range(first, last + 1))
     if weights is not None:
         weighted = [(v, w) for v, w in zip(values, weights, strict=True) if w > 0]

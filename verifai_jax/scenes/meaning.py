@@ -176,11 +176,11 @@ class Values:
         return compute(drawn)
 
     def _Vector(self, node: Any) -> Any:
-        return Vec(*(self(place) for place in field(node, "coordinates")))
+        return Vec(*(self(coordinate) for coordinate in field(node, "coordinates")))
 
     def _OrientedVector(self, node: Any) -> Any:
-        place = self._Vector(node)
-        return Vec(place.x, place.y, place.z, self(field(node, "heading")))
+        vector = self._Vector(node)
+        return Vec(vector.x, vector.y, vector.z, self(field(node, "heading")))
 
     def _TupleDistribution(self, node: Any) -> Any:
         return tuple(self(entry) for entry in field(node, "coordinates"))
@@ -246,12 +246,12 @@ class Values:
 
     _VectorMethodDistribution = _MethodDistribution
 
-    def _at_field(self, owner: Any, place: Any) -> Any:
+    def _at_field(self, owner: Any, where: Any) -> Any:
         """Return the direction of a line at the point of it that is nearest."""
         line: Any = getattr(owner.value, "__self__", None)
         if kind_of(line) != "PolylineRegion":
             raise Unsupported(f"the vector field {owner.name}")
-        position = as_vec(self(place))
+        position = as_vec(self(where))
         if position.heading is not None:
             return Yaw(position.heading)
         starts, ends = (

@@ -131,7 +131,7 @@ def _visit(
         found.setdefault(id(node), label if pointed or not suffix else f"{label}.{suffix}")
         moved = field(drawn, "operator") in LOCAL
         offsets = {id(operand) for operand in field(drawn, "operands")} if moved else set()
-        places = vars(drawn).get("coordinates", ())
+        coordinates = vars(drawn).get("coordinates", ())
         region = kind_of(drawn).endswith("Region")
         frame = {id(field(drawn, part)): part for part in FRAME} if region else {}
         below_node = list(reversed(children(node)))
@@ -139,14 +139,14 @@ def _visit(
         below_node.sort(key=lambda child, frame=frame: id(child) in frame)
         for child in below_node:
             own = suffix
-            for axis, place in zip("xyz", places, strict=False):
-                if place is child:
+            for axis, coordinate in zip("xyz", coordinates, strict=False):
+                if coordinate is child:
                     own = axis
             below = label
-            inner = node is not root and bool(places)
+            inner = node is not root and bool(coordinates)
             if (inner or id(child) in offsets) and label.endswith(".position"):
                 below = label.removesuffix("position") + "offset"
             if id(child) in frame:
-                place = variables.get(id(node), f"{label}.region")
-                below, own = f"{place}.{frame[id(child)]}", ""
+                coordinate = variables.get(id(node), f"{label}.region")
+                below, own = f"{coordinate}.{frame[id(child)]}", ""
             stack.append((child, below, own))

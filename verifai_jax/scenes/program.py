@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.trace import Trace
 from verifai_jax.features import FeatureSpace
 from verifai_jax.scenes.outputs import Outputs
@@ -194,7 +194,7 @@ class ScenicProgram:
         return self._sampling.features_of(scene)
 
     def refusal(self, features: Mapping[str, Any]) -> str | None:
-        """Return why Scenic's own checker refuses a scene; None where it accepts it."""
+        """Return why Scenic's own checker refuses a scene; None if it accepts it."""
         here = jax.tree.map(np.asarray, self.space.convert(features))
         try:
             return self._sampling.refusal(self._sampling.values(here), here)
@@ -230,7 +230,7 @@ class ScenicProgram:
         - `scene`: of Scenic.
         - `path`: file to write the picture to.
         """
-        return late("verifai_jax.plotting.scenes", "draw_scene")(self, scene, path)
+        return lazy_import("verifai_jax.plotting.scenes", "draw_scene")(self, scene, path)
 
     def describe(self) -> str:
         """Describe the features, and say what Scenic computes and decides in Python."""

@@ -36,7 +36,7 @@ from verifai_jax.scenes.values import Unsupported, as_vec, is_plain
 
 Check = Callable[[Values], Any]
 
-MOST_DECISIONS = 100_000
+MAX_DECISIONS = 100_000
 """Decisions of Scenic that are kept: a run asks about some points more than once."""
 
 
@@ -163,7 +163,7 @@ class Constraint:
         point = tuple(_plain(features[name]) for name in self.sampling.domains)
         if (known := self._decisions.get(point)) is not None:
             return known
-        if len(self._decisions) >= MOST_DECISIONS:
+        if len(self._decisions) >= MAX_DECISIONS:
             self._decisions.clear()
         verdict = self._decisions[point] = self._accepts_anew(features)
         return verdict
@@ -223,11 +223,11 @@ def _visible(requirement: Any) -> Check:
 
     def check(values: Values) -> Any:
         viewer = values.body(source)
-        place = as_vec(viewer.get("position"))
+        position = as_vec(viewer.get("position"))
         if "cameraOffset" in viewer.names:
             camera = as_vec(viewer.get("cameraOffset"))
-            place = place.offsetRotated(viewer.get("orientation"), camera)
+            position = position.offsetRotated(viewer.get("orientation"), camera)
         distance = viewer.get("visibleDistance")
-        return sees_all_around(place.x, place.y, distance, rectangle_of(values.body(target)))
+        return sees_all_around(position.x, position.y, distance, rectangle_of(values.body(target)))
 
     return check

@@ -71,7 +71,7 @@ class Sampling:
         self.seeded: dict[int, str] = {}
         self.domains: dict[str, Domain] = {}
         self._external = False
-        self._place(names)
+        self._assign(names)
         self.soft = self._soft()
         for name in self.soft:
             probability = float(self.soft[name].prob)
@@ -94,7 +94,7 @@ class Sampling:
         )
         return behaves or composed or bool(over_time) or self.scenario.simulator is not None
 
-    def _place(self, names: Mapping[int, str]) -> None:
+    def _assign(self, names: Mapping[int, str]) -> None:
         """Give each random leaf its features, or a part in the seed."""
         options = {
             id(field(law(node), "index")): field(law(node), "options")
@@ -172,7 +172,7 @@ class Sampling:
         return region.orient(vectors.Vector(x, y, region.z))
 
     def refusal(self, values: Any, features: Mapping[str, Any]) -> str | None:
-        """Return why Scenic's own checker refuses a scene; None where it accepts it."""
+        """Return why Scenic's own checker refuses a scene; None if it accepts it."""
         with LOCK, _seeded_generators(0):
             self.activate(features)
             return self.scenario.checker.checkRequirements(values)
@@ -216,9 +216,9 @@ class Sampling:
         refusals = sys.modules["scenic.core.distributions"].RejectionException
         why = ""
         with LOCK, _seeded_generators(0):
-            for place in (0.5, 0.0, 1.0, *([None] * GUESSES)):
+            for unit_value in (0.5, 0.0, 1.0, *([None] * GUESSES)):
                 try:
-                    features, complete = self._inverted(scene.sample, place, random)
+                    features, complete = self._inverted(scene.sample, unit_value, random)
                     if not complete:
                         for name, value in features.items():
                             self.domains[name].check(value, name)
@@ -235,7 +235,7 @@ class Sampling:
         return {name: features[name] for name in self.domains}
 
     def _inverted(
-        self, sample: Any, place: float | None, random: np.random.Generator
+        self, sample: Any, unit_value: float | None, random: np.random.Generator
     ) -> tuple[dict[str, Any], bool]:
         """Return the features of what Scenic drew, and whether it tells all of them.
 
@@ -246,12 +246,15 @@ class Sampling:
         features: dict[str, Any] = {}
         complete = True
         for node in self.order:
-            leaf, told = self.leaves.get(id(node)), node in sample
-            if told:
+            leaf, given = self.leaves.get(id(node)), node in sample
+            if given:
                 values[node] = sample[node]
             elif leaf is not None:
                 complete = False
-                unit = {name: random.random() if place is None else place for name in leaf.domains}
+                unit = {
+                    name: random.random() if unit_value is None else unit_value
+                    for name in leaf.domains
+                }
                 guess = {
                     name: np.asarray(
                         domain.from_unit(jnp.full(domain.size, unit[name], jnp.float32))

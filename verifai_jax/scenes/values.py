@@ -254,8 +254,8 @@ class Body:
         if name in SIDES:
             across, along = SIDES[name]
             offset = Vec(across * self.get("width") / 2, along * self.get("length") / 2)
-            place = as_vec(self.get("position")).offsetLocally(self.get("orientation"), offset)
-            made = {"position": place, "orientation": self.get("orientation")}
+            position = as_vec(self.get("position")).offsetLocally(self.get("orientation"), offset)
+            made = {"position": position, "orientation": self.get("orientation")}
             made["heading"] = made["orientation"].yaw
             return Body(made.__getitem__, frozenset(made))
         raise Unsupported(f"the property {name}")
@@ -291,8 +291,8 @@ def select(index: Any, options: Sequence[Any]) -> Any:
             return options[0]
         # A sum of masked values has the derivatives of the chosen one, and no gather.
         result = options[-1] + 0.0 * index
-        for place, option in enumerate(options[:-1]):
-            result = jnp.where(index == place, option, result)
+        for position, option in enumerate(options[:-1]):
+            result = jnp.where(index == position, option, result)
         return result
     return Choice(index, tuple(options))
 

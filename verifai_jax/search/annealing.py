@@ -125,7 +125,7 @@ class Annealing(Search[AnnealingState]):
     ) -> tuple[Float[Array, "batch d"], AnnealingState]:
         key = jax.random.fold_in(state.key, state.asks)
         d, k, chains = cube.dim, len(cube.discrete), len(state.energy)
-        row, prior, noise, move, cell, way = draw_columns(key, batch, 6, d, d, d, k, k)
+        row, prior, noise, move, cell, direction = draw_columns(key, batch, 6, d, d, d, k, k)
         turn = self._turn(state, batch)
         own = state.u[turn]
         # One coordinate moves for certain, others all together or a few at a time.
@@ -143,7 +143,7 @@ class Annealing(Search[AnnealingState]):
         width = np.array([cube.ordered[i] / cube.levels[i] for i in few], np.float32)
         either = np.where(width > 0, RESAMPLED + NEIGHBOURING, RESAMPLED)
         drawn = cell[:, index] * jnp.where(certain[:, few], either, 1.0)
-        sideways = jnp.where(way[:, index] < 0.5, width, -width)
+        sideways = jnp.where(direction[:, index] < 0.5, width, -width)
         step = step.at[:, few].set(jnp.where((drawn > RESAMPLED) & (drawn < either), sideways, 0.0))
         u = _reflect(own + step)
         u = u.at[:, few].set(jnp.where(drawn < RESAMPLED, prior[:, few], u[:, few]))

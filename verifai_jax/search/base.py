@@ -27,7 +27,7 @@ from verifai_jax.core.notebook import ForUsers
 from verifai_jax.core.outcomes import OUTCOME
 
 KIND = 1 << 16
-"""Marks of one kind: a mark is `kind * KIND + number`. An int32 has room for 32 768
+"""Coverage ids of one kind: a coverage id is `kind * KIND + number`. An int32 has room for 32 768
 kinds with 65 536 numbers each."""
 
 
@@ -44,8 +44,8 @@ class Observations(NamedTuple):
     - `clause_gradients`: their gradients with respect to `u`; zero in rounds whose plan does not
       differentiate.
     - `outcomes`: what happened (`core.outcomes`), NaN where it is not known.
-    - `marks`: numbers of what each simulation covered, -1 for nothing; `marks // KIND` is the kind
-      of thing.
+    - `coverage_ids`: numbers of what each simulation covered, -1 for nothing; `coverage_ids //
+      KIND` is the kind of thing.
 
     All after `valid` are None for a search whose `Wants` do not name them.
     """
@@ -56,7 +56,7 @@ class Observations(NamedTuple):
     gradient: Float[Array, "n d"] | None = None
     clauses: Float[Array, "n clauses"] | None = None
     clause_gradients: Float[Array, "n clauses d"] | None = None
-    marks: Int[Array, "n marks"] | None = None
+    coverage_ids: Int[Array, "n ids"] | None = None
     outcomes: Float[Array, "n outcome"] | None = None
 
     @property
@@ -108,7 +108,7 @@ class Wants:
     - `gradient`: `Observations.gradient`, at the `temperature` of the search.
     - `clauses`: `Observations.clauses`. Such a search plans its rounds (`plan`).
     - `clause_gradients`: `Observations.clause_gradients`, in the rounds whose plan says so.
-    - `marks`: `Observations.marks`.
+    - `coverage_ids`: `Observations.coverage_ids`.
     - `outcomes`: `Observations.outcomes`.
     - `no_verdict_rows`: simulations without a verdict as if they were valid, with the greatest
       robustness so far, so that a model of the robustness learns to stay away from them.
@@ -121,7 +121,7 @@ class Wants:
     gradient: bool = False
     clauses: bool = False
     clause_gradients: bool = False
-    marks: bool = False
+    coverage_ids: bool = False
     outcomes: bool = False
     no_verdict_rows: bool = False
     traces: TraceOptions | None = None
@@ -146,19 +146,19 @@ class Wants:
             "gradient": self.gradient,
             "clauses": self.clauses,
             "clause_gradients": self.clauses,
-            "marks": self.marks,
+            "coverage_ids": self.coverage_ids,
             "outcomes": self.outcomes,
         }
         return observations._replace(**{name: None for name, want in wanted.items() if not want})
 
-    def form(self, cube: Cube, batch: int, marks: int) -> Observations:
+    def form(self, cube: Cube, batch: int, coverage_ids: int) -> Observations:
         """Return the shapes and types of the observations of a round.
 
         **Arguments:**
 
         - `cube`: the cube that is searched.
         - `batch`: rows of a round.
-        - `marks`: marks of a row.
+        - `coverage_ids`: coverage ids of a row.
         """
 
         def array(*shape: int, dtype: DTypeLike = jnp.float32) -> Any:
@@ -171,7 +171,7 @@ class Wants:
             gradient=array(batch, cube.dim),
             clauses=array(batch, CLAUSES),
             clause_gradients=array(batch, CLAUSES, cube.dim),
-            marks=array(batch, marks, dtype=jnp.int32),
+            coverage_ids=array(batch, coverage_ids, dtype=jnp.int32),
             outcomes=array(batch, OUTCOME),
         )
         return self.only(everything)
@@ -235,7 +235,7 @@ class Search(ForUsers, abc.ABC, Generic[State]):
             return "prior"
         if not self.learns:
             return "sequence"
-        return "coverage" if self.wants.marks else "learned"
+        return "coverage" if self.wants.coverage_ids else "learned"
 
     @property
     def sequence(self) -> tuple[str, str]:

@@ -20,7 +20,7 @@ from verifai_jax.search.base import Search
 
 BATCH = 16
 """Points of a round with which the forms are checked. Nothing is computed; any number serves."""
-MARKS = 4
+COVERAGE_IDS = 4
 """Marks of a point with which the forms are checked; any number serves."""
 
 
@@ -65,7 +65,7 @@ def check_contract(search: Search, cube: Cube) -> None:
         )
     _check_state(search, "ask", state, following)
     if search.learns:
-        rows = search.wants.form(cube, BATCH, MARKS)
+        rows = search.wants.form(cube, BATCH, COVERAGE_IDS)
         updated = _form(search, "tell", lambda s, rows: search.tell(s, cube, rows), state, rows)
         _check_state(search, "tell", state, updated)
 

@@ -1,12 +1,12 @@
 """Coverage-guided fuzzing: mutations of points that did what few others did.
 
-Each simulation has marks, numbers of what it covered: transitions of an automaton, cells of
-behaviour, the clause nearest to breaking. For each mark the search keeps the point with the lowest
-robustness among those that have it (an archive of elites: Mouret, Clune, Illuminating search spaces
-by mapping elites, 2015), and mutates those of seldom marks more often (Boehme, Pham, Roychoudhury,
-Coverage-based greybox fuzzing as Markov chain, IEEE Transactions on Software Engineering 45(5),
-2019). So it climbs by what is new where the robustness says nothing. Each kind of mark gets the
-same share, so that many pairs of transitions do not drown a few cells.
+Each simulation has coverage ids, numbers of what it covered: transitions of an automaton, cells of
+behaviour, the clause nearest to breaking. For each coverage id the search keeps the point with the
+lowest robustness among those that have it (an archive of elites: Mouret, Clune, Illuminating search
+spaces by mapping elites, 2015), and mutates those of seldom coverage ids more often (Boehme, Pham,
+Roychoudhury, Coverage-based greybox fuzzing as Markov chain, IEEE Transactions on Software
+Engineering 45(5), 2019). So it climbs by what is new where the robustness says nothing. Each kind
+of coverage id gets the same share, so that many pairs of transitions do not drown a few cells.
 """
 
 from dataclasses import dataclass
@@ -25,18 +25,18 @@ from verifai_jax.search.base import KIND, Observations, Search, Wants, standard_
 STEP = 0.1
 """Standard deviation of small steps, in unit coordinates."""
 
-WAYS = (0.35, 0.55, 0.75, 0.9)
+MOVES = (0.35, 0.55, 0.75, 0.9)
 """Cumulative shares of mutations: a few coordinates, a stretch, all from one coordinate on, a
 splice; the rest are small steps."""
 
 SHARES = (0.25, 0.5, 0.25, 0.25)
-"""Shares of the kinds of marks: of features, of cells of behaviour, of verdicts, and others."""
+"""Shares of the kinds of ids: of features, of cells of behaviour, of verdicts, and others."""
 
 KINDS = len(SHARES)
-"""Number of kinds of marks that the search distinguishes."""
+"""Number of kinds of coverage ids that the search distinguishes."""
 
 VERDICT = 2
-"""The kind of marks of verdicts."""
+"""The kind of coverage ids of verdicts."""
 
 EDITED = 0.85
 """Share of mutations that edit an item of an array, where there are such."""
@@ -59,8 +59,8 @@ class CoverageState(NamedTuple):
     key: Key[Array, ""]
     round: UInt32[Array, ""]
     elites: Float[Array, "kinds*buckets d"]
-    score: Float[Array, " kinds*buckets"]  # infinite where no point has the mark
-    hits: Float[Array, " kinds*buckets"]  # simulations with the mark
+    score: Float[Array, " kinds*buckets"]  # infinite where no point has the coverage id
+    hits: Float[Array, " kinds*buckets"]  # simulations with the coverage id
 
 
 @dataclass(frozen=True)
@@ -70,13 +70,14 @@ class Coverage(Search[CoverageState]):
     **Arguments:**
 
     - `exploration`: share of points drawn from the prior, for ever.
-    - `rarity`: exponent by which seldom marks are preferred; 0 is not at all.
-    - `buckets`: marks of a kind that the search distinguishes; further marks share these buckets.
+    - `rarity`: exponent by which seldom coverage ids are preferred; 0 is not at all.
+    - `buckets`: coverage ids of a kind that the search distinguishes; further coverage ids share
+      these buckets.
 
     **Raises:** `ValueError` for values out of range.
     """
 
-    wants: ClassVar[Wants] = Wants(marks=True, max_batch=64)
+    wants: ClassVar[Wants] = Wants(coverage_ids=True, max_batch=64)
 
     exploration: float = 0.15
     rarity: float = 2.0
@@ -138,14 +139,14 @@ class Coverage(Search[CoverageState]):
         few = (index == begin) | (masks * d < 2.0 ** jnp.floor(coins[:, 2:3] * 4) - 1)
         stretch = (index >= begin) & (index < begin + length)
         tail = index >= begin
-        way = coins[:, 3][:, None]
+        move = coins[:, 3][:, None]
         drawn = jnp.where(
-            way < WAYS[0], few, jnp.where(way < WAYS[1], stretch, tail & (way < WAYS[2]))
+            move < MOVES[0], few, jnp.where(move < MOVES[1], stretch, tail & (move < MOVES[2]))
         )
-        spliced = tail & (way >= WAYS[2]) & (way < WAYS[3])
+        spliced = tail & (move >= MOVES[2]) & (move < MOVES[3])
         moved = jnp.where(drawn, fresh, jnp.where(spliced, other, parent))
         continuous = np.array(cube.levels) == 0
-        steps = few & continuous & (way >= WAYS[3])
+        steps = few & continuous & (move >= MOVES[3])
         moved = jnp.where(steps, moved + STEP * standard_normal(noise), moved)
         if cube.lengths:
             # Items after the end change nothing.
@@ -159,12 +160,12 @@ class Coverage(Search[CoverageState]):
 
     def tell(self, state: CoverageState, cube: Cube, observations: Observations) -> CoverageState:
         usable, n = observations.usable, len(observations.rho)
-        marks = observations.marks
-        if marks is None or not marks.shape[1]:
-            marks = jnp.zeros((n, 1), jnp.int32)
+        coverage_ids = observations.coverage_ids
+        if coverage_ids is None or not coverage_ids.shape[1]:
+            coverage_ids = jnp.zeros((n, 1), jnp.int32)
         u = jnp.where(usable[:, None], observations.u, 0.5)
-        known, size = usable[:, None] & (marks >= 0), KINDS * self.buckets
-        index = (marks // KIND) % KINDS * self.buckets + marks % KIND % self.buckets
+        known, size = usable[:, None] & (coverage_ids >= 0), KINDS * self.buckets
+        index = (coverage_ids // KIND) % KINDS * self.buckets + coverage_ids % KIND % self.buckets
         bucket = jnp.where(known, index, size)
         rows = jnp.broadcast_to(jnp.arange(n)[:, None], bucket.shape)
         scores = self._scores(cube, observations, index)
@@ -182,11 +183,11 @@ class Coverage(Search[CoverageState]):
         )
 
     def _scores(
-        self, cube: Cube, observations: Observations, index: Int[Array, "n marks"]
-    ) -> Float[Array, "n marks"]:
-        """Return what is kept for each mark: short arrays, then the lowest robustness.
+        self, cube: Cube, observations: Observations, index: Int[Array, "n ids"]
+    ) -> Float[Array, "n ids"]:
+        """Return what is kept for each coverage id: short arrays, then the lowest robustness.
 
-        For marks of verdicts the robustness alone: those lead to what fails.
+        For coverage ids of verdicts the robustness alone: those lead to what fails.
         """
         score = observations.score.astype(jnp.float32)
         score = jnp.where(jnp.isfinite(score), score / (1 + score), 1.0)
@@ -222,21 +223,21 @@ def _edited(
         # Arcsine distributed: dense at both ends. The kind of an item is its first coordinate.
         extreme = (coins[:, 7] < EXTREME)[:, None, None] & (np.arange(width) > 0)
         new = jnp.where(extreme, jnp.sin(0.5 * np.pi * new) ** 2, new)
-        indices, way = jnp.arange(count), coins[:, 3][:, None]
+        indices, move = jnp.arange(count), coins[:, 3][:, None]
         here = (indices == slot)[:, :, None]
         after = (indices > slot)[:, :, None]
         inserted = jnp.where(here, new, jnp.where(after, jnp.roll(block, 1, axis=1), block))
         removed = jnp.where(here | after, jnp.roll(block, -1, axis=1), block)
         # Some changes keep the kind of an item and all its numbers but one.
         one = 1 + jnp.floor(coins[:, 8] * max(width - 1, 1))[:, None, None]
-        within = here & ((np.arange(width) == one) | (way[:, :, None] < EDITS[1]))
+        within = here & ((np.arange(width) == one) | (move[:, :, None] < EDITS[1]))
         replaced = jnp.where(within, new, block)
         tail = jnp.where(here | after, new, block)
-        ways = [way < EDITS[0], way < EDITS[2], way < EDITS[3]]
+        moves = [move < EDITS[0], move < EDITS[2], move < EDITS[3]]
         sizes = [items + 1, jnp.maximum(items, slot[:, 0] + 1), items - 1]
         longest = jnp.maximum(items, jnp.floor(fresh[:, length] * levels) + min_items)
-        size = jnp.select([w[:, 0] for w in ways], sizes, longest)
-        edited = jnp.select([w[:, :, None] for w in ways], [inserted, replaced, removed], tail)
+        size = jnp.select([w[:, 0] for w in moves], sizes, longest)
+        edited = jnp.select([w[:, :, None] for w in moves], [inserted, replaced, removed], tail)
         size = jnp.clip(size, min_items, count)
         whole = parent.at[:, first : first + width * count].set(edited.reshape(len(parent), -1))
         whole = whole.at[:, length].set((size - min_items + 0.5) / levels)

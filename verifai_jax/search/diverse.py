@@ -41,7 +41,7 @@ AT_ONCE = 16
 """Maximum number of failures archived in a round, each by one step of a loop: as many as the rounds
 of a diverse run have points by default."""
 
-WAYS = ("inputs", "behaviour")
+MOVES = ("inputs", "behaviour")
 """What failures can be far from each other in."""
 
 
@@ -96,8 +96,8 @@ class Diverse(Wrapper[DiverseState]):
         check_fraction("shrink", self.shrink, one=True)
         check_count("patience", self.patience)
         check_count("capacity", self.capacity)
-        if self.by not in WAYS:
-            raise unknown_name("way of being diverse", self.by, WAYS)
+        if self.by not in MOVES:
+            raise unknown_name("way of being diverse", self.by, MOVES)
         if self.min_radius > self.radius:
             raise ValueError(
                 f"min_radius must be at most radius, {self.radius}; got {self.min_radius}"
@@ -307,7 +307,7 @@ class Diverse(Wrapper[DiverseState]):
                 gradient=jnp.where(inside[:, None], raised, observations.gradient)
             )
         if observations.clauses is not None:
-            # These have no unit, and of clauses that there are not the values stay very low.
+            # These have no unit, and of clauses that do not exist the values stay very low.
             there = inside[:, None] & (observations.clauses > NOTHING)
             lifted = jnp.maximum(observations.clauses, 0.0) + near[:, None]
             changed = changed._replace(clauses=jnp.where(there, lifted, observations.clauses))

@@ -21,7 +21,7 @@ class Evolution(NamedTuple):
     mean: Float[Array, " n"]
     size: Float[Array, ""]  # of the step
     covariance: Float[Array, "n *n"]  # over the squared size; or its diagonal
-    way: Float[Array, " n"]  # evolution paths, of the covariance and of the size
+    path: Float[Array, " n"]  # evolution paths, of the covariance and of the size
     whitened: Float[Array, " n"]
     age: Float[Array, ""]  # steps taken
 
@@ -32,7 +32,7 @@ class Evolution(NamedTuple):
             mean=mean,
             size=size,
             covariance=jnp.eye(n, dtype=jnp.float32) if full else jnp.ones(n, jnp.float32),
-            way=jnp.zeros(n, jnp.float32),
+            path=jnp.zeros(n, jnp.float32),
             whitened=jnp.zeros(n, jnp.float32),
             age=jnp.float32(0),
         )
@@ -77,7 +77,7 @@ class Evolution(NamedTuple):
         mass = _mass(weights)  # mu_eff
         size_rate = (mass + 2) / (n + mass + 5)  # c_sigma
         damping = 1 + 2 * jnp.maximum(0, jnp.sqrt((mass - 1) / (n + 1)) - 1) + size_rate
-        way_rate = (4 + mass / n) / (n + 4 + 2 * mass / n)  # c_c
+        path_rate = (4 + mass / n) / (n + 4 + 2 * mass / n)  # c_c
         one, many = rates(mass, n, self.covariance.ndim == 2)
         # The sum of the negative weights; the last limit keeps the covariance positive definite.
         learned = jnp.maximum(many, 1e-12)
@@ -95,19 +95,19 @@ class Evolution(NamedTuple):
 
         unbiased = jnp.sqrt(1 - (1 - size_rate) ** (2 * (self.age + 1)))
         steady = length / unbiased < (1.4 + 2 / (n + 1)) * expected  # h_sigma
-        gain = jnp.sqrt(way_rate * (2 - way_rate) * mass)
-        way = (1 - way_rate) * self.way + steady * gain * step
-        kept = 1 - one - many * (1 - shrinking) + one * (1 - steady) * way_rate * (2 - way_rate)
+        gain = jnp.sqrt(path_rate * (2 - path_rate) * mass)
+        path = (1 - path_rate) * self.path + steady * gain * step
+        kept = 1 - one - many * (1 - shrinking) + one * (1 - steady) * path_rate * (2 - path_rate)
         if self.covariance.ndim == 1:
-            covariance = kept * self.covariance + one * way**2 + many * (signed @ steps**2)
+            covariance = kept * self.covariance + one * path**2 + many * (signed @ steps**2)
         else:
             spread = (signed * steps.T) @ steps
-            covariance = kept * self.covariance + one * jnp.outer(way, way) + many * spread
+            covariance = kept * self.covariance + one * jnp.outer(path, path) + many * spread
         return Evolution(
             mean=self.mean + self.size * step,
             size=self.size * jnp.exp(jnp.minimum(growth, 1.0)),
             covariance=covariance,
-            way=way,
+            path=path,
             whitened=whitened,
             age=self.age + 1,
         )

@@ -65,7 +65,7 @@ FIRST_BOX = 0.4
 """Size of the first box of short descents: beyond it gradients say little. Chosen among others from
 192 to 384 random starts, by simulations a failure (`benchmarks/RESULTS.md`, "Short descents")."""
 
-WHOLE_CUBE = 2
+FULL_CUBE = 2
 """Of so many descents one begins with the whole cube, for failures in corners such as those of CC2.
 With one of four, and twelve descents first, the landscape of ripples cost half as much again."""
 
@@ -288,7 +288,7 @@ class Gradient(Search[GradientState]):
         before = jnp.max(state.clauses, axis=1)
 
         # With gradients: a descent goes on from where they are known, or starts elsewhere.
-        begin = jnp.where(state.number % WHOLE_CUBE > 0, FIRST_BOX, 1.0)
+        begin = jnp.where(state.number % FULL_CUBE > 0, FIRST_BOX, 1.0)
         begin = jnp.where(state.given, OFFERED_BOX, begin)
         differentiated = state._replace(
             point=_rows(informative & visited, observations.u[best], state.point),
@@ -438,7 +438,7 @@ def _minimax(
     share = jnp.where(above + below > 0, below / (above + below), 0.5)[:, None]
     candidates = jnp.concatenate([corner(gradients), share * a + (1 - share) * b])
     greatest = jnp.max(linear(candidates), axis=1)
-    # Of clauses that there are not, and of equally good points the first: a corner.
+    # Of clauses that do not exist, and of equally good points the first: a corner.
     there = clauses > NOTHING
     usable = jnp.concatenate([there, there[pairs[:, 0]] & there[pairs[:, 1]]])
     greatest = jnp.where(usable, greatest, jnp.inf)

@@ -203,7 +203,7 @@ class Mutation(Search[MutationState]):
 
 def _explore(
     cube: Cube,
-    way: Float[Array, " n"],
+    direction: Float[Array, " n"],
     change: Float[Array, " n"],
     even: Float[Array, " n"],
     idle: Float[Array, ""],
@@ -224,8 +224,8 @@ def _explore(
         side = jnp.cumsum(cuts[:, indices] < TO_AND_FRO, axis=1) % 2 == 0
         high = jnp.maximum(u[:, indices], 1 - u[:, indices])
         swinging = jnp.where(side, high, 1 - high)
-        found = jnp.where((way < SELDOM)[:, None], held, u[:, indices])
-        found = jnp.where((way > 1 - SWINGING)[:, None], swinging, found)
+        found = jnp.where((direction < SELDOM)[:, None], held, u[:, indices])
+        found = jnp.where((direction > 1 - SWINGING)[:, None], swinging, found)
         found = jnp.where(evenly[:, None], u[:, indices], found)
         u = u.at[:, indices].set(found)
     return u

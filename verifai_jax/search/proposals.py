@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.clauses import ABSENT, CLAUSES
-from verifai_jax.core.compilation import Compilation, Effort, compile_soon, tracing
+from verifai_jax.core.compilation import Compilation, XlaOptimization, compile_soon, tracing
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.fingerprint import identity
 from verifai_jax.core.outcomes import OUTCOME
@@ -63,17 +63,17 @@ class Proposals:
         batch: int,
         key: Key[Array, ""],
         accepts: Callable[[Any], Bool[Array, " n"]] | None = None,
-        marks: int = 0,
+        coverage_ids: int = 0,
         improve: Callable[[Any], Float[Any, "batch d"]] | None = None,
     ) -> None:
         self.search, self.batch, self.cube = search, batch, cube
         self.total = search.total(self.cube)
         self.proposed = self.accepted = 0
         self.cut = False
-        self._marks = marks if search.wants.marks else 0
+        self._coverage_ids = coverage_ids if search.wants.coverage_ids else 0
         self._improve = improve
         self.stage = search.stage(None, self.cube, batch)
-        self._program = compiled_search(self.stage, self.cube, batch, self._marks)
+        self._program = compiled_search(self.stage, self.cube, batch, self._coverage_ids)
         self._checked = is_user_defined(search)
         self._accepts = accepts
         if self._accepts is not None:
@@ -143,7 +143,7 @@ class Proposals:
         gradient: Float[np.ndarray, "m d"] | None,
         clauses: Float[np.ndarray, "m clauses"] | None = None,
         clause_gradients: Float[np.ndarray, "m clauses d"] | None = None,
-        marks: Int[np.ndarray, "m marks"] | None = None,
+        coverage_ids: Int[np.ndarray, "m ids"] | None = None,
         outcomes: Float[np.ndarray, "m outcome"] | None = None,
     ) -> None:
         """Let the search learn from the simulations of the points that `next` gave last.
@@ -154,7 +154,7 @@ class Proposals:
         - `valid`: False for simulations without a verdict.
         - `gradient`: of the smooth robustness, for a search that wants it.
         - `clauses`, `clause_gradients`: for a search that wants clauses; see `Observations`.
-        - `marks`: for a search that wants them, as many as the constructor was given.
+        - `coverage_ids`: for a search that wants them, as many as the constructor was given.
         - `outcomes`: for a search that wants them.
         """
         if not self.search.learns:
@@ -181,9 +181,9 @@ class Proposals:
                     none if clause_gradients is None else clause_gradients, 0.0
                 ),
             )
-        if self.search.wants.marks:
-            whole = np.zeros((len(rho), 0), np.int32) if marks is None else marks
-            observations = observations._replace(marks=self._spread(whole, -1))
+        if self.search.wants.coverage_ids:
+            whole = np.zeros((len(rho), 0), np.int32) if coverage_ids is None else coverage_ids
+            observations = observations._replace(coverage_ids=self._spread(whole, -1))
         if self.search.wants.outcomes:
             unknown = np.full((len(rho), OUTCOME), np.nan, np.float32)
             known = unknown if outcomes is None else outcomes
@@ -193,8 +193,8 @@ class Proposals:
     def tell_refused(self) -> None:
         """Let the search know that no row of the last round could be simulated."""
         gradient = np.zeros((0, self.cube.dim), np.float32) if self.search.wants.gradient else None
-        marks = np.zeros((0, self._marks), np.int32)
-        self.tell(np.zeros(0, np.float32), np.zeros(0, bool), gradient, marks=marks)
+        coverage_ids = np.zeros((0, self._coverage_ids), np.int32)
+        self.tell(np.zeros(0, np.float32), np.zeros(0, bool), gradient, coverage_ids=coverage_ids)
 
     def warm_start(
         self,
@@ -257,7 +257,9 @@ class Proposals:
         if stage == self.stage:
             return False
         self.stage = stage
-        self._program = compiled_search(stage, self.cube, self.batch, self._marks, begins=False)
+        self._program = compiled_search(
+            stage, self.cube, self.batch, self._coverage_ids, begins=False
+        )
         return True
 
     def wait(self) -> None:
@@ -414,13 +416,13 @@ SMALL = 256
 its programs are large, and then run nearly as fast."""
 
 
-def effort_of(search: Search, batch: int) -> Effort:
+def optimization_of(search: Search, batch: int) -> XlaOptimization:
     """Return how much is done to make the programs of a search fast."""
     return "least" if search.wants.clauses and batch <= SMALL else "little"
 
 
 class SearchProgram(NamedTuple):
-    """Compiled functions of a search; `init` is None where they begin with the state of another."""
+    """Compiled functions of a search; `init` is None if they begin with the state of another."""
 
     init: Callable[..., PyTree] | None
     ask: Callable[..., tuple[Array, PyTree]]
@@ -432,7 +434,7 @@ class SearchProgram(NamedTuple):
 @lru_cache(maxsize=64)
 @tracing("the search")
 def compiled_search(
-    search: Search, cube: Cube, batch: int, marks: int, begins: bool = True
+    search: Search, cube: Cube, batch: int, coverage_ids: int, begins: bool = True
 ) -> SearchProgram:
     """Compile `init / ask / tell` of one search on one cube, in the background, side by side.
 
@@ -443,19 +445,19 @@ def compiled_search(
     state: Any = begun.out_info
     states = jax.tree.structure(state)
     # What a search of this package does follows from its options; a user's may do anything.
-    kept = None if is_user_defined(search) else identity(search, cube, batch, marks)
+    kept = None if is_user_defined(search) else identity(search, cube, batch, coverage_ids)
 
     def compiled(verb: str, function: Callable[..., Any], *arguments: PyTree, form: Any) -> Any:
         name = remembered_as(f"search-{verb}", kept, verb)
         lowered = lower_or_recall(name, function, arguments, form)
-        return compile_soon("the search", lowered, effort_of(search, batch))
+        return compile_soon("the search", lowered, optimization_of(search, batch))
 
     # What takes longest to compile begins first.
     asked = jax.tree.structure((0, jax.tree.unflatten(states, [0] * states.num_leaves)))
     ask = compiled("ask", lambda state: search.ask(state, cube, batch), state, form=asked)
     init: Any = None
     if begins:
-        init = compile_soon("the search", begun.lower(), effort_of(search, batch))
+        init = compile_soon("the search", begun.lower(), optimization_of(search, batch))
     plan: Any = None
     if search.wants.clauses:
         form = jax.tree.structure(Plan(0, 0, 0))  # pyright: ignore[reportArgumentType]
@@ -464,7 +466,7 @@ def compiled_search(
     if search.learns:
         tell = compiled(
             "tell", lambda state, rows: search.tell(state, cube, rows), state,
-            search.wants.form(cube, batch, marks), form=states,
+            search.wants.form(cube, batch, coverage_ids), form=states,
         )  # fmt: skip
     temperature: Any = lambda state: 1.0  # noqa: E731
     if search.wants.gradient:

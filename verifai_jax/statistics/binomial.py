@@ -44,8 +44,8 @@ class Rate:
         return self.failures / self.simulations
 
     def __str__(self) -> str:
-        most = (self.failures + self.undecided) / self.simulations
-        range_ = f" to {format_percent(most)}" if self.undecided else ""
+        maximum = (self.failures + self.undecided) / self.simulations
+        range_ = f" to {format_percent(maximum)}" if self.undecided else ""
         return (
             f"{format_percent(self.estimate)}{range_} ({format_percent(self.confidence)} interval "
             f"{format_percent(self.low)} to {format_percent(self.high)}"
@@ -78,9 +78,9 @@ def clopper_pearson(
     from scipy.special import betaincinv
 
     tail = (1 - confidence) / 2
-    k, most, n = failures, failures + undecided, simulations
+    k, maximum, n = failures, failures + undecided, simulations
     low = 0.0 if k == 0 else float(betaincinv(k, n - k + 1, tail))
-    high = 1.0 if most == n else float(betaincinv(most + 1, n - most, 1 - tail))
+    high = 1.0 if maximum == n else float(betaincinv(maximum + 1, n - maximum, 1 - tail))
     return Rate(k, n, low, high, confidence, undecided=undecided)
 
 

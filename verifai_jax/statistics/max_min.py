@@ -31,28 +31,28 @@ def max_min_step(
     **Returns:** the step; zero where nothing can be gained, or the solver finds nothing.
     """
     step = np.zeros_like(theta)
-    places = np.flatnonzero(free & np.any(gradients != 0, axis=0))
+    indices = np.flatnonzero(free & np.any(gradients != 0, axis=0))
     rows = np.flatnonzero(np.isfinite(rho))
-    if not len(places) or not len(rows):
+    if not len(indices) or not len(rows):
         return step
-    low, high = np.full(len(places), -radius), np.full(len(places), radius)
+    low, high = np.full(len(indices), -radius), np.full(len(indices), radius)
     if bounded:
-        low, high = np.maximum(low, -theta[places]), np.minimum(high, 1 - theta[places])
-    linear = gradients[np.ix_(rows, places)]
+        low, high = np.maximum(low, -theta[indices]), np.minimum(high, 1 - theta[indices])
+    linear = gradients[np.ix_(rows, indices)]
     if len(rows) == 1:
-        step[places] = np.where(linear[0] > 0, high, np.where(linear[0] < 0, low, 0.0))
+        step[indices] = np.where(linear[0] > 0, high, np.where(linear[0] < 0, low, 0.0))
         return step
     from scipy.optimize import linprog
 
     # In units of the radius and of the largest derivative, which a solver's tolerances suit.
     scale = np.abs(linear).max() * radius
-    least = rho[rows].min()
+    lowest = rho[rows].min()
     solution = linprog(
-        np.append(np.zeros(len(places)), -1.0),
+        np.append(np.zeros(len(indices)), -1.0),
         A_ub=np.hstack([-linear * radius / scale, np.ones((len(rows), 1))]),
-        b_ub=(rho[rows] - least) / scale,
+        b_ub=(rho[rows] - lowest) / scale,
         bounds=[*zip(low / radius, high / radius, strict=True), (None, None)],
     )
     if solution.status == 0:
-        step[places] = np.clip(solution.x[:-1] * radius, low, high)
+        step[indices] = np.clip(solution.x[:-1] * radius, low, high)
     return step

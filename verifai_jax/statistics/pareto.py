@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-_MOST_PAIRS = 2**24
+_MAX_PAIRS = 2**24
 """Comparisons made in one go."""
 
 
@@ -31,10 +31,10 @@ def fronts(points: ArrayLike) -> Int[np.ndarray, " n"]:
     if points.ndim != 2:
         raise ValueError(f"points must have shape [n, objectives]; got {list(points.shape)}")
     numbers = np.full(len(points), -1, np.int64)
-    places = np.flatnonzero(~np.isnan(points).any(axis=1))
+    indices = np.flatnonzero(~np.isnan(points).any(axis=1))
     # Equal points share a front: the distinct ones are enough, and there are often few.
-    distinct, which = np.unique(points[places], axis=0, return_inverse=True)
-    numbers[places] = _fronts_of_distinct(distinct)[which.ravel()]
+    distinct, which = np.unique(points[indices], axis=0, return_inverse=True)
+    numbers[indices] = _fronts_of_distinct(distinct)[which.ravel()]
     return numbers
 
 
@@ -45,12 +45,12 @@ def _fronts_of_distinct(points: Float[np.ndarray, "n objectives"]) -> Int[np.nda
     while len(left):
         some = points[left]
         dominated = np.zeros(len(left), bool)
-        together = max(1, _MOST_PAIRS // max(1, some.size))
+        together = max(1, _MAX_PAIRS // max(1, some.size))
         for begin in range(0, len(left), together):
             part = some[begin : begin + together]
             # Distinct points: nowhere worse means somewhere better, but for the point itself.
-            least = (some[None] <= part[:, None]).all(axis=2).sum(axis=1)
-            dominated[begin : begin + together] = least > 1
+            lowest = (some[None] <= part[:, None]).all(axis=2).sum(axis=1)
+            dominated[begin : begin + together] = lowest > 1
         numbers[left[~dominated]] = front
         left, front = left[dominated], front + 1
     return numbers

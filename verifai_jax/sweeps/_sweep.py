@@ -51,7 +51,7 @@ SCREENING = 64
 """Samples of a policy, and simulations of the attack on it, by which a search or halving chooses.
 
 Certificates take fresh samples."""
-_MOST_BARREN = 64
+_MAX_BARREN = 64
 """Rounds of a search without a new configuration before proposals end."""
 _FOR_TRAINING = 2 / 3
 """Share of `max_seconds` after which no training begins, so that there is time to certify."""
@@ -235,7 +235,7 @@ class _RunningSweep:
 
     def _train_all(self, proposer: Proposer) -> None:
         wanted, barren = self.options["configurations"], 0
-        while len(self.configurations) < wanted and barren < _MOST_BARREN:
+        while len(self.configurations) < wanted and barren < _MAX_BARREN:
             proposals = proposer.propose(wanted - len(self.configurations))
             if not proposals:
                 return
@@ -293,7 +293,7 @@ class _RunningSweep:
                     missing.append((run, rung))
                 else:
                     self.returns[run, rung] = float(arrays["return"])
-        policies = [self._policy(place) for place in missing]
+        policies = [self._policy(entry) for entry in missing]
         task = self.study.trainer.evaluation_task
         if task is None:
             measured: Any = [(list(range(len(missing))), self._training_returns(missing))]
@@ -306,16 +306,16 @@ class _RunningSweep:
                 entries[self._return_name(*missing[i])] = {"return": np.asarray(value, np.float64)}
             self.cache.put(entries)
             self.clock.check()
-        for place in list(self.returns)[before:]:
-            self._notify(place, {"nominal_return": self.returns[place]})
+        for entry in list(self.returns)[before:]:
+            self._notify(entry, {"nominal_return": self.returns[entry]})
 
-    def _training_returns(self, places: Sequence[tuple[int, int]]) -> list[float]:
-        checkpoints = [self.runs.checkpoint(*place) for place in places]
+    def _training_returns(self, entries: Sequence[tuple[int, int]]) -> list[float]:
+        checkpoints = [self.runs.checkpoint(*entry) for entry in entries]
         return [each.training_return for each in checkpoints if each is not None]
 
-    def _notify(self, place: tuple[int, int], values: Mapping[str, float]) -> None:
+    def _notify(self, entry: tuple[int, int], values: Mapping[str, float]) -> None:
         """Call the callbacks with numbers of a policy."""
-        run, rung = place
+        run, rung = entry
         training, checkpoint = self.runs.runs[run], self.runs.checkpoint(run, rung)
         assert checkpoint is not None
         number = next(n for n, one in enumerate(self.configurations) if run in one.runs)
@@ -331,12 +331,12 @@ class _RunningSweep:
     def _return_name(self, run: int, rung: int) -> str:
         return f"return/{self.runs.cache_name(run, rung)}"
 
-    def _is_finite(self, place: tuple[int, int]) -> bool:
-        checkpoint = self.runs.checkpoint(*place)
+    def _is_finite(self, entry: tuple[int, int]) -> bool:
+        checkpoint = self.runs.checkpoint(*entry)
         return checkpoint is not None and checkpoint.finite
 
-    def _policy(self, place: tuple[int, int]) -> TrainedPolicy:
-        checkpoint = self.runs.checkpoint(*place)
+    def _policy(self, entry: tuple[int, int]) -> TrainedPolicy:
+        checkpoint = self.runs.checkpoint(*entry)
         assert checkpoint is not None
         return checkpoint.policy
 
@@ -345,34 +345,34 @@ class _RunningSweep:
     def _halving_objectives(self, by: str, numbers: Sequence[int], rung: int) -> dict[int, float]:
         """Return the objectives of configurations at a checkpoint; NaN where one is unknown."""
         if by == SAFETY:
-            values = self._screen({n: self._places_of(n, rung) for n in numbers})
+            values = self._screen({n: self._entries_of(n, rung) for n in numbers})
             return {n: float("nan") if value is None else value for n, value in values.items()}
         objectives = {}
         for number in numbers:
-            places = self._places_of(number, rung)
-            returns = [self.returns.get(place, np.nan) for place in places]
-            objectives[number] = -float(np.mean(returns)) if places else float("nan")
+            entries = self._entries_of(number, rung)
+            returns = [self.returns.get(entry, np.nan) for entry in entries]
+            objectives[number] = -float(np.mean(returns)) if entries else float("nan")
         return objectives
 
     def _objectives(self, proposals: Sequence[Hyperparameters]) -> list[float | None]:
         """Return the objectives of proposals at the end of their training; None if unknown."""
         numbers = [self.numbers[digest(values)] for values in proposals]
-        places = {}
+        entries = {}
         for number in dict.fromkeys(numbers):
             rung = self.configurations[number].stopped
-            places[number] = self._places_of(number, _LAST if rung is None else rung)
-        values = self._screen(places)
+            entries[number] = self._entries_of(number, _LAST if rung is None else rung)
+        values = self._screen(entries)
         return [values[number] for number in numbers]
 
-    def _places_of(self, number: int, rung: int) -> list[tuple[int, int]]:
+    def _entries_of(self, number: int, rung: int) -> list[tuple[int, int]]:
         """Return the places of a configuration's runs at a checkpoint, or at their last."""
         runs = self.configurations[number].runs
         return [(n, min(rung, self.runs.rungs(n) - 1)) for n in runs]
 
-    def _screen(self, places: dict[int, list[tuple[int, int]]]) -> dict[int, float | None]:
+    def _screen(self, entries: dict[int, list[tuple[int, int]]]) -> dict[int, float | None]:
         """Estimate objectives of configurations by few simulations, never to certify."""
-        finite = [place for group in places.values() for place in group if self._is_finite(place)]
-        returns = [self.returns[place] for place in finite]
+        finite = [entry for group in entries.values() for entry in group if self._is_finite(entry)]
+        returns = [self.returns[entry] for entry in finite]
         if self.return_range is None and returns:
             self.return_range = min(returns), max(returns)
         samples = min(SCREENING, self.options["samples"])
@@ -380,7 +380,7 @@ class _RunningSweep:
         if finite:
             # Other samples than those of the certificates.
             seed = int(np.random.SeedSequence([self.options["seed"], 1]).generate_state(1)[0])
-            policies = [self._policy(place) for place in finite]
+            policies = [self._policy(entry) for entry in finite]
             certificates = self._certify_policies(
                 policies,
                 samples=samples,
@@ -394,48 +394,48 @@ class _RunningSweep:
                 raise KeyboardInterrupt
             safety = dict(zip(finite, certificates.rows, strict=True))
         objectives: dict[int, float | None] = {}
-        for number, group in places.items():
-            values = [self._objective(place, safety.get(place)) for place in group]
-            failed = any(place[0] in self.runs.errors for place in group)
+        for number, group in entries.items():
+            values = [self._objective(entry, safety.get(entry)) for entry in group]
+            failed = any(entry[0] in self.runs.errors for entry in group)
             objectives[number] = None if failed else float(np.mean(values))
         return objectives
 
-    def _objective(self, place: tuple[int, int], safety: Certificate | None) -> float:
+    def _objective(self, entry: tuple[int, int], safety: Certificate | None) -> float:
         if safety is None or self.return_range is None:
             return WORST
         rate, worst = columns_of(safety)["failure_rate"], safety.worst_robustness
-        value = objective(rate, worst, self.returns[place], self.return_range)
+        value = objective(rate, worst, self.returns[entry], self.return_range)
         return WORST if value is None else value
 
     # Certification
 
     def _certify(self) -> Certificates | None:
-        """Certify the finite policies of all rows; None where there are none."""
-        places = [
+        """Certify the finite policies of all rows; None if there are none."""
+        entries = [
             (run, rung)
             for run in self._runs_of(range(len(self.configurations)))
             for rung in range(self.runs.rungs(run))
             if self._is_finite((run, rung))
         ]
-        if not places:
+        if not entries:
             return None
-        total = len(places) * self.options["samples"]
+        total = len(entries) * self.options["samples"]
         with self.clock.stage(CERTIFYING, total, "simulations"):
             # Training may have been out of time before returns were measured.
-            self._measure_returns(list(dict.fromkeys(run for run, _ in places)))
+            self._measure_returns(list(dict.fromkeys(run for run, _ in entries)))
             certificates = self._certify_policies(
-                [self._policy(place) for place in places],
+                [self._policy(entry) for entry in entries],
                 samples=self.options["samples"],
                 budget=self.options["budget"],
                 seed=self.options["seed"],
                 attack_simulations=self.options["attack_simulations"],
                 progress=self.clock.show,
             )
-        self.safety = dict(zip(places, certificates.rows, strict=True))
-        for place, safety in self.safety.items():
+        self.safety = dict(zip(entries, certificates.rows, strict=True))
+        for entry, safety in self.safety.items():
             numbers = columns_of(safety)
             del numbers["failure_rate"], numbers["verdict"]
-            self._notify(place, {"nominal_return": self.returns[place], **numbers})
+            self._notify(entry, {"nominal_return": self.returns[entry], **numbers})
         return certificates
 
     def _certify_policies(self, policies: Sequence[TrainedPolicy], **options: Any) -> Certificates:
@@ -466,8 +466,8 @@ class _RunningSweep:
         for number, configuration in enumerate(self.configurations):
             for run in configuration.runs:
                 for row in self._rows(number, configuration, run):
-                    if row.place in self.safety:
-                        certified[row.place] = len(rows)
+                    if row.entry in self.safety:
+                        certified[row.entry] = len(rows)
                     rows.append(row)
         table = tabulate(rows, self.study)
         return SweepRecord(
@@ -479,7 +479,7 @@ class _RunningSweep:
             worst=table.worst,
             curves=table.curves,
             certificates=certificates,
-            certified=tuple(certified[place] for place in self.safety),
+            certified=tuple(certified[entry] for entry in self.safety),
             options=self.options,
             version=__version__,
             seconds=dict(self.clock.seconds),
@@ -502,7 +502,7 @@ class _RunningSweep:
                     steps=steps,
                     values=configuration.values,
                     status=status if checkpoint.finite else NONFINITE,
-                    place=(run, rung),
+                    entry=(run, rung),
                     checkpoint=checkpoint,
                     nominal_return=self.returns.get((run, rung), float("nan")),
                     safety=self.safety.get((run, rung)),
@@ -516,7 +516,7 @@ class _RunningSweep:
                     steps=training.checkpoints[-1],
                     values=configuration.values,
                     status=error_status(self.runs.errors[run]),
-                    place=(run, -1),
+                    entry=(run, -1),
                 )
             )
         return rows

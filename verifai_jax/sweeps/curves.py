@@ -89,7 +89,7 @@ def curve_robustness(
     **Arguments:**
 
     - `formula`: over the signal `return`, bounds in environment steps from 0 on, rounded down to
-      whole updates. Behind the end of the curve its last value stays.
+      whole updates. After the end of the curve its last value stays.
     - `steps`, `mean_return`: the curve, as in `curve_trace`.
 
     **Returns:** the robustness in units of the return; NaN where no episode ended.

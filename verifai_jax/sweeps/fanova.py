@@ -14,7 +14,7 @@ from jaxtyping import Float
 if TYPE_CHECKING:
     from sklearn.ensemble import ExtraTreesRegressor
 
-_MOST_ENTRIES = 2**22
+_MAX_ENTRIES = 2**22
 """Pairs of boxes times inputs in one block of memory."""
 
 
@@ -89,7 +89,7 @@ def variance_shares(boxes: Boxes) -> Shares:
     without = np.stack([np.delete(width, j, axis=1).prod(axis=1) for j in range(dimensions)], 1)
     # Second moments of the function given all inputs, given one, and given all but one.
     everything, alone, others = 0.0, np.zeros(dimensions), np.zeros(dimensions)
-    together = max(1, _MOST_ENTRIES // max(1, count * dimensions))
+    together = max(1, _MAX_ENTRIES // max(1, count * dimensions))
     for begin in range(0, count, together):
         part = slice(begin, begin + together)
         overlap = np.minimum(high[part, None], high[None]) - np.maximum(low[part, None], low[None])

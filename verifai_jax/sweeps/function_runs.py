@@ -96,7 +96,7 @@ class FunctionRuns(TrainingRuns):
     def forget(self, numbers: Sequence[int]) -> None:
         """Delete the folders of trainings that do not continue."""
         for number in numbers:
-            shutil.rmtree(self._place(number), ignore_errors=True)
+            shutil.rmtree(self._folder_of(number), ignore_errors=True)
 
     def _call(self, numbers: list[int], at: int) -> None:
         """Call the function for each of these, at most as many at a time as there are workers."""
@@ -108,8 +108,8 @@ class FunctionRuns(TrainingRuns):
         seeds = [self.runs[number].seed for number in numbers]
         train = partial(train_once, self._trainer.train, self._trainer.observation)
 
-        def ended(place: int, result: "Arrays | str") -> None:
-            number = numbers[place]
+        def ended(index: int, result: "Arrays | str") -> None:
+            number = numbers[index]
             if isinstance(result, str):
                 self.errors[number] = one_line(result)
             else:
@@ -123,32 +123,32 @@ class FunctionRuns(TrainingRuns):
             return
         workers = min(self._trainer.workers or available_cores(), len(calls))
         pool = Pool(train, self._trainer.train, workers, None, retries=0, fresh=True)
-        for place, outcome in pool.outcomes(calls, seeds):
+        for index, outcome in pool.outcomes(calls, seeds):
             made = cast("Arrays", outcome.trace)
-            ended(place, made if outcome.status == Status.OK else outcome.message)
+            ended(index, made if outcome.status == Status.OK else outcome.message)
 
     def _begin(self, number: int, at: int) -> Path:
         """Make the folder of a call, with what the call before it left."""
-        folder = self._place(number, at).with_suffix(".part")
+        folder = self._folder_of(number, at).with_suffix(".part")
         shutil.rmtree(folder, ignore_errors=True)
-        if at and self._place(number, at - 1).exists():
-            shutil.copytree(self._place(number, at - 1), folder)
+        if at and self._folder_of(number, at - 1).exists():
+            shutil.copytree(self._folder_of(number, at - 1), folder)
         else:
             folder.mkdir(parents=True)
         return folder
 
     def _end(self, number: int, at: int, arrays: Arrays) -> None:
         """Store a finished call, and then let go of the one before it."""
-        folder = self._place(number, at)
+        folder = self._folder_of(number, at)
         shutil.rmtree(folder, ignore_errors=True)
         folder.with_suffix(".part").rename(folder)
         self.cache.put({self.cache_name(number, at): arrays})
         self._set_checkpoint(number, at, arrays)
         if at:
-            shutil.rmtree(self._place(number, at - 1), ignore_errors=True)
+            shutil.rmtree(self._folder_of(number, at - 1), ignore_errors=True)
         self._advanced(number, at)
 
-    def _place(self, number: int, at: int | None = None) -> Path:
+    def _folder_of(self, number: int, at: int | None = None) -> Path:
         run = self.runs[number]
         folder = self._folder / f"{run.key}-{run.seed}"
         return folder if at is None else folder / str(run.checkpoints[at])

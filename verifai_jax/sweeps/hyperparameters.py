@@ -17,7 +17,7 @@ from verifai_jax.features.domain import Domain
 Hyperparameters: TypeAlias = dict[str, Any]
 """Plain Python values of hyper-parameters, by name."""
 
-_MOST_PROBES = 64
+_MAX_PROBES = 64
 """Choices of a domain up to which each is checked; only the ends of larger ones are."""
 _COMPANIONS = 16
 """Points of the space at which a value is tried before it is refused."""
@@ -60,11 +60,11 @@ def probe_values(domain: Domain) -> list[tuple[Any, str]]:
     if not domain.columns("value"):
         return [(domain.held_at, "the value")]
     if (tuning := domain.tuning) is not None:
-        if 0 < len(tuning.choices) <= _MOST_PROBES:
+        if 0 < len(tuning.choices) <= _MAX_PROBES:
             return [(choice, "a choice") for choice in tuning.choices]
         if not tuning.choices:
             low, high = tuning.low, tuning.high
-            few = tuning.scale == "integer" and np.ndim(low) == 0 and high - low < _MOST_PROBES
+            few = tuning.scale == "integer" and np.ndim(low) == 0 and high - low < _MAX_PROBES
             inner = [(value, "a value") for value in range(low + 1, high)] if few else []
             return [(low, "the lower end"), *inner, (high, "the upper end")]
     space = FeatureSpace({"value": domain})

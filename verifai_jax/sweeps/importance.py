@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.text import format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.statistics.confidence_sequences import verdict_kind
@@ -39,21 +39,21 @@ if TYPE_CHECKING:
 
 TARGETS = {"failure_rate": "failing", "nominal_return": "return"}
 """Columns that are explained, with their names in the summary."""
-FEWEST = 10
+MIN_ROWS_TO_LEARN = 10
 """Configurations below which nothing is learned."""
-FEWEST_ROWS = 5
+MIN_ROWS = 5
 """Configurations of a verdict below which they have no principal components."""
 FOLDS = 5
 """Folds of the cross-validation."""
 TREES = 40
 """Trees of the forest."""
-LEAST = 0.2
+MIN_SCORE = 0.2
 """R^2 on held-out configurations below which importances mean nothing."""
-LEAST_LOSS = 0.02
+MIN_LOSS = 0.02
 """Loss of R^2 below which the summary does not name a hyper-parameter."""
-MOST_NAMED = 5
+MAX_NAMED = 5
 """Hyper-parameters that the summary names, at most."""
-MOST_CELLS = 8
+MAX_CELLS = 8
 """Different numbers in a column of an unknown domain up to which they count as choices."""
 
 
@@ -87,7 +87,7 @@ class HyperparameterImportance:
 
     def is_reliable(self, target: str) -> bool:
         """Check that the model of `"failure_rate"` or `"nominal_return"` predicts at all."""
-        return self.scores.get(target, -np.inf) >= LEAST
+        return self.scores.get(target, -np.inf) >= MIN_SCORE
 
     @property
     def ranking(self) -> list[str]:
@@ -107,7 +107,7 @@ class HyperparameterImportance:
         """
         if not self.scores:
             raise ValueError(f"there is nothing to draw: {'; '.join(self._lines())}")
-        return late("verifai_jax.plotting.sweep", "plot_importance")(self, path)
+        return lazy_import("verifai_jax.plotting.sweep", "plot_importance")(self, path)
 
     def __repr__(self) -> str:
         return str(self)
@@ -129,11 +129,11 @@ class HyperparameterImportance:
                 )
                 continue
             losses = self.table[target].to_numpy(float)
-            order = [j for j in np.argsort(-losses, kind="stable") if losses[j] >= LEAST_LOSS]
+            order = [j for j in np.argsort(-losses, kind="stable") if losses[j] >= MIN_LOSS]
             shares = self.table[f"{target}_total"].to_numpy(float)
             listed = ", ".join(
                 f"{self.table.index[j]} ({format_percent(float(shares[j]))} of the variance)"
-                for j in order[:MOST_NAMED]
+                for j in order[:MAX_NAMED]
             )
             lines.append(f"{what} depends on {listed or 'no single one'}; {score}")
         lines += self._directions()
@@ -145,7 +145,7 @@ class HyperparameterImportance:
         trends = trends.loc[trends.abs() > self.chance[target]]
         if not len(trends):
             return "no single one correlates with it beyond chance"
-        order = trends.abs().sort_values(ascending=False).index[:MOST_NAMED]
+        order = trends.abs().sort_values(ascending=False).index[:MAX_NAMED]
         listed = ", ".join(f"{name} ({trends[name]:+z.2f})" for name in order)
         return f"its rank correlations beyond chance: {listed}"
 
@@ -235,7 +235,7 @@ def hyperparameter_importance(
         columns |= {f"{target}_first": shares.first, f"{target}_total": shares.total}
     importances = pd.DataFrame(columns, index=pd.Index([one.name for one in inputs], name="name"))
     if scores:
-        by = max(scores, key=lambda target: (scores[target] >= LEAST, target == "failure_rate"))
+        by = max(scores, key=lambda target: (scores[target] >= MIN_SCORE, target == "failure_rate"))
         importances = importances.sort_values(by, ascending=False, kind="stable")
     unsafe, safe = (_components(table, inputs, kind) for kind in ("counterexamples", "safe"))
     return HyperparameterImportance(
@@ -248,9 +248,9 @@ def _unlearnable(values: np.ndarray, groups: np.ndarray, inputs: int) -> str:
     count = len(np.unique(groups))
     if not inputs:
         return "no hyper-parameter varies"
-    if count < FEWEST:
+    if count < MIN_ROWS_TO_LEARN:
         some = f"{count} configuration{'s' * (count != 1)}" if count else "no configuration"
-        return f"{some} with a verdict, too few to learn from (at least {FEWEST})"
+        return f"{some} with a verdict, too few to learn from (at least {MIN_ROWS_TO_LEARN})"
     if np.ptp(values) == 0:
         return f"it is {values[0]:z.4g} for every policy"
     return ""
@@ -317,16 +317,16 @@ def _inputs(
         domain = None if name == "steps" else domains.get(name)
         if domain is not None and domain.size == 1:
             present = entries.dropna().unique().tolist()
-            place = {
+            index = {
                 entry: float(domain.to_unit(domain.from_columns({name: entry}, name))[0])
                 for entry in present
             }
-            values = entries.map(place).to_numpy(np.float64)
+            values = entries.map(index).to_numpy(np.float64)
             levels, weights = domain.levels[0], domain.weights[0]
             edges = np.linspace(0, 1, levels + 1) if levels else None
             if weights is not None:
                 edges = np.concatenate([[0.0], np.cumsum(weights)])
-        elif number and entries.nunique() > MOST_CELLS:
+        elif number and entries.nunique() > MAX_CELLS:
             real = entries.to_numpy(np.float64)
             values, edges = (real - np.nanmin(real)) / np.ptp(real[~np.isnan(real)]), None
         else:
@@ -361,6 +361,6 @@ def _components(
     frame = frame.sort_values("violated", kind="stable")
     frame = frame.drop_duplicates("configuration", keep="last").drop(columns="configuration")
     selected = frame["violated"] == (which == "counterexamples")
-    if int(selected.sum()) < FEWEST_ROWS or not ordered:
+    if int(selected.sum()) < MIN_ROWS or not ordered:
         return None
     return pca(frame, which=which, columns=[one.name for one in ordered], scale="raw")

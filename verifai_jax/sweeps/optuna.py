@@ -32,7 +32,7 @@ _SAMPLERS = {
     "qmc": "QMCSampler",
 }
 """Classes of Optuna's samplers, by the names that are used here."""
-_MOST_REFUSED = 1000
+_MAX_REFUSED = 1000
 """Trials in a row that the constraint may refuse before proposals end."""
 
 
@@ -111,10 +111,10 @@ class OptunaProposer:
             optuna.logging.set_verbosity(before)
         self._trials: list[Trial] = []
 
-    def propose(self, most: int) -> list[Hyperparameters]:
+    def propose(self, maximum: int) -> list[Hyperparameters]:
         """Return the next configurations; see `Proposer`."""
         self._trials, proposals, refused = [], [], 0
-        while len(proposals) < min(most, self.batch) and refused < _MOST_REFUSED:
+        while len(proposals) < min(maximum, self.batch) and refused < _MAX_REFUSED:
             trial = self._study.ask(self._distributions)
             values, accepted = _values(self.space, trial.params)
             if accepted:

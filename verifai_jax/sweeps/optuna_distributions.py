@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def optuna_distribution(domain: Domain | None) -> "BaseDistribution | None":
-    """Return Optuna's distribution for a domain; None where Optuna has no such distribution.
+    """Return Optuna's distribution for a domain; None if Optuna has no such distribution.
 
     **Raises:** `MissingExtra` without Optuna.
     """

@@ -2,7 +2,7 @@
 
     proposer = make_proposer("bayes", space, configurations=64, seed=0)
     values = proposer.propose(8)                        # dictionaries of plain values, 8 at most
-    proposer.observe([0.02, None, ...])                 # their objective; None where it is unknown
+    proposer.observe([0.02, None, ...])                 # their objective; None if it is unknown
 
 Proposers look for the least `objective`: failure rate first, then worst robustness, then return.
 """
@@ -41,12 +41,12 @@ class Proposer(Protocol):
     learns: bool
     batch: int
 
-    def propose(self, most: int) -> list[Hyperparameters]:
-        """Return the next configurations, at most `most` and `batch`; none at the end."""
+    def propose(self, maximum: int) -> list[Hyperparameters]:
+        """Return the next configurations, at most `maximum` and `batch`; none at the end."""
         ...
 
     def observe(self, objectives: Sequence[float | None]) -> None:
-        """Record the objectives of the last proposals, one by one; None where one is unknown."""
+        """Record the objectives of the last proposals, one by one; None if one is unknown."""
         ...
 
     def to_json(self) -> object:
@@ -111,15 +111,15 @@ class SearchProposer:
         self._proposals = Proposals(search, space.cube, batch, run_keys(seed)[0], space.constraint)
         self._count = 0
 
-    def propose(self, most: int) -> list[Hyperparameters]:
+    def propose(self, maximum: int) -> list[Hyperparameters]:
         """Return the next configurations; see `Proposer`."""
         if self._proposals.exhausted:
             self._count = 0
             return []
-        points = np.asarray(self._proposals.next(min(most, self.batch)))
+        points = np.asarray(self._proposals.next(min(maximum, self.batch)))
         # A search that learns gives whole rounds, also where fewer are wanted at the end.
         self._count = len(points)
-        return values_at(self.space, points)[:most]
+        return values_at(self.space, points)[:maximum]
 
     def observe(self, objectives: Sequence[float | None]) -> None:
         """Record the objectives of the last proposals; see `Proposer`."""
@@ -150,7 +150,7 @@ def objective(
     - `nominal_return`: mean return on the nominal task.
     - `return_range`: least and greatest nominal return of the first round.
 
-    **Returns:** the objective; None where the failure rate is not known.
+    **Returns:** the objective; None if the failure rate is not known.
     """
     if not math.isfinite(failure_rate):
         return None

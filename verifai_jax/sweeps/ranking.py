@@ -74,12 +74,12 @@ def group_by_configuration(table: "pd.DataFrame", hyperparameters: Sequence[str]
     import pandas as pd
 
     names = [name for name in hyperparameters if name != "steps"]
-    place = {int(i): rank for rank, i in enumerate(table.index[preference_order(table)])}
+    rank_of = {int(i): rank for rank, i in enumerate(table.index[preference_order(table)])}
     rows: list[dict[str, Any]] = []
     for number, part in table.groupby("configuration", sort=True):
         last = last_checkpoints(part)
-        ranked = [int(i) for i in part.index if int(i) in place]
-        best = min(ranked, key=place.__getitem__, default=-1)
+        ranked = [int(i) for i in part.index if int(i) in rank_of]
+        best = min(ranked, key=rank_of.__getitem__, default=-1)
         rows.append(
             {
                 "configuration": number,

@@ -70,18 +70,18 @@ class SweepRecord:
     - `columns`: the table, name -> column `[rows]`, in order: `BEFORE`, the hyper-parameters,
       `AFTER`. Unknown numbers are NaN, unknown texts empty. `steps` are the wanted ones.
     - `hyperparameters`: columns that the space of the study gave; `steps` is that of `BEFORE`.
-    - `policies`: of each row, on the host; None where there is none.
+    - `policies`: of each row, on the host; None if there is none.
     - `worst`: features of each row with the least robustness, as `space.rows` writes them; None
       where nothing was simulated.
     - `curves`: learning curve of each training run, by `(configuration, seed)`.
-    - `certificates`: result of the certification; None where nothing was certified.
+    - `certificates`: result of the certification; None if nothing was certified.
     - `certified`: rows of the certified policies, in the order of the certification.
     - `options`: options of the sweep, plain data.
     - `version`: of verifai_jax.
     - `seconds`: wall-clock time of each stage, such as `training` and `certifying`.
     - `complete`: False where the sweep was interrupted or out of time.
     - `sources`: what the study was made of when the sweep began, and again where it went on with
-      another one, as a run records it; empty where that is not recorded.
+      another one, as a run records it; empty if that is not recorded.
     """
 
     study: str

@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.figure import Drawn
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.sources import Change, list_changes
 from verifai_jax.core.targets import load_target
 from verifai_jax.core.trace import Trace
@@ -58,11 +58,11 @@ class Sweep(Drawn):
 
     - `record`: everything that was trained and certified, as plain data.
     - `study`: the study that was swept; None for a loaded sweep without it.
-    - `space`: of the hyper-parameters; the study's if left out, None where it is not known.
+    - `space`: of the hyper-parameters; the study's if left out, None if it is not known.
     - `folder`: place on disk of a loaded sweep.
     - `failing`: counterexamples of each row of a loaded sweep, by its number; others have
       certificates.
-    - `used`: names of the hyper-parameters of each algorithm; empty where all have all.
+    - `used`: names of the hyper-parameters of each algorithm; empty if all have all.
     - `reuse`: how much was cached before: by kind of work (`"train"`, `"return"`, `"certify"`) the
       number of entries that were, and of all; empty for a loaded sweep.
     """
@@ -369,7 +369,7 @@ class Sweep(Drawn):
 
         **Returns:** the path.
         """
-        return late("verifai_jax.reports", "write_report")(self, path, **options)
+        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
 
     def save(self, folder: str | Path) -> Path:
         """Write the sweep to a folder: table, policies, curves, record.

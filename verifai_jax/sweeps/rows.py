@@ -24,10 +24,10 @@ class Row:
     - `configuration`, `seed`, `steps`: number of the configuration, training seed, checkpoint.
     - `values`: hyper-parameters.
     - `status`: see `record`.
-    - `place`: numbers of the training run and of its checkpoint.
-    - `checkpoint`: the run there; None where it did not train.
+    - `entry`: numbers of the training run and of its checkpoint.
+    - `checkpoint`: the run there; None if it did not train.
     - `nominal_return`: mean return on the nominal task; NaN where it is not known.
-    - `safety`: of the policy; None where it was not certified.
+    - `safety`: of the policy; None if it was not certified.
     """
 
     configuration: int
@@ -35,7 +35,7 @@ class Row:
     steps: int
     values: Mapping[str, object]
     status: str
-    place: tuple[int, int]
+    entry: tuple[int, int]
     checkpoint: RunCheckpoint | None = None
     nominal_return: float = float("nan")
     safety: Certificate | None = None

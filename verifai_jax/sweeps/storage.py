@@ -56,7 +56,7 @@ class StoredSweep(NamedTuple):
 
     - `record`: table, policies, curves and options; without certificates once it was read.
     - `space`: of the hyper-parameters, where it is known.
-    - `used`: names of the hyper-parameters of each algorithm; empty where all have all.
+    - `used`: names of the hyper-parameters of each algorithm; empty if all have all.
     - `failing`: counterexamples of all rows, with a column `row`.
     """
 

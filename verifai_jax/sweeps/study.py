@@ -130,12 +130,14 @@ class Study:
         """
         self.trainer.check(self.space)
         self.space.check_where()
-        most = self.trainer.steps
+        maximum = self.trainer.steps
         if STEPS in self.space.domains:
-            most = max(int(value) for value, _ in probe_values(self.space.domains[STEPS]))
-        late = [at for at in self.checkpoints if at > most]
-        if late:
-            raise StudyError(f"checkpoints must lie between 1 and steps = {most}; got {late[0]}")
+            maximum = max(int(value) for value, _ in probe_values(self.space.domains[STEPS]))
+        beyond = [at for at in self.checkpoints if at > maximum]
+        if beyond:
+            raise StudyError(
+                f"checkpoints must lie between 1 and steps = {maximum}; got {beyond[0]}"
+            )
         for name in self.algorithms:
             problem = self._problem_of(name)
             try:

@@ -26,7 +26,7 @@ from verifai_jax.sweeps.record import SweepRecord, algorithm_uses, error_message
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST_ROWS = 8
+MAX_ROWS = 8
 """Rows that a notebook shows."""
 _VIEWS = ".table .safe .best .configurations .pareto() .importance() .plot() .problem(row)"
 """Views of the result that the summary points to."""
@@ -35,7 +35,7 @@ _WORK = {
     "return": "nominal return",
     "certify": "block of simulations",
 }
-"""Kinds of cached work, in words."""
+"""What each kind of cached work is called in a summary."""
 _CSS = {"safe": "#3a9e7d", "unsafe": "#d1495b"}
 """Colours of verdicts in a notebook, those of the pictures; others are grey."""
 
@@ -46,7 +46,7 @@ class Findings(NamedTuple):
     - `record`: the record of the sweep.
     - `table`: one row for each policy.
     - `configurations`: one row for each configuration.
-    - `used`: names of the hyper-parameters of each algorithm; empty where all have all.
+    - `used`: names of the hyper-parameters of each algorithm; empty if all have all.
     - `p`: failure probability below which a policy is safe, where it is known.
     - `reuse`: entries that were cached before, and all, by kind of work.
     """
@@ -153,7 +153,7 @@ def format_hyperparameters(findings: Findings, row: Mapping[str, Any]) -> str:
 def format_html(findings: Findings) -> str:
     """Write the headline, the first rows to choose from, and the summary to unfold."""
     record, table = findings.record, findings.table
-    rows = table.iloc[preference_order(table)[:MOST_ROWS]]
+    rows = table.iloc[preference_order(table)[:MAX_ROWS]]
     names = [name for name in record.hyperparameters if name != "steps"]
     heads = ["row", "verdict", "P(fail)", "nominal return", "steps", *names]
     entries: Any = rows.to_dict("records")

@@ -274,7 +274,7 @@ class Trainer:
                 {ALGORITHM: algorithm, name: None}
             ):
                 continue
-            for value, place in probe_values(domain):
+            for value, part in probe_values(domain):
                 refused = None
                 # A value that only some of the others exclude becomes an error of its row.
                 for others in candidates:
@@ -287,7 +287,7 @@ class Trainer:
                         refused = None
                         break
                 if refused is not None:
-                    raise StudyError(f"{name}: {refused}, {place} of {domain!r}") from refused
+                    raise StudyError(f"{name}: {refused}, {part} of {domain!r}") from refused
         for others in candidates:
             try:
                 self.configuration({**others, ALGORITHM: algorithm}).check()

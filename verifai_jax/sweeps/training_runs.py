@@ -66,7 +66,7 @@ class TrainingRun:
     - `seed`: training seed.
     - `key`: digest of the hyper-parameters that the algorithm uses; part of the cache's names.
     - `checkpoints`: environment steps of its rows.
-    - `configuration`: task and algorithm with these values; None where they cannot train.
+    - `configuration`: task and algorithm with these values; None if they cannot train.
     - `error`: the reason for that, in one line.
     """
 
@@ -131,7 +131,7 @@ class TrainingRuns:
         return len(self.runs[number].checkpoints)
 
     def checkpoint(self, number: int, rung: int) -> RunCheckpoint | None:
-        """Return a run at a checkpoint; None where it has not trained so far."""
+        """Return a run at a checkpoint; None if it has not trained so far."""
         return self._checkpoints.get((number, rung))
 
     def structure(self, number: int) -> Hashable:
@@ -162,8 +162,8 @@ class TrainingRuns:
             if (number, last) in self._checkpoints:
                 self.clock.advance(self._steps(number, last))
             else:
-                place = (id(self._batches[number][0]), self.structure(number))
-                waiting.setdefault(place, []).append(number)
+                key = (id(self._batches[number][0]), self.structure(number))
+                waiting.setdefault(key, []).append(number)
         if self._executor is not None:
             self._train_on_workers(list(waiting.values()), rung)
             return
@@ -179,8 +179,8 @@ class TrainingRuns:
         """Delete the states of runs that do not continue."""
         for number in numbers:
             if number in self._batches:
-                batch, place = self._batches[number]
-                batch.discard(place)
+                batch, index = self._batches[number]
+                batch.discard(index)
 
     def _assign_batches(self) -> None:
         """Put the runs of a new round into one batch, in which they stay until they are done."""
@@ -188,7 +188,7 @@ class TrainingRuns:
         trainable = [(n, c) for n in fresh if (c := self.runs[n].configuration) is not None]
         if trainable:
             batch = BatchedTraining([configuration for _, configuration in trainable])
-            self._batches.update({n: (batch, place) for place, (n, _) in enumerate(trainable)})
+            self._batches.update({n: (batch, index) for index, (n, _) in enumerate(trainable)})
 
     def _train_on_workers(self, groups: list[list[int]], rung: int) -> None:
         """Train runs on the workers of the executor, each from its beginning; caches each."""
@@ -205,8 +205,8 @@ class TrainingRuns:
                 work.append((dict(run.values), run.seed, run.checkpoints[: rung + 1]))
             futures.append(self._executor.submit(train_block, self._shipment, work))
 
-        def ended(place: int, results: list[list[Arrays] | str]) -> None:
-            for number, result in zip(blocks[place], results, strict=True):
+        def ended(index: int, results: list[list[Arrays] | str]) -> None:
+            for number, result in zip(blocks[index], results, strict=True):
                 if isinstance(result, str):
                     self.errors[number] = result
                     continue
@@ -247,14 +247,14 @@ class TrainingRuns:
             here = [n for n in numbers if at < self.rungs(n) and (n, at) not in self._checkpoints]
             targets = {self._batches[n][1]: self.runs[n].checkpoints[at] for n in here}
             began, busy = time.perf_counter(), 0.0
-            for place in batch.advance(targets):
-                number = number_of[place]
-                policy, curve = batch.policy(place), Curve(*batch.curve(place))
-                arrays = _encode(policy, curve, batch.seconds(place))
+            for index in batch.advance(targets):
+                number = number_of[index]
+                policy, curve = batch.policy(index), Curve(*batch.curve(index))
+                arrays = _encode(policy, curve, batch.seconds(index))
                 self.cache.put({self.cache_name(number, at): arrays})
                 self._set_checkpoint(number, at, arrays)
                 before = self._checkpoints.get((number, at - 1))
-                share = batch.seconds(place) - (before.seconds if before else 0.0)
+                share = batch.seconds(index) - (before.seconds if before else 0.0)
                 busy += share / len(batch.devices)
                 self.clock.advance(self._steps(number, at) - self._steps(number, at - 1))
             self.clock.count_compilation(time.perf_counter() - began - busy)

@@ -27,8 +27,8 @@ from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.validation import check_options, usual_batch
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
-from verifai_jax.statistics.least_distance import least_change
 from verifai_jax.statistics.max_min import max_min_step
+from verifai_jax.statistics.smallest_change import smallest_change
 from verifai_jax.synthesis._synthesize import (
     ATTACK,
     attack_search,
@@ -38,7 +38,7 @@ from verifai_jax.synthesis._synthesize import (
 from verifai_jax.synthesis.adversary import attack
 from verifai_jax.synthesis.held_out import held_out
 from verifai_jax.synthesis.optimize import (
-    LEAST_BATCH,
+    MIN_BATCH,
     Archive,
     Choice,
     climb,
@@ -101,7 +101,7 @@ def repair(
       changing the backend.
     - `max_seconds`: wall-clock seconds, of which a fifth is kept for the check.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-    - the others as in `falsify`.
+    - all other arguments: as in `falsify`.
 
     **Returns:** a `Repair`; after Ctrl-C what is finished, without the check.
 
@@ -144,8 +144,8 @@ def repair(
     if stopped != "interrupted" and held_out:
         before, after = _check(loop, start, work.now.theta, held_out, margin, seed, checking)
     robustness = work.robustness
-    if after is not None and after.least is not None:
-        robustness = min(robustness, after.least)
+    if after is not None and after.lowest is not None:
+        robustness = min(robustness, after.lowest)
     theta = work.now.theta
     return Repair(
         name=whole.name,
@@ -267,7 +267,7 @@ class _Repair:
         self.margin, self.seed = margin, seed
         self.rng = np.random.default_rng((seed, 2))
         # An attack that finds nothing costs a tenth of the budget; one that does costs less.
-        self.share = min(ATTACK, max(64, limits.most // 10))
+        self.share = min(ATTACK, max(64, limits.maximum // 10))
         self.batch = min(128, usual_batch(search, self.share))
         self.environments = np.zeros((0, loop.environment.dim), np.float32)
         self.now = Choice(start, np.inf, 0)
@@ -361,7 +361,7 @@ class _Repair:
         # What was near and what was robust in the old set may still be in this one.
         old = self.archive.best(4, self.merit) + self.archive.best(8, value_merit, apart=0.05)
         self.archive = archive = Archive()
-        if self.limits.left < LEAST_BATCH * len(self.environments):
+        if self.limits.left < MIN_BATCH * len(self.environments):
             self.archive, self.stopped = archive, self.limits.stopped_by
             return False
         starts = np.stack([self.start, self.now.theta, *(choice.theta for choice in old)])
@@ -390,7 +390,7 @@ class _Repair:
         self.robustness = best.value
         if best.value >= self.enough:
             return True
-        if self.limits.left < LEAST_BATCH * len(self.environments):
+        if self.limits.left < MIN_BATCH * len(self.environments):
             self.stopped = self.limits.stopped_by
             return False
         self.stopped = "no parameters"
@@ -412,7 +412,7 @@ class _Repair:
         self, theta: np.ndarray, rho: np.ndarray, gradients: np.ndarray, radius: float
     ) -> list[np.ndarray]:
         loop = self.loop
-        step = least_change(
+        step = smallest_change(
             theta, self.start, rho, gradients, self.aim, free=loop.free, bounded=loop.bounded
         )
         steps = [] if step is None else [step * share for share in (1.0, 0.5, 0.2, 0.05)]
@@ -433,7 +433,7 @@ class _Repair:
 
     def without_gradients(self, archive: Archive) -> Choice:
         """Search by cross-entropy, over the whole space where nothing is known, then nearer."""
-        limits = self.limits.slice(max(self.limits.most // 8, self.limits.left // 8))
+        limits = self.limits.slice(max(self.limits.maximum // 8, self.limits.left // 8))
         if archive.best(1, self.merit)[0].value < self.enough:
             explore(
                 self.loop, self.environments, archive, limits.slice(limits.left // 2),
@@ -460,11 +460,11 @@ class _Repair:
             low, high = 0.0, 1.0  # Shares of the way that are kept: `high` is known to be enough.
             for _ in range(3):
                 shares = low + (high - low) * np.arange(8) / 8
-                ways = [np.where(block, self.start + s * (theta - self.start), theta)
+                fractions = [np.where(block, self.start + s * (theta - self.start), theta)
                         for s in shares]  # fmt: skip
-                if limits.left < len(ways) * len(self.environments) or high - low < 1e-3:
+                if limits.left < len(fractions) * len(self.environments) or high - low < 1e-3:
                     return
-                values = evaluate(self.loop, ways, self.environments, archive)
+                values = evaluate(self.loop, fractions, self.environments, archive)
                 good = values >= self.enough
                 # Nearest above which all are good, so that it is not an island.
                 upper = len(good) - int(np.argmin(np.append(good[::-1], False)))

@@ -102,7 +102,7 @@ def synthesize(
     - `batch`: simulations at once.
     - `max_seconds`: wall-clock seconds, of which a fifth is kept for the check.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-    - the others as in `falsify`.
+    - all other arguments: as in `falsify`.
 
     **Returns:** a `Synthesis`; after Ctrl-C what is finished, without the check.
 
@@ -138,8 +138,8 @@ def synthesize(
         and (loop.environment is not None or depends_on_key(problem))
     ):
         checked = _check(loop, best.theta, held_out, margin, seed, checking)
-    if checked is not None and checked.least is not None:
-        robustness = min(robustness, checked.least)
+    if checked is not None and checked.lowest is not None:
+        robustness = min(robustness, checked.lowest)
     return Synthesis(
         problem=problem,
         parameters=loop.values(best.theta),
@@ -191,7 +191,7 @@ class _Synthesis:
         self.loop, self.search, self.limits, self.seed = loop, search, limits, seed
         self.margin = margin
         # One shape for all attacks: a twentieth of what one may cost.
-        self.batch = min(128, usual_batch(search, max(256, limits.most // 4)))
+        self.batch = min(128, usual_batch(search, max(256, limits.maximum // 4)))
         self.archive = Archive()
         self.rng = np.random.default_rng((seed, 2))
         self.scale = 1.0
@@ -225,8 +225,8 @@ class _Synthesis:
         """Choose parameters and attack them in turn."""
         total = self.limits.left
         alone = self.loop.environment is None
-        most = EXPLORED if alone else 1000 * len(self.environments)
-        first = self.limits.slice(min(most, int((0.5 if alone else 0.15) * total)))
+        maximum = EXPLORED if alone else 1000 * len(self.environments)
+        first = self.limits.slice(min(maximum, int((0.5 if alone else 0.15) * total)))
         explore(
             self.loop, self.environments, self.archive, first,
             merit=value_merit, batch=CANDIDATES, rng=self.rng,
@@ -262,7 +262,7 @@ class _Synthesis:
             self.attacked.append(choice._replace(value=worst))
             if not result.violating.any():
                 # What a handful of simulations does not find says nothing.
-                thorough = len(result.rho) >= min(ATTACK // 2, max(32, self.limits.most // 20))
+                thorough = len(result.rho) >= min(ATTACK // 2, max(32, self.limits.maximum // 20))
                 self.stopped = "converged" if thorough else self.limits.stopped_by
                 return
             self.extend(result.select(ADDED))
@@ -339,7 +339,7 @@ class _Synthesis:
         thetas: dict[bytes, Any] = {}
         for choice in pool.best(len(pool.choices), value_merit):
             thetas.setdefault(choice.theta.tobytes(), choice)
-        affordable = max(0, self.limits.most - self.loop.simulations) // len(self.environments)
+        affordable = max(0, self.limits.maximum - self.loop.simulations) // len(self.environments)
         chosen = list(thetas.values())[: min(CANDIDATES, affordable)]
         if not chosen:
             return

@@ -18,11 +18,11 @@ from verifai_jax.search.proposals import Proposals
 from verifai_jax.synthesis.parametric import Pairs, Parametric
 from verifai_jax.synthesis.region import Region
 
-MOST_FOLLOWED = 4
+MAX_FOLLOWED = 4
 """Environments that are followed downhill."""
 DESCENT = 4
 """Steps of a descent at most."""
-MOST_DIFFERENCES = 12
+MAX_DIFFERENCES = 12
 """Coordinates up to which differences take the place of gradients."""
 GAP = 0.01
 """Length of a difference, in unit coordinates."""
@@ -46,16 +46,16 @@ class Attack(NamedTuple):
         """Least robustness with a verdict; infinite if there is none."""
         return float(np.nanmin(self.rho, initial=np.inf))
 
-    def select(self, most: int) -> Float[np.ndarray, "k d"]:
+    def select(self, maximum: int) -> Float[np.ndarray, "k d"]:
         """Select the worst violating environment, and those of the worst half farthest apart."""
-        places = np.flatnonzero(self.violating)
-        places = places[np.argsort(self.rho[places], kind="stable")]
-        places = places[: max(most, (len(places) + 1) // 2)]
-        points = self.environments[places]
-        if len(points) <= most:
+        indices = np.flatnonzero(self.violating)
+        indices = indices[np.argsort(self.rho[indices], kind="stable")]
+        indices = indices[: max(maximum, (len(indices) + 1) // 2)]
+        points = self.environments[indices]
+        if len(points) <= maximum:
             return points
         taken, far = [0], np.linalg.norm(points - points[0], axis=1)
-        while len(taken) < most and far.max() > 0:
+        while len(taken) < maximum and far.max() > 0:
             taken.append(int(np.argmax(far)))
             far = np.minimum(far, np.linalg.norm(points - points[taken[-1]], axis=1))
         return points[taken]
@@ -91,9 +91,9 @@ def attack(
     """
     assert loop.environment is not None
     free = np.sum(np.array(loop.environment.levels) == 0)
-    follows = free > 0 and (loop.differentiable or free <= MOST_DIFFERENCES)
+    follows = free > 0 and (loop.differentiable or free <= MAX_DIFFERENCES)
     each = 1 if loop.differentiable else 1 + int(free)
-    reserved = DESCENT * MOST_FOLLOWED * (each + len(STEPS)) if follows else 0
+    reserved = DESCENT * MAX_FOLLOWED * (each + len(STEPS)) if follows else 0
     searching = limits.slice(limits.left - min(reserved, limits.left // 3))
     proposals = Proposals(
         search,
@@ -139,15 +139,15 @@ def _descend(
     assert loop.environment is not None
     free = np.array(loop.environment.levels) == 0
     order = np.argsort(np.where(np.isnan(first.rho), np.inf, first.rho), kind="stable")
-    points = first.environments[order[:MOST_FOLLOWED]]
-    best = first.rho[order[:MOST_FOLLOWED]]
+    points = first.environments[order[:MAX_FOLLOWED]]
+    best = first.rho[order[:MAX_FOLLOWED]]
     tried: list[tuple[np.ndarray, Pairs]] = []
     for _ in range(DESCENT):
         each = 1 if loop.differentiable else 1 + int(free.sum())
         if limits.left < len(points) * (each + len(STEPS)) or not free.any():
             break
-        gradients, beside = _gradients(loop, theta, points, 0.02 * scale, free)
-        tried.append(beside)
+        gradients, shifted = _gradients(loop, theta, points, 0.02 * scale, free)
+        tried.append(shifted)
         down = -np.sign(gradients) * free
         moved = np.stack([np.clip(points + step * down, 0.0, 1.0) for step in STEPS], axis=1)
         rows = region.project(moved.reshape(-1, points.shape[1]))
@@ -155,12 +155,12 @@ def _descend(
         pairs = loop.evaluate(theta[None], rows)
         tried.append((rows, pairs))
         rho = np.where(pairs.proper[0], pairs.rho[0], np.inf).reshape(len(points), len(STEPS))
-        least, which = rho.min(axis=1), rho.argmin(axis=1)
-        better = least < best
+        lowest, which = rho.min(axis=1), rho.argmin(axis=1)
+        better = lowest < best
         if not better.any():
             break
         points = np.where(better[:, None], moved[np.arange(len(points)), which], points)
-        best = np.where(better, least, best)
+        best = np.where(better, lowest, best)
     return _join(first, _collect(tried, level, loop))
 
 
@@ -176,16 +176,16 @@ def _gradients(
         pairs = loop.evaluate(theta[None], points, warmth)
         assert pairs.by_environment is not None
         return pairs.by_environment[0], (points, pairs)
-    places = np.flatnonzero(free)
-    beside = np.repeat(points[:, None], 1 + len(places), axis=1)
-    gaps = np.where(points[:, places] > 0.5, -GAP, GAP)
-    beside[:, 1 + np.arange(len(places)), places] += gaps
-    rows = beside.reshape(-1, points.shape[1])
+    indices = np.flatnonzero(free)
+    shifted = np.repeat(points[:, None], 1 + len(indices), axis=1)
+    gaps = np.where(points[:, indices] > 0.5, -GAP, GAP)
+    shifted[:, 1 + np.arange(len(indices)), indices] += gaps
+    rows = shifted.reshape(-1, points.shape[1])
     pairs = loop.evaluate(theta[None], rows)
     rho = np.where(pairs.proper & np.isfinite(pairs.rho), pairs.rho, np.nan)[0]
     rho = rho.reshape(len(points), -1)
     gradients = np.zeros(points.shape)
-    gradients[:, places] = np.nan_to_num((rho[:, 1:] - rho[:, :1]) / gaps)
+    gradients[:, indices] = np.nan_to_num((rho[:, 1:] - rho[:, :1]) / gaps)
     return gradients, (rows, pairs)
 
 

@@ -14,7 +14,7 @@ from verifai_jax.core.budget import Budget
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
 from verifai_jax.synthesis.parametric import Parametric
 
-MOST_DRAWS = 1000
+MAX_DRAWS = 1000
 """Batches of draws at most where the constraint refuses nearly all."""
 ROUND = 256
 """Simulations between two readings of the clock."""
@@ -31,7 +31,7 @@ class HeldOut:
     - `short`: simulations that kept it, but by less than the wanted margin.
     - `without_verdict`: simulations that did not end properly; the upper end of the rate's interval
       takes them for failures.
-    - `least` robustness, None without a verdict.
+    - `lowest` robustness, None without a verdict.
     - `rate`: of failures, with its 95 % interval; None without any verdict.
     """
 
@@ -39,7 +39,7 @@ class HeldOut:
     failures: int
     short: int
     without_verdict: int
-    least: float | None
+    lowest: float | None
     rate: Rate | None
 
     @property
@@ -112,7 +112,7 @@ def held_out(
         failures=failures,
         short=int(short.sum()),
         without_verdict=len(rho) - verdicts,
-        least=float(np.min(rho[proper])) if verdicts else None,
+        lowest=float(np.min(rho[proper])) if verdicts else None,
         rate=clopper_pearson(failures, len(rho), undecided=len(rho) - verdicts)
         if verdicts
         else None,
@@ -126,7 +126,7 @@ def draw(
     d = loop.environment.dim if loop.environment is not None else 0
     rng = np.random.default_rng(seed)
     parts, count_so_far = [np.zeros((0, d), np.float32)], 0
-    for _ in range(MOST_DRAWS):
+    for _ in range(MAX_DRAWS):
         if count_so_far >= count:
             break
         points = rng.random((max(count, 64), d), np.float32)

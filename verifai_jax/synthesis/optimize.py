@@ -20,13 +20,13 @@ FIRST = 6
 """Hardest environments, in which candidates are evaluated before the others."""
 EXPLORED = 0.2
 """Share of the candidates of cross-entropy that are drawn from anywhere."""
-LEAST_BATCH = 8
+MIN_BATCH = 8
 """Candidates below which a round of cross-entropy is not made."""
-LEAST_RADIUS = 1e-5
+MIN_RADIUS = 1e-5
 """Share of the first radius below which a climb ends."""
-MOST_DIFFERENCES = 12
+MAX_DIFFERENCES = 12
 """Parameters up to which differences take the place of gradients."""
-MOST_REFUSED = 1000
+MAX_REFUSED = 1000
 """Draws in a row without one that the constraint accepts, after which no more are made."""
 
 Thetas: TypeAlias = Float[np.ndarray, "k p"] | Sequence[Float[np.ndarray, " p"]]
@@ -118,7 +118,7 @@ def explore(
     """Evaluate parameters over their whole space, then around the best."""
     size, half = max(1, len(environments)), limits.slice(limits.left // 2)
     refused = 0
-    while half.left >= size and refused < MOST_REFUSED:
+    while half.left >= size and refused < MAX_REFUSED:
         # One in each of as many slices of every coordinate: a Latin hypercube.
         cells = np.argsort(rng.random((batch, loop.dim)), axis=0)
         thetas = (cells + rng.random(cells.shape)) / batch
@@ -169,7 +169,7 @@ def climb(
     radii = np.full(len(now), radius)
     for _ in range(steps):
         alive = [
-            i for i, r in enumerate(radii) if r >= LEAST_RADIUS * radius and now[i].value > -np.inf
+            i for i, r in enumerate(radii) if r >= MIN_RADIUS * radius and now[i].value > -np.inf
         ]
         if not alive:
             break
@@ -210,7 +210,7 @@ def climb(
 
 def has_gradients(loop: Parametric) -> bool:
     """Return whether there are gradients, or few enough parameters for differences."""
-    return loop.differentiable or (loop.bounded and 0 < int(loop.free.sum()) <= MOST_DIFFERENCES)
+    return loop.differentiable or (loop.bounded and 0 < int(loop.free.sum()) <= MAX_DIFFERENCES)
 
 
 def _gradients(
@@ -221,15 +221,15 @@ def _gradients(
         pairs = loop.evaluate(theta[None], environments, warmth)
         assert pairs.by_parameters is not None
         return np.where(pairs.proper[0], pairs.rho[0], np.inf), pairs.by_parameters[0]
-    places = np.flatnonzero(loop.free)
+    indices = np.flatnonzero(loop.free)
     # Away from the nearer end of the cube; wide enough that float32 has digits left.
-    gaps = np.where(theta[places] > 0.5, -1.0, 1.0) * np.clip(gap, 1e-3, 0.02)
-    beside = np.repeat(theta[None], len(places), axis=0)
-    beside[np.arange(len(places)), places] += gaps
-    pairs = loop.evaluate(np.concatenate([theta[None], beside]), environments)
+    gaps = np.where(theta[indices] > 0.5, -1.0, 1.0) * np.clip(gap, 1e-3, 0.02)
+    shifted = np.repeat(theta[None], len(indices), axis=0)
+    shifted[np.arange(len(indices)), indices] += gaps
+    pairs = loop.evaluate(np.concatenate([theta[None], shifted]), environments)
     rho = np.where(pairs.proper & np.isfinite(pairs.rho), pairs.rho, np.nan)
     gradients = np.zeros((len(environments), loop.dim))
-    gradients[:, places] = np.nan_to_num((rho[1:] - rho[0]) / gaps[:, None]).T
+    gradients[:, indices] = np.nan_to_num((rho[1:] - rho[0]) / gaps[:, None]).T
     return np.where(np.isnan(rho[0]), np.inf, rho[0]), gradients
 
 
@@ -252,7 +252,7 @@ def cross_entropy(
     """
     environments, size = np.asarray(environments), max(1, len(environments))
     affordable = limits.left // size
-    if affordable < LEAST_BATCH:
+    if affordable < MIN_BATCH:
         return
     points = np.array(thetas, np.float64)[: max(1, affordable // 3)]
     pairs = loop.evaluate(points, environments)
@@ -262,19 +262,19 @@ def cross_entropy(
     best = max(range(len(points)), key=lambda j: merit(points[j], values[j]))
     rho = np.where(pairs.proper[best], pairs.rho[best], np.inf)
     environments = environments[np.argsort(rho, kind="stable")]
-    most, std = max(4, batch // 5), np.full(loop.dim, 0.1)
+    maximum, std = max(4, batch // 5), np.full(loop.dim, 0.1)
     for _ in range(rounds):
         affordable = limits.left // size
-        if affordable < LEAST_BATCH:
+        if affordable < MIN_BATCH:
             return
         order = sorted(range(len(points)), key=lambda j: merit(points[j], values[j]), reverse=True)
-        points, values = points[order[:most]], values[order[:most]]
-        if len(points) == most:
+        points, values = points[order[:maximum]], values[order[:maximum]]
+        if len(points) == maximum:
             std = np.clip(1.5 * points.std(axis=0), 1e-4, 0.2)
             if np.all(std[loop.free] == 1e-4) and loop.free.all():
                 return
-        count = min(batch, max(LEAST_BATCH, affordable // 3))
-        level = merit(points[-1], values[-1]) if len(points) == most else (-np.inf,)
+        count = min(batch, max(MIN_BATCH, affordable // 3))
+        level = merit(points[-1], values[-1]) if len(points) == maximum else (-np.inf,)
         parents = points[rng.integers(0, len(points), 4 * count)]
         drawn = parents + std * rng.normal(size=parents.shape)
         # A few anywhere: what was best in the old set need not be near what is in this one.

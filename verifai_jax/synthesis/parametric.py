@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 ROWS = 64
 """Rows of a table made at a time, so that one shape compiles."""
-MOST_DIFFERENTIATED = 64
+MAX_DIFFERENTIATED = 64
 """Simulations differentiated at a time by arrays of parameters."""
 
 
@@ -143,7 +143,7 @@ class FeatureParameters:
         verdicts = evaluate(rows[happens], 1.0 if temperature is None else temperature)
         self.without_verdict += int(np.sum(~verdicts.proper))
         rho = np.full(k * n, np.inf)
-        rho[happens] = np.where(verdicts.proper, verdicts.least, np.nan)
+        rho[happens] = np.where(verdicts.proper, verdicts.lowest, np.nan)
         failing, proper = np.zeros(k * n, bool), np.ones(k * n, bool)
         failing[happens], proper[happens] = verdicts.violated, verdicts.proper
         slopes: Any = (None, None)
@@ -222,9 +222,9 @@ class ArrayParameters:
 
         for path, leaf in jax.tree_util.tree_leaves_with_path(parameters):
             if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
-                place = jax.tree_util.keystr(path)
+                leaf_path = jax.tree_util.keystr(path)
                 raise TypeError(
-                    f"parameters must be arrays of real numbers; {place or 'they'} is "
+                    f"parameters must be arrays of real numbers; {leaf_path or 'they'} is "
                     f"{jnp.result_type(leaf)}"
                 )
         flat, self._restore = ravel_pytree(parameters)
@@ -284,14 +284,14 @@ class ArrayParameters:
         slopes: Any = (None, None)
         if temperature is not None:
             slopes = np.zeros((len(rows), self.dim)), np.zeros((len(rows), space.dim))
-        places = np.flatnonzero(happens)
+        indices = np.flatnonzero(happens)
         engine = self._values if temperature is None else self._gradients
-        for start in range(0, len(places), engine.batch):
-            these = places[start : start + engine.batch]
+        for start in range(0, len(indices), engine.batch):
+            these = indices[start : start + engine.batch]
             verdicts = engine.evaluate(
                 rows[these], self._key, self.simulations, temperature or 1.0, shared=theta
             )
-            rho[these] = np.where(verdicts.proper, verdicts.least, np.nan)
+            rho[these] = np.where(verdicts.proper, verdicts.lowest, np.nan)
             failing[these], proper[these] = verdicts.violated, verdicts.proper
             if verdicts.gradient is not None:
                 usable = _finite(verdicts.gradient, verdicts.proper)
@@ -315,7 +315,7 @@ class ArrayParameters:
     @cached_property
     def _gradients(self) -> Engine:
         # The gradient of each row is kept, which is as long as the parameters.
-        return self._engine(min(self.batch, MOST_DIFFERENTIATED), gradient=True)
+        return self._engine(min(self.batch, MAX_DIFFERENTIATED), gradient=True)
 
     def _engine(self, batch: int, gradient: bool) -> Engine:
         inputs = WithParameters(

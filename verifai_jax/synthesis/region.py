@@ -20,9 +20,9 @@ from verifai_jax.core.text import format_percent
 from verifai_jax.features.continuous import scipy_special
 from verifai_jax.synthesis.parametric import Parametric
 
-LEAST = 1e-12
+MIN_QUANTILE = 1e-12
 """Distance that normal scores keep from the ends of the cube, where they are infinite."""
-MOST_NAMES = 6
+MAX_NAMES = 6
 """Features that are named one by one."""
 
 
@@ -82,7 +82,7 @@ class Region:
 
     def _scores(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n t"]:
         u = np.asarray(points, np.float64)[:, self.tailed]
-        return scipy_special().ndtri(np.clip(u, LEAST, 1 - LEAST))
+        return scipy_special().ndtri(np.clip(u, MIN_QUANTILE, 1 - MIN_QUANTILE))
 
     def _distance(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
         return np.linalg.norm(self._scores(points), axis=1)
@@ -108,5 +108,5 @@ def region_of(loop: Parametric, mass: float) -> Region | None:
 
 
 def _listed(names: tuple[str, ...]) -> str:
-    shown = ", ".join(names[:MOST_NAMES])
-    return f"{shown} and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else shown
+    shown = ", ".join(names[:MAX_NAMES])
+    return f"{shown} and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else shown

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from verifai_jax.core.figure import Drawn
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.problem.problem import Problem
 from verifai_jax.synthesis.held_out import HeldOut
@@ -258,7 +258,7 @@ class Repair(Drawn, InNotebook):
 
         **Raises:** as `vj.estimate`.
         """
-        estimate = late("verifai_jax.estimation", "estimate")
+        estimate = lazy_import("verifai_jax.estimation", "estimate")
         problems = (self.nominal_problem, self.problem)
         return RepairEstimates(
             self.name, *(estimate(problem, method, budget, **options) for problem in problems)

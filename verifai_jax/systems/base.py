@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias, TypeVar
 import jax
 from jaxtyping import Array, Int, Key, PyTree
 
-from verifai_jax.core.compilation import Effort
+from verifai_jax.core.compilation import XlaOptimization
 from verifai_jax.core.locks import returning_once
 from verifai_jax.core.notebook import ForUsers
 from verifai_jax.core.trace import Status, Trace
@@ -91,7 +91,7 @@ class System(ForUsers):
     black_box: bool = False
     # About 1 MB of a trace with 200 samples and two signals.
     lanes: int = 512
-    effort: Effort = "most"
+    effort: XlaOptimization = "most"
     forward_up_to: int = 1
     notes: tuple[str, ...] = ()
     reverse_hint: str = ""
@@ -120,7 +120,7 @@ class System(ForUsers):
     def abstract(self, features: Features) -> Trace | None:
         """Return the form of the trace, its signals as `jax.ShapeDtypeStruct`s.
 
-        None where nothing but a simulation can tell.
+        None if nothing but a simulation can tell.
 
         **Arguments:**
 
@@ -134,7 +134,7 @@ class System(ForUsers):
     def known_signals(self) -> KnownSignals:
         """Signals of a trace, of a system without `abstract`: names, with components where known.
 
-        None where nothing but a simulation can tell.
+        None if nothing but a simulation can tell.
         """
         return None
 
@@ -189,7 +189,7 @@ class System(ForUsers):
         raise ValueError(f"{self!r} has no backends to choose from; got backend {name!r}")
 
     def why_not(self, backend: str) -> str | None:
-        """Return the reason why an engine cannot simulate this system, None where it can."""
+        """Return the reason why an engine cannot simulate this system, None if it can."""
         return None if backend in self.backends else "the system has no such backend"
 
     def why_slow_to_compile(self, gradient: bool) -> str:

@@ -23,9 +23,9 @@ DelayOption: TypeAlias = int | Mapping[str, int]
 
 
 class Delay(NamedTuple):
-    """A delay: of `most` steps, or of as many as `feature` says, `most` at most."""
+    """A delay: of `max_steps` steps, or of as many as `feature` says, `max_steps` at most."""
 
-    most: int = 0
+    max_steps: int = 0
     feature: str | None = None
 
     @property
@@ -35,12 +35,12 @@ class Delay(NamedTuple):
 
     def steps(self, features: Features) -> Any:
         """Return the number of steps in one simulation; traced where the feature is."""
-        return self.most if self.feature is None else features[self.feature]
+        return self.max_steps if self.feature is None else features[self.feature]
 
     def valid(self, features: Features) -> Any:
         """Return whether the feature's value is a whole number from 0 to the greatest."""
         steps = self.steps(features)
-        return (steps >= 0) & (steps <= self.most) & (steps % 1 == 0)
+        return (steps >= 0) & (steps <= self.max_steps) & (steps % 1 == 0)
 
     def refusal(self, features: Features, owner: str) -> str | None:
         """Return what is wrong with the feature's value; None for a delay that `owner` can have."""
@@ -49,7 +49,7 @@ class Delay(NamedTuple):
             return None
         return (
             f"feature {self.feature!r} of {owner} must be a whole number of steps from 0 to "
-            f"{self.most}; got {steps}"
+            f"{self.max_steps}; got {steps}"
         )
 
     def check(self, features: Features) -> None:
@@ -65,12 +65,12 @@ class Delay(NamedTuple):
         ):
             raise ValueError(
                 f"feature {self.feature!r} is a delay in whole steps: make it a DiscreteBox, as in "
-                f"DiscreteBox(0, {self.most}); it draws real numbers"
+                f"DiscreteBox(0, {self.max_steps}); it draws real numbers"
             )
 
 
 def first_refusal(delays: Iterable[Delay], features: Features, owner: str) -> str | None:
-    """Return what is wrong with the first delay that `owner` cannot have; None where all are right.
+    """Return what is wrong with the first delay that `owner` cannot have; None if all are right.
 
     **Arguments:**
 
@@ -90,10 +90,19 @@ def as_delay(option: DelayOption, name: str) -> Delay:
     """
     delay = Delay(option) if isinstance(option, int) else None  # pyright: ignore[reportArgumentType]
     if isinstance(option, Mapping) and len(option) == 1:
-        ((feature, most),) = option.items()
-        delay = Delay(most, feature)
-    whole = delay is not None and isinstance(delay.most, int) and not isinstance(delay.most, bool)
-    if delay is None or not whole or delay.most < 0 or not isinstance(delay.feature, str | None):
+        ((feature, maximum),) = option.items()
+        delay = Delay(maximum, feature)
+    whole = (
+        delay is not None
+        and isinstance(delay.max_steps, int)
+        and not isinstance(delay.max_steps, bool)
+    )
+    if (
+        delay is None
+        or not whole
+        or delay.max_steps < 0
+        or not isinstance(delay.feature, str | None)
+    ):
         raise ValueError(
             f"{name} must be a number of steps, or one feature with the greatest number of steps "
             f"that it may say, {{'latency': 5}}; got {option!r}"
@@ -107,11 +116,11 @@ class Line(NamedTuple):
     values: PyTree
 
     @classmethod
-    def of(cls, first: PyTree, most: int) -> "Line | None":
+    def of(cls, first: PyTree, maximum: int) -> "Line | None":
         """Return a line that holds `first` everywhere; None for no delay, which costs nothing."""
-        if not most:
+        if not maximum:
             return None
-        repeat = lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], most + 1, axis=0)  # noqa: E731
+        repeat = lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], maximum + 1, axis=0)  # noqa: E731
         return cls(jax.tree.map(repeat, first))
 
 
@@ -133,14 +142,14 @@ class Delays(NamedTuple):
     """The delays of one simulation.
 
     - `observation`, `action`: in steps; traced where a feature says them.
-    - `most_observation`, `most_action`: the greatest that they may be.
+    - `max_observation`, `max_action`: the greatest that they may be.
     - `valid`: whether they are within these.
     """
 
     observation: Any = 0
     action: Any = 0
-    most_observation: int = 0
-    most_action: int = 0
+    max_observation: int = 0
+    max_action: int = 0
     valid: Bool[Array, ""] | bool = True
 
     @classmethod
@@ -149,8 +158,8 @@ class Delays(NamedTuple):
         return cls(
             observation.steps(features),
             action.steps(features),
-            observation.most,
-            action.most,
+            observation.max_steps,
+            action.max_steps,
             observation.valid(features) & action.valid(features),
         )
 

@@ -131,7 +131,7 @@ def test_density_finds_what_k_means_cannot():
 def test_density_of_many_rows(monkeypatch):
     frame, _ = blobs(2000)
     whole = clusters(frame, "dbscan")
-    monkeypatch.setattr(density, "MOST_ROWS", 300)
+    monkeypatch.setattr(density, "MAX_ROWS", 300)
     part = clusters(frame, "dbscan")
     assert part.count == 3
     both = (whole.assigned >= 0) & (part.assigned >= 0)

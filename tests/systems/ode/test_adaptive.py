@@ -71,7 +71,7 @@ def test_derivatives_and_batches():
 @pytest.mark.thorough
 def test_what_needs_too_many_steps_is_not_finite():
     pytest.importorskip("diffrax")
-    system = van_der_pol(method=adaptive("Tsit5", most_steps=2))
+    system = van_der_pol(method=adaptive("Tsit5", max_steps=2))
     assert int(jax.jit(system)({"mu": 100.0}).status) == Status.NONFINITE
 
 
@@ -100,5 +100,5 @@ def test_refused():
         adaptive("Kvaerno6")
     with pytest.raises(ValueError, match="rtol must lie between 0 and 1; got -1"):
         adaptive(rtol=-1.0)
-    with pytest.raises(ValueError, match="most_steps"):
-        adaptive(most_steps=0)
+    with pytest.raises(ValueError, match="max_steps"):
+        adaptive(max_steps=0)

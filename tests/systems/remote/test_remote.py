@@ -549,7 +549,7 @@ def test_the_hello_says_what_is_expected(system):
         "type": "hello",
         "protocol": 1,
         "challenge": None,
-        "most_bytes": 16777216,
+        "max_bytes": 16777216,
         "signals": {"x": 1},
         "dt": 0.1,
         "length": 3,
@@ -714,7 +714,7 @@ def test_both_protocols():
         ({"timeout": 0}, "timeout must be a positive number of seconds; got 0"),
         ({"patience": -1}, "patience must be a positive number of seconds; got -1"),
         ({"retries": -1}, "retries must be an integer of at least 0; got -1"),
-        ({"most_bytes": 10}, r"most_bytes must be an integer from 1024 to 2\*\*31 - 1; got 10"),
+        ({"max_bytes": 10}, r"max_bytes must be an integer from 1024 to 2\*\*31 - 1; got 10"),
         ({"tokn": "x"}, "unknown option of remote 'tokn'; did you mean 'token'"),
     ],
 )
@@ -878,7 +878,7 @@ def test_a_client_gives_up_where_there_is_no_run():
 
 
 def test_connections_that_say_nothing_shut_nobody_out(system, monkeypatch):
-    monkeypatch.setattr(server, "MOST_CLIENTS", 4)
+    monkeypatch.setattr(server, "MAX_CLIENTS", 4)
     silent = [socket.create_connection(system.address, timeout=10) for _ in range(20)]
     with answering(system):
         outcomes = Asked(system, 3).all()
@@ -889,7 +889,7 @@ def test_connections_that_say_nothing_shut_nobody_out(system, monkeypatch):
 
 
 def test_a_full_server_is_tried_again(system, monkeypatch, program):
-    monkeypatch.setattr(server, "MOST_CLIENTS", 2)
+    monkeypatch.setattr(server, "MAX_CLIENTS", 2)
     peers = [Peer(system.address) for _ in range(2)]
     until(lambda: len(system.clients) == 2)
     refused = Peer(system.address, greet=False)
@@ -914,7 +914,7 @@ def test_a_full_server_is_tried_again(system, monkeypatch, program):
 
 
 def test_the_memory_of_all_clients_is_bounded(caplog):
-    options = {"most_bytes": 1 << 20, "most_memory": 2 << 20}
+    options = {"max_bytes": 1 << 20, "max_memory": 2 << 20}
     with remote(signals=("x",), dt=0.1, length=3, retries=0, **options) as system:
         hogs = [Peer(system.address) for _ in range(6)]
         until(lambda: len(system.clients) == 6)

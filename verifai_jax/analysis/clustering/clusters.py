@@ -26,9 +26,9 @@ from verifai_jax.analysis.data.samples import (
     Seed,
     Source,
     Which,
-    beside,
     distances,
     generator,
+    with_columns,
 )
 from verifai_jax.core.checks import check_count, check_positive
 from verifai_jax.core.figure import Drawn
@@ -39,7 +39,7 @@ from verifai_jax.problem.problem import Problem
 Method = Literal["auto", "kmeans", "kmodes", "kprototypes", "dbscan"]
 METHODS = ("auto", "kmeans", "kmodes", "kprototypes", "dbscan")
 # Kaufman and Rousseeuw, Finding Groups in Data, 1990: below, there is no substantial structure.
-LEAST_SILHOUETTE = 0.25
+MIN_SILHOUETTE = 0.25
 _SILHOUETTE_ROWS = 2000
 _TRIED = 5000
 _STARTS = 8
@@ -96,8 +96,10 @@ class Clusters(Drawn):
                 columns[column.name] = entries.mean().reindex(kinds).to_numpy(np.float64)
             else:
                 codes = column.codes(frame[column.name])
-                most = [np.argmax(np.bincount(codes[self.assigned == c] + 1)) - 1 for c in kinds]
-                choices = [column.choices[i] if i >= 0 else None for i in most]
+                commonest = [
+                    np.argmax(np.bincount(codes[self.assigned == c] + 1)) - 1 for c in kinds
+                ]
+                choices = [column.choices[i] if i >= 0 else None for i in commonest]
                 columns[column.name] = pd.Series(choices, dtype=object).to_numpy()
         return pd.DataFrame(columns, index=pd.Index(kinds, name="cluster"))
 
@@ -109,8 +111,8 @@ class Clusters(Drawn):
         nearest to the centre; `worst`: the row of least robustness, and `worst_rho`. A name that a
         feature has gets `_` added.
         """
-        placed = _place(self.samples, self.scale, self.weight)
-        centred = _place(self.samples, self.scale, self.weight, self.centres)
+        placed = _embed(self.samples, self.scale, self.weight)
+        centred = _embed(self.samples, self.scale, self.weight, self.centres)
         rho = np.nan_to_num(self.samples.rho, nan=np.inf)
         own = []
         for i, cluster in enumerate(self.centres.index):
@@ -128,7 +130,7 @@ class Clusters(Drawn):
                     "worst_rho": self.samples.rho[worst],
                 }
             )
-        table = beside(self.centres, pd.DataFrame(own, index=self.centres.index))
+        table = with_columns(self.centres, pd.DataFrame(own, index=self.centres.index))
         return table.loc[[*range(self.count), *([-1] if -1 in table.index else [])]]
 
     def __str__(self) -> str:
@@ -164,7 +166,7 @@ def clusters(
     columns: Sequence[str] | None = None,
     which: Which = "counterexamples",
     scale: Scale = "range",
-    most: int = 8,
+    max_clusters: int = 8,
     radius: float | None = None,
     space: Problem | FeatureSpace | None = None,
 ) -> Clusters:
@@ -177,14 +179,14 @@ def clusters(
     - `method`: `"kmeans"` looks at ordered columns only, `"kmodes"` at unordered ones only,
       `"kprototypes"` at both; `"auto"` takes the one that fits the columns. `"dbscan"` looks at
       both, and finds the number of clusters and the noise itself.
-    - `count`: number of clusters; by default that from 2 to `most` with the greatest silhouette
-      (Rousseeuw, Journal of Computational and Applied Mathematics 20, 1987), or 1 if none is above
-      0.25, or there are less than three rows. It is chosen on at most 5000 rows.
+    - `count`: number of clusters; by default that from 2 to `max_clusters` with the greatest
+      silhouette (Rousseeuw, Journal of Computational and Applied Mathematics 20, 1987), or 1 if
+      none is above 0.25, or there are less than three rows. It is chosen on at most 5000 rows.
     - `radius`: of DBSCAN, by default the knee of the distances to the k-th neighbour, where k is
       twice the number of columns, and 4 at least.
     - `seed`: an integer, a NumPy generator or a `jax.random` key.
     - `scale`: as in `Samples.scaling`.
-    - `most`: clusters at most, where `count` is left out.
+    - `max_clusters`: clusters at most, where `count` is left out.
 
     **Returns:** `Clusters`; the same seed gives the same ones.
 
@@ -210,10 +212,10 @@ def clusters(
     if radius is not None:
         raise ValueError(f"a radius is for method='dbscan'; got {radius!r} with {method!r}")
     weight = _weight(samples, scale)
-    placed = _place(samples, scale, weight)
+    placed = _embed(samples, scale, weight)
     different = len(np.unique(np.concatenate(placed, axis=1), axis=0))
     if count is None:
-        count = _best_count(placed, min(check_count("most", most), different), rng)
+        count = _best_count(placed, min(check_count("max_clusters", max_clusters), different), rng)
     elif check_count("count", count) > different:
         raise ValueError(
             f"count must be from 1 to {different}, the number of different rows among "
@@ -226,7 +228,7 @@ def clusters(
 
 def _weight(samples: Samples, scale: Scale) -> float:
     """Return the weight with which numbers and choices differ equally on average."""
-    coordinates, codes = samples.place(scale)
+    coordinates, codes = samples.embed(scale)
     apart = 2 * coordinates.var(axis=0).sum() / max(len(samples.ordered), 1)
     if not codes.shape[1] or apart <= 0:
         return 1.0
@@ -234,20 +236,22 @@ def _weight(samples: Samples, scale: Scale) -> float:
     return float(apart / np.mean(unlike)) if np.mean(unlike) > 0 else 1.0
 
 
-def _place(
+def _embed(
     samples: Samples, scale: Scale, weight: float, frame: pd.DataFrame | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return `Samples.place`, divided so that a different choice has this weight."""
-    coordinates, codes = samples.place(scale, frame)
+    """Return `Samples.embed`, divided so that a different choice has this weight."""
+    coordinates, codes = samples.embed(scale, frame)
     return coordinates / np.sqrt(weight), codes
 
 
-def _best_count(placed: tuple[np.ndarray, np.ndarray], most: int, rng: np.random.Generator) -> int:
+def _best_count(
+    placed: tuple[np.ndarray, np.ndarray], max_clusters: int, rng: np.random.Generator
+) -> int:
     """Return the number of clusters with the greatest silhouette, tried on at most 5000 rows."""
     rows = rng.permutation(len(placed[0]))[:_TRIED]
     part = placed[0][rows], placed[1][rows]
-    best, reached = 1, LEAST_SILHOUETTE
-    for count in range(2, min(most, len(rows) - 1) + 1):
+    best, reached = 1, MIN_SILHOUETTE
+    for count in range(2, min(max_clusters, len(rows) - 1) + 1):
         # The same rows for each count, so that chance does not decide between them.
         score = _silhouette(part, _partition(part, count, rng), np.random.default_rng(0))
         if score > reached:
@@ -283,7 +287,7 @@ def _dense(
         check_positive("radius", radius, finite=True)
     needed = max(4, 2 * len(samples.columns))
     found, radius = dbscan(samples.points(scale), needed, radius, rng)
-    score = _silhouette(samples.place(scale), found, rng)
+    score = _silhouette(samples.embed(scale), found, rng)
     return Clusters(samples, _by_size(found), "dbscan", score, scale, radius=radius)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 # Beyond, a random part is clustered, and the other rows join the part's dense ones.
-MOST_ROWS = 20_000
+MAX_ROWS = 20_000
 
 
 def dbscan(
@@ -26,17 +26,17 @@ def dbscan(
     from sklearn.cluster import DBSCAN
 
     n = len(points)
-    part = np.arange(n) if n <= MOST_ROWS else np.sort(rng.permutation(n)[:MOST_ROWS])
+    part = np.arange(n) if n <= MAX_ROWS else np.sort(rng.permutation(n)[:MAX_ROWS])
     if radius is None:
         radius = knee(points[part], min(needed, len(part)))
-    elif n > MOST_ROWS:
+    elif n > MAX_ROWS:
         # So many of the rows within a radius that was meant for all of them are in the part.
         needed = max(3, round(needed * len(part) / n))
     found = DBSCAN(eps=radius, min_samples=needed).fit(points[part])
     labels = np.full(n, -1, np.int64)
     labels[part] = found.labels_
     dense = part[found.core_sample_indices_]
-    if n > MOST_ROWS and len(dense):
+    if n > MAX_ROWS and len(dense):
         far, which = KDTree(points[dense]).query(points, workers=-1)
         left = np.setdiff1d(np.flatnonzero(np.asarray(far) <= radius), part)
         labels[left] = labels[dense[np.asarray(which)[left]]]
@@ -54,5 +54,5 @@ def knee(points: Float[np.ndarray, "n d"], k: int) -> float:
         # All rows have equals: any radius will do that separates different ones.
         return 1e-9
     across, up = np.linspace(0, 1, len(far)), (far - far[0]) / max(far[-1] - far[0], 1e-300)
-    place = int(np.argmax(across - up)) if far[-1] > far[0] else -1
-    return float(far[place]) if far[place] > 0 else float(far[far > 0][0])
+    at = int(np.argmax(across - up)) if far[-1] > far[0] else -1
+    return float(far[at]) if far[at] > 0 else float(far[far > 0][0])

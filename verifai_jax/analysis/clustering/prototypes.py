@@ -84,7 +84,7 @@ def _centres(
     modes = np.zeros((count, codes.shape[1]), codes.dtype)
     for j, column in enumerate(codes.T):
         # An absent entry has the code -1.
-        least, kinds = column.min(), column.max() - column.min() + 1
-        counts = np.bincount(labels * kinds + column - least, minlength=count * kinds)
-        modes[:, j] = np.argmax(counts.reshape(count, kinds), axis=1) + least
+        lowest, kinds = column.min(), column.max() - column.min() + 1
+        counts = np.bincount(labels * kinds + column - lowest, minlength=count * kinds)
+        modes[:, j] = np.argmax(counts.reshape(count, kinds), axis=1) + lowest
     return means, modes

@@ -14,11 +14,11 @@ from jaxtyping import Float, Int
 from verifai_jax.analysis.data.marginals import Marginal
 from verifai_jax.analysis.data.samples import Samples
 
-MOST_VALUES = 20
+MAX_VALUES = 20
 """Values up to which each one of a discrete feature is a cell of its own."""
-MOST_FEATURES = 60
+MAX_FEATURES = 60
 """Features up to which all of their pairs are counted."""
-MOST_UNTRIED = 1000
+MAX_UNTRIED = 1000
 BLOCK = 4096
 
 
@@ -41,7 +41,7 @@ def cut(samples: Samples, parts: Sequence[Marginal], count: int) -> list[Cells]:
     found = []
     for part in parts:
         name = part.column.name
-        if part.edges is not None and (part.count <= MOST_VALUES or not part.column.ordered):
+        if part.edges is not None and (part.count <= MAX_VALUES or not part.column.ordered):
             ids, prior = part.cells(samples), np.diff(part.edges)
             found.append(Cells(name, ids, prior, part, True))
         else:
@@ -67,11 +67,13 @@ def count_occupied(
     **Returns:** a table with a row for each feature, a table of the values and pairs of values that
     were never tried (1000 at most), and their number.
     """
-    most = min(len(rows), MOST_FEATURES)
+    maximum = min(len(rows), MAX_FEATURES)
     counts = np.array([len(cells.prior) for cells in rows])
-    edges = np.concatenate([[0], np.cumsum(counts[:most])])
-    together = pair_counts(_ids(rows[:most]), counts[:most])
-    possible = together if allowed is None else pair_counts(_ids(allowed[:most]), counts[:most])
+    edges = np.concatenate([[0], np.cumsum(counts[:maximum])])
+    together = pair_counts(_ids(rows[:maximum]), counts[:maximum])
+    possible = (
+        together if allowed is None else pair_counts(_ids(allowed[:maximum]), counts[:maximum])
+    )
     table = np.full((len(rows), len(_COLUMNS)), np.nan)
     untried: list[tuple[Any, ...]] = []
     missing = 0
@@ -85,8 +87,8 @@ def count_occupied(
             missing += len(never)
             untried += [(one.name, one.marginal.shown(int(cell)), "", "") for cell in never]
         shares = []
-        for j, other in enumerate(rows[:most]):
-            if i == j or i >= most:
+        for j, other in enumerate(rows[:maximum]):
+            if i == j or i >= maximum:
                 continue
             block = np.s_[edges[i] : edges[i + 1], edges[j] : edges[j + 1]]
             both = together[block] > 0
@@ -99,7 +101,7 @@ def count_occupied(
                 alive = np.outer(both.any(axis=1), both.any(axis=0))
                 empty = np.argwhere(~both & real & alive)
                 missing += len(empty)
-                for a, b in empty[: max(0, MOST_UNTRIED - len(untried))].tolist():
+                for a, b in empty[: max(0, MAX_UNTRIED - len(untried))].tolist():
                     first = (one.name, one.marginal.shown(a))
                     untried.append((*first, other.name, other.marginal.shown(b)))
         if shares:
@@ -109,7 +111,7 @@ def count_occupied(
     heads = ["feature", "value", "other", "other_value"]
     return (
         pd.DataFrame(table, columns=list(_COLUMNS), index=index).astype({"cells": int}),
-        pd.DataFrame(untried[:MOST_UNTRIED], columns=heads),
+        pd.DataFrame(untried[:MAX_UNTRIED], columns=heads),
         missing,
     )
 

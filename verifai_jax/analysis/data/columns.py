@@ -46,8 +46,8 @@ class Column:
         **Raises:** `ValueError` for an entry that is none of the choices.
         """
         kinds, values = pd.factorize(entries)
-        places = _places(self.choices)
-        found = [places.get(value, places.get(str(value), -2)) for value in values.tolist()]
+        indices = _indices(self.choices)
+        found = [indices.get(value, indices.get(str(value), -2)) for value in values.tolist()]
         codes = np.array([*found, -1], np.int64)[kinds]
         if (codes == -2).any():
             stray = as_scalar(entries.iloc[int(np.argmax(codes == -2))])
@@ -117,10 +117,10 @@ def _column(entries: Any, name: str, known: Mapping[str, Any]) -> Column:
     )
 
 
-def _places(choices: Sequence[Any]) -> dict[Any, int]:
+def _indices(choices: Sequence[Any]) -> dict[Any, int]:
     # A float32 entry of 0.1 still means the choice 0.1.
-    places = {float(np.float32(c)): i for i, c in enumerate(choices) if isinstance(c, float)}
-    return places | {choice: i for i, choice in enumerate(choices)}
+    indices = {float(np.float32(c)): i for i, c in enumerate(choices) if isinstance(c, float)}
+    return indices | {choice: i for i, choice in enumerate(choices)}
 
 
 def _sorting(choice: Any) -> tuple[str, Any]:

@@ -71,10 +71,10 @@ class Marginal:
     def value(self, u: float) -> Any:
         """Return the entry at a coordinate."""
         if self.edges is not None:
-            place = int(
+            index = int(
                 np.clip(np.searchsorted(self.edges, u, side="right") - 1, 0, self.count - 1)
             )
-            return self.shown(place)
+            return self.shown(index)
         return float(np.interp(u, self.heights, self.knots))
 
     def shown(self, cell: int) -> Any:

@@ -185,11 +185,11 @@ class Samples:
         **Raises:** `IndexError` for a row number that is not in the table.
         """
         numbers = np.asarray(rows).reshape(-1)
-        places = self.table.index.get_indexer(numbers)
-        if (places < 0).any():
-            stray = numbers[np.argmin(places)]
+        indices = self.table.index.get_indexer(numbers)
+        if (indices < 0).any():
+            stray = numbers[np.argmin(indices)]
             raise IndexError(f"row {stray} is not in the table of {len(self.table):,} rows")
-        return self.table.iloc[places]
+        return self.table.iloc[indices]
 
     @property
     def kind(self) -> str:
@@ -249,7 +249,7 @@ class Samples:
 
     def codes(self) -> Int[np.ndarray, "n m"]:
         """Return the unordered columns as places in their `choices`; -1 where absent."""
-        return self.place()[1]
+        return self.embed()[1]
 
     def points(self, scale: Scale = "range") -> Float[np.ndarray, "n d"]:
         """Return all columns such that Euclidean distances treat ordered and unordered ones alike.
@@ -258,14 +258,14 @@ class Samples:
         differences, and 1 for each unordered column in which they differ. Where only one of two
         has an item, its columns count 0.75 to 1 each; where neither has it, 0.
         """
-        coordinates, codes = self.place(scale)
+        coordinates, codes = self.embed(scale)
         parts = [coordinates]
         for column, code in zip(self.unordered, codes.T, strict=True):
             # Two different rows of the unit matrix are the square root of two apart.
             parts.append((np.eye(len(column.choices) + 1) / np.sqrt(2))[code])
         return np.concatenate(parts, axis=1)
 
-    def place(
+    def embed(
         self, scale: Scale = "range", frame: pd.DataFrame | None = None
     ) -> tuple[Float[np.ndarray, "n p"], Int[np.ndarray, "n m"]]:
         """Coordinates of the ordered columns and codes of the unordered ones; see `distances`.
@@ -324,7 +324,7 @@ def distances(
     rows: tuple[Float[np.ndarray, "n p"], Int[np.ndarray, "n m"]],
     one: tuple[Float[np.ndarray, " p"], Int[np.ndarray, " m"]],
 ) -> Float[np.ndarray, " n"]:
-    """Distances of rows from one row, both as `Samples.place` gives them; see `points`."""
+    """Distances of rows from one row, both as `Samples.embed` gives them; see `points`."""
     squared = ((rows[0] - one[0]) ** 2).sum(axis=1) + (rows[1] != one[1]).sum(axis=1)
     return np.sqrt(squared)
 
@@ -333,7 +333,7 @@ Source: TypeAlias = Run | ErrorTable | pd.DataFrame | Samples
 """A run, its table, a DataFrame with feature columns, or samples of one of them."""
 
 
-def beside(frame: pd.DataFrame, own: pd.DataFrame) -> pd.DataFrame:
+def with_columns(frame: pd.DataFrame, own: pd.DataFrame) -> pd.DataFrame:
     """Append the columns of `own` to those of `frame`, with `_` added to a name that is taken."""
     return frame.join(own.rename(columns={name: f"{name}_" for name in own if name in frame}))
 
@@ -381,6 +381,8 @@ def _has_absent(entries: pd.Series | pd.DataFrame) -> bool:
     return bool(entries.isna().any())
 
 
-def _listed(names: Sequence[str], most: int = 8) -> str:
-    shown = ", ".join(names[:most]) + (f", and {len(names) - most} more" if names[most:] else "")
+def _listed(names: Sequence[str], maximum: int = 8) -> str:
+    shown = ", ".join(names[:maximum]) + (
+        f", and {len(names) - maximum} more" if names[maximum:] else ""
+    )
     return shown or "none"

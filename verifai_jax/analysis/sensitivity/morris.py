@@ -61,13 +61,13 @@ def morris(
     generator = np.random.default_rng(seed)
     counts = np.where(np.array(space.levels) == 0, levels, space.levels).astype(int)
     start, stop, step = _steps(counts, space, generator, trajectories)
-    place = generator.permuted(np.tile(np.arange(d), (trajectories, 1)), axis=1)
+    index = generator.permuted(np.tile(np.arange(d), (trajectories, 1)), axis=1)
     simulate = Simulator(problem, seed, min(batch, trajectories), of)
     cells, rows = start.copy(), np.arange(trajectories)
     before = simulate(space.centres(cells, counts), 0)
     seen, effects = [before], np.full((trajectories, d), np.nan)
     for turn in range(d):
-        moved = place[:, turn]
+        moved = index[:, turn]
         cells[rows, moved] = stop[rows, moved]
         after = simulate(space.centres(cells, counts), 0)
         size = step[rows, moved]

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.core.errors import check_names
-from verifai_jax.core.lazy import late
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 from verifai_jax.evaluation.backends import resolved
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 RESAMPLES = 200
 """Bootstrap samples behind an interval."""
-MOST_SHOWN = 20
+MAX_SHOWN = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class Sensitivity(InNotebook):
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the indices with their intervals; returns the figure."""
-        return late("verifai_jax.plotting.bars", "plot_sensitivity")(self, path)
+        return lazy_import("verifai_jax.plotting.bars", "plot_sensitivity")(self, path)
 
     def __repr__(self) -> str:
         return str(self)
@@ -64,10 +64,10 @@ class Sensitivity(InNotebook):
         if self.dropped:
             lines.append(f"{self.dropped:,} simulations had no verdict and were left out")
         width = max(len(str(name)) for name in self.table.index)
-        for name, row in self.table.head(MOST_SHOWN).iterrows():
+        for name, row in self.table.head(MAX_SHOWN).iterrows():
             lines.append(f"  {name!s:<{width}}  {_words(self.method, row)}")
-        if len(self.table) > MOST_SHOWN:
-            lines.append(f"  and {len(self.table) - MOST_SHOWN} more with less influence")
+        if len(self.table) > MAX_SHOWN:
+            lines.append(f"  and {len(self.table) - MAX_SHOWN} more with less influence")
         return "\n".join(lines)
 
 
@@ -91,7 +91,7 @@ class Simulator:
         """Robustness `[n]`, NaN without a verdict; row `i` has the random key `first + i`."""
         verdicts = self._evaluate(u, temperature, first)
         self.gradients.append(verdicts.gradient)
-        rho = verdicts.least if self.column is None else verdicts.rho[:, self.column]
+        rho = verdicts.lowest if self.column is None else verdicts.rho[:, self.column]
         rho = rho.astype(np.float64)
         rho[~np.isfinite(rho)] = np.nan
         self.done += len(rho)
@@ -182,11 +182,11 @@ def _words(method: str, row: Any) -> str:
         alone = f"{format_percent(max(row['first'], 0))} alone"
         return f"{format_percent(row['total'])} of the variance in all ({between}), {alone}"
     if "mu_star" in row:
-        way = {1.0: ", up on average", -1.0: ", down on average"}.get(np.sign(row["mu"]), "")
+        direction = {1.0: ", up on average", -1.0: ", down on average"}.get(np.sign(row["mu"]), "")
         return (
             f"moves the robustness by {row['mu_star']:z.3g} "
             f"({row['low']:z.3g} to {row['high']:z.3g}) over its range, "
-            f"standard deviation {row['sigma']:z.3g}{way}"
+            f"standard deviation {row['sigma']:z.3g}{direction}"
         )
     if np.isnan(row["bound"]):
         return "discrete: has no gradient"

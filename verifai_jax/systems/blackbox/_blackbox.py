@@ -79,7 +79,7 @@ class TraceForm:
         return dict(signals) if isinstance(signals, Mapping) else dict.fromkeys(signals, 1)
 
     def abstract(self) -> Trace | None:
-        """Return a trace of this form as shapes; None where the form is incomplete."""
+        """Return a trace of this form as shapes; None if the form is incomplete."""
         if self.signals is None or self.dt is None or self.length is None:
             return None
         shapes = {n: (self.length, *([] if w == 1 else [w])) for n, w in self.widths.items()}

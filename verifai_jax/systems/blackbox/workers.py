@@ -304,12 +304,12 @@ class _Batch:
     ) -> tuple[int, tuple[Features, int], int] | None:
         """Return what a worker simulates next: its index, itself, and a number that stands for it.
 
-        None where nothing is left, or only what it has simulated before and others will now.
+        None if nothing is left, or only what it has simulated before and others will now.
         """
         with self._lock:
-            for place, task in enumerate(self.tasks):
+            for index, task in enumerate(self.tasks):
                 if seen.get(task[2]) != worker.number:
-                    del self.tasks[place]
+                    del self.tasks[index]
                     return task
             if self.tasks and self._busy <= {worker, *self._leaving}:
                 return self.tasks.popleft()

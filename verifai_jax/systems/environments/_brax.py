@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import jax
 from jaxtyping import Array, Int, Key, PyTree
 
-from verifai_jax.core.compilation import Effort
+from verifai_jax.core.compilation import XlaOptimization
 from verifai_jax.core.errors import require, suggests_options, unknown_name
 from verifai_jax.systems.base import Features
 from verifai_jax.systems.delays import DelayOption
@@ -24,9 +24,9 @@ from verifai_jax.systems.environments.brax_model import (
     Env,
     check_parts_are_read,
     explain_errors,
-    joint_place,
+    joint_location,
     steps_plainly,
-    system_place,
+    system_location,
     with_finer_step,
     with_start,
     with_system,
@@ -52,7 +52,7 @@ class Brax(PolicyLoop):
     exact_step: bool = True
 
     @property
-    def effort(self) -> Effort:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def effort(self) -> XlaOptimization:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Effort of XLA: with `little` the generalized backend compiles sooner and runs as fast."""
         backend = getattr(self.env.unwrapped, "_backend", None)
         return "little" if backend == "generalized" else "most"
@@ -94,7 +94,9 @@ class Brax(PolicyLoop):
         if callable(self.initial):
             return _moment(self.initial(env, features, key), self.name)
         if self.initial:
-            env = with_start(env, {place: features[name] for name, place in self.initial.items()})
+            env = with_start(
+                env, {location: features[name] for name, location in self.initial.items()}
+            )
         with explain_errors(self.env, self.name, "reset"):
             return _moment(env.reset(key), self.name)
 
@@ -114,8 +116,8 @@ class Brax(PolicyLoop):
         env = self.env
         if self.features:
             sys = env.unwrapped.sys
-            for name, place in self.features.items():
-                sys = with_value(sys, place, features[name], name)
+            for name, location in self.features.items():
+                sys = with_value(sys, location, features[name], name)
             env = with_system(env, sys)
         if self.configure is None:
             return env
@@ -225,17 +227,17 @@ def brax(
     shared = loop_options(
         dt, policy, policy_memory, features, configure, initial, signals, delays, "sys", "env"
     )
-    places = {f: system_place(env, path, name) for f, path in shared["features"].items()}
+    locations = {f: system_location(env, path, name) for f, path in shared["features"].items()}
     if isinstance(initial, Mapping):
         if not hasattr(env, "pipeline_init"):
             raise ValueError(
                 f"{name} has no pipeline_init: initial must be a function (env, features, key) -> "
                 "State"
             )
-        shared["initial"] = {f: joint_place(env, path, name) for f, path in initial.items()}
-    check_parts_are_read(env, name, places)
+        shared["initial"] = {f: joint_location(env, path, name) for f, path in initial.items()}
+    check_parts_are_read(env, name, locations)
     return Brax(
-        **{**shared, "features": places},
+        **{**shared, "features": locations},
         env=env,
         name=name,
         steps=step_count(steps, duration, shared["dt"]),

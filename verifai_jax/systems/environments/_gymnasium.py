@@ -197,7 +197,7 @@ class EpisodeFunction:
             if not hasattr(env, attribute):
                 known = [name for name in vars(env) if not name.startswith("_")]
                 raise unknown_name(f"attribute of {self.name}", attribute, known)
-        delayed = self.action_delay.most > 0
+        delayed = self.action_delay.max_steps > 0
         check_space(getattr(self.environment, "action_space", None), self.name, delayed)
         # Also refuses entries that the observation does not have.
         _ = self.known_signals

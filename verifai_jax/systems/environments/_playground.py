@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
-from verifai_jax.core.compilation import Effort
 from verifai_jax.core.errors import suggests_options, unknown_name
 from verifai_jax.systems.base import Features
 from verifai_jax.systems.delays import DelayOption
@@ -38,11 +37,6 @@ class Playground(Brax):
 
     binding: ClassVar[str] = "bind={feature: 'body/NAME/mass'}, as in vj.mujoco"
     bindings: Bindings
-
-    @property
-    def effort(self) -> Effort:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Effort of XLA."""
-        return "most"
 
     @property
     def reverse_hint(self) -> str:
@@ -159,7 +153,7 @@ def playground(
     bindings = resolve_bindings(load(env.mj_model), bind)
     if bindings.applied:
         raise ValueError(
-            f"{bindings.applied[0].place.path!r} is set by the environment {name} at each step: "
+            f"{bindings.applied[0].location.path!r} is set by the environment {name} at each step: "
             "change it by configure=(env, features) -> env"
         )
     return Playground(

@@ -1,6 +1,6 @@
 """Paths to the parts of a Brax environment, and copies of it with parts set.
 
-place = system_place(env, "link.inertia.mass[pole]", "hopper")
+place = system_location(env, "link.inertia.mass[pole]", "hopper")
 env = with_system(env, with_value(env.unwrapped.sys, place, 2.0, "mass"))
 """
 
@@ -38,7 +38,7 @@ _ROWS = {
 }
 
 
-class Place(NamedTuple):
+class Location(NamedTuple):
     """An array somewhere in a Brax system, or a row or one entry of it."""
 
     parts: tuple[str, ...]
@@ -70,7 +70,7 @@ def explain_errors(env: Env, name: str, what: str, backend: str | None = None) -
         ) from e
 
 
-def system_place(env: Env, path: str, name: str) -> Place:
+def system_location(env: Env, path: str, name: str) -> Location:
     """Return the place of a path such as `link.inertia.mass[pole]` or `geom_friction[floor, 0]`.
 
     **Raises:** `UnknownNameError` for a part or an entry that does not exist; `ValueError` for an
@@ -100,7 +100,7 @@ def system_place(env: Env, path: str, name: str) -> Place:
         )
     text = match.group(2) if match else None
     if text is None:
-        return Place(parts, None)
+        return Location(parts, None)
     if np.ndim(leaf) == 0:
         raise ValueError(f"{'.'.join(parts)} of {name} is one number and has no entry {text!r}")
     row, *columns = (entry.strip() for entry in text.split(","))
@@ -112,7 +112,7 @@ def system_place(env: Env, path: str, name: str) -> Place:
     index = [_row(row, parts, np.shape(leaf)[0], _row_names(sys, parts), name)]
     for axis, column in enumerate(columns, 1):
         index.append(_row(column, parts, np.shape(leaf)[axis], {}, name))
-    return Place(parts, tuple(index))
+    return Location(parts, tuple(index))
 
 
 def _paths(sys: BraxSystem) -> list[str]:
@@ -150,7 +150,7 @@ def _row(text: str, parts: tuple[str, ...], length: int, named: dict[str, int], 
     return int(text) % length
 
 
-def joint_place(env: Env, path: str, name: str) -> Place:
+def joint_location(env: Env, path: str, name: str) -> Location:
     """Return the place of a path such as `q[hinge]` in the initial `q` or `qd`."""
     match = re.fullmatch(r"(\w+)\[([^\]]+)\]", path.strip())
     part = match.group(1) if match else path
@@ -168,27 +168,27 @@ def joint_place(env: Env, path: str, name: str) -> Place:
         for i in range(model.njnt):
             if int(model.jnt_type[i]) in single:
                 named[mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, i)] = int(first[i])
-    return Place((part,), (_row(match.group(2), (part,), length, named, name),))
+    return Location((part,), (_row(match.group(2), (part,), length, named, name),))
 
 
-def with_value(sys: BraxSystem, place: Place, value: ArrayLike, feature: str) -> Any:
+def with_value(sys: BraxSystem, location: Location, value: ArrayLike, feature: str) -> Any:
     """Return the system with one array, or one entry of it, set."""
     old: Any = sys
-    for part in place.parts:
+    for part in location.parts:
         old = getattr(old, part)
     old = jnp.asarray(old)
-    target = old if place.index is None else old[place.index]
+    target = old if location.index is None else old[location.index]
     if jnp.shape(value) != target.shape:
-        entry = (*(place.index or ()), *[0] * target.ndim)
+        entry = (*(location.index or ()), *[0] * target.ndim)
         raise ValueError(
-            f"feature {feature!r} has shape {list(jnp.shape(value))} and {place} has "
-            f"{list(target.shape)}; name one entry, as in '{Place(place.parts, entry)}', or use "
-            "configure=(sys, features) -> sys"
+            f"feature {feature!r} has shape {list(jnp.shape(value))} and {location} has "
+            f"{list(target.shape)}; name one entry, as in '{Location(location.parts, entry)}', or "
+            "use configure=(sys, features) -> sys"
         )
     new = jnp.asarray(value, jnp.result_type(old, value))
-    if place.index is not None:
-        new = old.astype(new.dtype).at[place.index].set(new)
-    return _replaced(sys, place.parts, new)
+    if location.index is not None:
+        new = old.astype(new.dtype).at[location.index].set(new)
+    return _replaced(sys, location.parts, new)
 
 
 def _replaced(node: BraxSystem, parts: tuple[str, ...], value: ArrayLike) -> Any:
@@ -259,7 +259,7 @@ def _with_counted_frames(kind: type) -> type:
     return type(kind.__name__, (kind,), {"pipeline_step": pipeline_step})
 
 
-def with_start(env: Env, values: Mapping[Place, ArrayLike]) -> Any:
+def with_start(env: Env, values: Mapping[Location, ArrayLike]) -> Any:
     """Return a copy whose reset starts from, and observes, these entries of `q` and `qd`."""
     other = copy.copy(env)
     if "env" in vars(other) and "sys" not in vars(other):
@@ -270,46 +270,46 @@ def with_start(env: Env, values: Mapping[Place, ArrayLike]) -> Any:
     def pipeline_init(
         q: Float[Array, " q"], qd: Float[Array, " qd"], *rest: Any, **options: Any
     ) -> Any:
-        for place, value in values.items():
-            if place.parts == ("q",):
-                q = jnp.asarray(q).at[place.index].set(value)
+        for location, value in values.items():
+            if location.parts == ("q",):
+                q = jnp.asarray(q).at[location.index].set(value)
             else:
-                qd = jnp.asarray(qd).at[place.index].set(value)
+                qd = jnp.asarray(qd).at[location.index].set(value)
         return begin(q, qd, *rest, **options)
 
     other.pipeline_init = pipeline_init
     return other
 
 
-def check_parts_are_read(env: Env, name: str, places: Mapping[str, Place]) -> None:
+def check_parts_are_read(env: Env, name: str, locations: Mapping[str, Location]) -> None:
     """Refuse a part of the system that neither reset nor step reads: it would change nothing.
 
     Each backend reads its own copies of masses, gains and the like.
     """
-    if not places:
+    if not locations:
         return
     sys = env.unwrapped.sys
 
-    def leaf(place: Place) -> Any:
+    def leaf(location: Location) -> Any:
         value: Any = sys
-        for part in place.parts:
+        for part in location.parts:
             value = getattr(value, part)
         return jnp.asarray(value)
 
     def play(values: Sequence[Array], key: Key[Array, ""], action: Float[Array, " action"]) -> Any:
         changed = sys
-        for place, value in zip(places.values(), values, strict=True):
-            changed = _replaced(changed, place.parts, value)
+        for location, value in zip(locations.values(), values, strict=True):
+            changed = _replaced(changed, location.parts, value)
         played = with_system(env, changed)
         with explain_errors(env, name, "reset and step"):
             return jax.tree.leaves(played.step(played.reset(key), action))
 
-    values = [leaf(place) for place in places.values()]
+    values = [leaf(location) for location in locations.values()]
     used = used_inputs(play, values, jax.random.key(0), jnp.zeros(env.action_size))
-    for (feature, place), read_at_all in zip(places.items(), used, strict=False):
+    for (feature, location), read_at_all in zip(locations.items(), used, strict=False):
         if not read_at_all:
             raise ValueError(
-                f"feature {feature!r} sets {place}, which {name} on the backend {env.backend!r} "
+                f"feature {feature!r} sets {location}, which {name} on the backend {env.backend!r} "
                 "does not read. The mjx backend reads MuJoCo's arrays (body_mass, dof_damping, "
                 "...), the others mostly Brax's (link.inertia.mass, actuator.gear, ...)"
             )

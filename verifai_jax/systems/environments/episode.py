@@ -115,7 +115,7 @@ def fold(
 ) -> tuple[Carry, Int[Array, ""]]:
     """Apply `carry = update(carry, sample)` to the samples of `rollout`, of which none is stored.
 
-    Behind the end the last valid sample comes again. **Returns:** the last carry, and the status.
+    After the end the last valid sample comes again. **Returns:** the last carry, and the status.
     """
     last, _, carry, _ = _run(episode, key, carry, lambda c, sample: (update(c, sample), None))
     return carry, _status(last, episode.delays.valid)
@@ -202,8 +202,8 @@ def _first_moment(
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), action)
     delays = episode.delays
     lines = (
-        Line.of(first.observation, delays.most_observation),
-        Line.of(nothing, delays.most_action),
+        Line.of(first.observation, delays.max_observation),
+        Line.of(nothing, delays.max_action),
     )
     return first, memory, lines
 
@@ -281,9 +281,9 @@ def count_required(function: Callable[..., Any]) -> int | None:
         return None
     if any(p.kind is p.VAR_POSITIONAL for p in parameters):
         return None
-    places = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     return sum(
-        p.kind in places and p.default is p.empty and p.name != "features" for p in parameters
+        p.kind in kinds and p.default is p.empty and p.name != "features" for p in parameters
     )
 
 
@@ -344,7 +344,7 @@ def read_signals(
 def check_signals_option(signals: object, state: str = "state") -> None:
     """Refuse a `signals=` option that `read_signals` could not use.
 
-    - `state`: what a function gets first, in words.
+    - `state`: what a function gets first, as text.
 
     **Raises:** `ValueError`.
     """
@@ -391,7 +391,7 @@ def check_features(
     """Refuse names of features that do not exist, and features that nothing would read.
 
     - `bound`: features that set something, `functions`: what a user may have given, and would read
-      any of them; `how`: how one is bound, in words.
+      any of them; `how`: how one is bound, as text.
 
     **Raises:** `UnknownNameError`, `ValueError`.
     """

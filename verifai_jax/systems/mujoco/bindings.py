@@ -24,7 +24,13 @@ from verifai_jax.systems.mujoco.derived_constants import (
     masses_of_geoms,
     recompute_inertia,
 )
-from verifai_jax.systems.mujoco.model import GEOM_MASS, Model, Place, free_centres_of_mass, place
+from verifai_jax.systems.mujoco.model import (
+    GEOM_MASS,
+    Location,
+    Model,
+    free_centres_of_mass,
+    locate,
+)
 
 STATE = ("qpos", "qvel", "act", "mocap_pos", "mocap_quat")
 APPLIED = ("ctrl", "xfrc_applied", "qfrc_applied")
@@ -54,7 +60,7 @@ class Binding:
     """One feature sets one place."""
 
     feature: str
-    place: Place
+    location: Location
     scaled: bool = False
 
 
@@ -82,7 +88,7 @@ class Bindings:
     @cached_property
     def arrays(self) -> frozenset[str]:
         """The model's arrays that differ between rows, derived ones included."""
-        changed = {binding.place.array for binding in self.parameters}
+        changed = {binding.location.array for binding in self.parameters}
         if changed & {"geom_size", "geom_pos", "geom_quat", GEOM_MASS} and self.solids:
             changed |= {"body_mass", "body_inertia", "body_ipos", "body_iquat"}
         changed.discard(GEOM_MASS)
@@ -102,11 +108,11 @@ class Bindings:
         """
         ordered = ("geom_size", "geom_pos", "geom_quat", GEOM_MASS)
         groups = [
-            [b for b in self.parameters if b.place.array in ordered],
-            [b for b in self.parameters if b.place.array == "body_mass"],
-            [b for b in self.parameters if b.place.array not in (*ordered, "body_mass")],
+            [b for b in self.parameters if b.location.array in ordered],
+            [b for b in self.parameters if b.location.array == "body_mass"],
+            [b for b in self.parameters if b.location.array not in (*ordered, "body_mass")],
         ]
-        bound = self.arrays | {binding.place.array for binding in groups[0]}
+        bound = self.arrays | {binding.location.array for binding in groups[0]}
         leaves = {name: jnp.asarray(self._base(name), _float()) for name in sorted(bound)}
         leaves = _set(leaves, groups[0], features, self._base)
         leaves = recompute_inertia(self.model.compiled, self.solids, leaves)
@@ -130,7 +136,7 @@ class Bindings:
         - `begin`: what they are where no feature sets them; as in the model's keyframe if None.
         """
         known = self.model.begin if begin is None else begin
-        bound = {"qpos", "qvel", "act"} | {b.place.array for b in self.state} | set(known)
+        bound = {"qpos", "qvel", "act"} | {b.location.array for b in self.state} | set(known)
         values = {
             name: jnp.asarray(known.get(name, self._base(name)), _float())
             for name in STATE
@@ -145,7 +151,7 @@ class Bindings:
         compiled = self.model.compiled
         shapes = {"ctrl": (compiled.nu,), "xfrc_applied": (compiled.nbody, 6)}
         shapes["qfrc_applied"] = (compiled.nv,)
-        bound = {binding.place.array for binding in self.applied}
+        bound = {binding.location.array for binding in self.applied}
         values = {name: jnp.zeros(shapes[name], _float()) for name in APPLIED if name in bound}
         if "ctrl" in values and "ctrl" in self.model.begin:
             values["ctrl"] = jnp.asarray(self.model.begin["ctrl"], _float())
@@ -156,12 +162,12 @@ class Bindings:
     def check(self, features: Mapping[str, Any]) -> None:
         """Refuse features that the bindings do not fit.
 
-        **Raises:** `ValueError` for a bound feature that there is not, one of another shape than
+        **Raises:** `ValueError` for a bound feature that does not exist, one of another shape than
         its place, and a `Signal` where only constants can go.
         """
         for binding in self.all:
-            check_names(f"feature bound to {binding.place.path!r}:", [binding.feature], features)
-            value, path = features[binding.feature], binding.place.path
+            check_names(f"feature bound to {binding.location.path!r}:", [binding.feature], features)
+            value, path = features[binding.feature], binding.location.path
             if is_waveform(value):
                 if binding not in self.applied:
                     raise ValueError(
@@ -175,10 +181,10 @@ class Bindings:
                 )
             else:
                 shape = np.shape(value)
-            if shape not in ((), binding.place.shape) or (shape == () != binding.place.shape):
+            if shape not in ((), binding.location.shape) or (shape == () != binding.location.shape):
                 raise ValueError(
                     f"feature {binding.feature!r} has shape {list(shape)}, but {path!r} has "
-                    f"{list(binding.place.shape)}{_one_of(path, shape, binding.place)}"
+                    f"{list(binding.location.shape)}{_one_of(path, shape, binding.location)}"
                 )
 
     def _base(self, array: str) -> np.ndarray:
@@ -202,7 +208,7 @@ class Bindings:
 def resolve_bindings(model: Model, bind: Bound | None) -> Bindings:
     """Resolve the `bind` argument of a system.
 
-    **Raises:** as `model.place` does; `ValueError` for two features on one number, or a
+    **Raises:** as `model.locate` does; `ValueError` for two features on one number, or a
     factor on what the model has no value of.
     """
     sorted_: dict[str, list[Binding]] = {"parameters": [], "state": [], "applied": []}
@@ -210,7 +216,7 @@ def resolve_bindings(model: Model, bind: Bound | None) -> Bindings:
     for feature, targets in (bind or {}).items():
         for target in [targets] if isinstance(targets, str | Scaled) else targets:
             path = target.path if isinstance(target, Scaled) else target
-            for where in place(model.compiled, path):
+            for where in locate(model.compiled, path):
                 group = "state" if where.array in STATE else "parameters"
                 group = "applied" if where.array in APPLIED else group
                 if isinstance(target, Scaled) and group != "parameters":
@@ -222,10 +228,10 @@ def resolve_bindings(model: Model, bind: Bound | None) -> Bindings:
                 sorted_[group].append(Binding(feature, where, isinstance(target, Scaled)))
     parameters, state, applied = (tuple(group) for group in sorted_.values())
     masses = {
-        int(i): b.place.path
+        int(i): b.location.path
         for b in parameters
-        if b.place.array == GEOM_MASS
-        for i in b.place.index
+        if b.location.array == GEOM_MASS
+        for i in b.location.index
     }
     changed = _rows(parameters, "geom_size", "geom_pos", "geom_quat")
     solids = bodies_of_geoms(model, changed, masses)
@@ -236,10 +242,10 @@ def resolve_bindings(model: Model, bind: Bound | None) -> Bindings:
 def _rows(parameters: Iterable[Binding], *arrays: str) -> set[int]:
     """Return the rows of these arrays that features change."""
     return {
-        int(i) // (4 if binding.place.array.endswith("quat") else 3)
+        int(i) // (4 if binding.location.array.endswith("quat") else 3)
         for binding in parameters
-        if binding.place.array in arrays
-        for i in binding.place.index
+        if binding.location.array in arrays
+        for i in binding.location.index
     }
 
 
@@ -254,7 +260,7 @@ def _moving_bodies(
     return moving | {s.body for s in solids if len(s.geoms) > 1 or placed & set(s.geoms)}
 
 
-def _claim(taken: dict[tuple[str, int], str], where: Place, feature: str) -> None:
+def _claim(taken: dict[tuple[str, int], str], where: Location, feature: str) -> None:
     for i in where.index.tolist():
         other = taken.setdefault((where.array, i), feature)
         if other != feature:
@@ -269,7 +275,7 @@ def _set(
 ) -> dict[str, Any]:
     arrays = dict(arrays)
     for binding in bound:
-        where = binding.place
+        where = binding.location
         array = arrays[where.array]
         value = jnp.asarray(features[binding.feature], array.dtype) * where.sign
         if binding.scaled:
@@ -280,7 +286,7 @@ def _set(
     return arrays
 
 
-def _one_of(path: str, shape: tuple[int, ...], where: Place) -> str:
+def _one_of(path: str, shape: tuple[int, ...], where: Location) -> str:
     if shape == () and where.shape:
         return f"; bind one of its numbers, like '{path}[0]'"
     return ""

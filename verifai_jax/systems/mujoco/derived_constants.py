@@ -220,12 +220,12 @@ def _inertia(kind: int, size: Float[Array, "3"]) -> Float[Array, "3"]:
 
 
 def _combine(parts: list[Any]) -> tuple[Array, Array, Array, Array]:
-    masses, places = (jnp.stack([part[i] for part in parts]) for i in range(2))
+    masses, centres = (jnp.stack([part[i] for part in parts]) for i in range(2))
     mass = jnp.sum(masses)
-    centre = masses @ places / mass
+    centre = masses @ centres / mass
     full = jnp.zeros((3, 3), centre.dtype)
-    for own, place, moments, quat in parts:
-        turn, arm = _rotation(quat), place - centre
+    for own, position, moments, quat in parts:
+        turn, arm = _rotation(quat), position - centre
         full = full + (turn * moments) @ turn.T
         full = full + own * (jnp.dot(arm, arm) * jnp.eye(3, dtype=arm.dtype) - jnp.outer(arm, arm))
     moments, axes = jnp.linalg.eigh(full)
@@ -250,7 +250,7 @@ def _quaternion(matrix: Float[Array, "3 3"]) -> Float[Array, "4"]:
     m = matrix
     signs = jnp.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], m.dtype)
     squares = 1 + signs @ jnp.diag(m)
-    ways = jnp.array(
+    candidates = jnp.array(
         [
             [squares[0], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
             [m[2, 1] - m[1, 2], squares[1], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
@@ -258,7 +258,7 @@ def _quaternion(matrix: Float[Array, "3 3"]) -> Float[Array, "4"]:
             [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], squares[3]],
         ]
     )
-    best = ways[jnp.argmax(squares)]
+    best = candidates[jnp.argmax(squares)]
     return best / jnp.linalg.norm(best)
 
 

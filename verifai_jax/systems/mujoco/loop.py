@@ -20,7 +20,7 @@ from verifai_jax.core.user_errors import explain_user_error
 from verifai_jax.systems.base import Seed
 from verifai_jax.systems.delays import NO_DELAY, Delay, Line, through
 from verifai_jax.systems.mujoco.bindings import Bindings, RecordingFeatures
-from verifai_jax.systems.mujoco.model import Place, names, reading
+from verifai_jax.systems.mujoco.model import Location, names, reading
 from verifai_jax.systems.pytree_checks import (
     as_precise_as,
     check_like,
@@ -129,20 +129,20 @@ class Loop:
         }
 
     @cached_property
-    def places(self) -> dict[str, Place]:
+    def locations(self) -> dict[str, Location]:
         """The places of signals that are named by a path."""
         if callable(self.signals):
             return {}
         chosen = self._default_signals() if self.signals is None else self.signals
-        places = {}
+        found = {}
         added = list(self.bindings.model.contact_sensors)
         for name, path in chosen.items():
             if callable(path):
                 continue
             if isinstance(path, str) and path.startswith("contact/"):
                 path = f"sensor/{added.pop(0)}"
-            places[name] = reading(self.compiled, path)
-        return places
+            found[name] = reading(self.compiled, path)
+        return found
 
     def _default_signals(self) -> dict[str, str]:
         paths: dict[str, str] = {}
@@ -156,12 +156,12 @@ class Loop:
     @cached_property
     def delayed_sensors(self) -> np.ndarray:
         """A mask of the `sensordata` that describe the last physics step, `[nsensordata]`."""
-        late = np.zeros(self.compiled.nsensordata, bool)
+        delayed = np.zeros(self.compiled.nsensordata, bool)
         for i in range(self.compiled.nsensor):
             if self.compiled.sensor_needstage[i] >= 3:
                 start = int(self.compiled.sensor_adr[i])
-                late[start : start + int(self.compiled.sensor_dim[i])] = True
-        return late
+                delayed[start : start + int(self.compiled.sensor_dim[i])] = True
+        return delayed
 
     def start(self, features: Features, key: Seed) -> dict[str, Array]:
         """Return `qpos`, `qvel` and `act` at time 0."""
@@ -187,7 +187,7 @@ class Loop:
             in_working_precision(self.controller_memory),
             jnp.int32(0),
             jnp.array(True),
-            Line.of(self.rest(), self.delay.most),
+            Line.of(self.rest(), self.delay.max_steps),
         )
 
     def rest(self) -> Float[Array, " nu"]:
@@ -294,18 +294,18 @@ class Loop:
             return dict(self.signals(state.time, state, ctrl, features))
         arrays = {**state._asdict(), "sensordata": sensors, "ctrl": ctrl}
         values = {}
-        for name, chosen in (self.signals or self.places).items():
+        for name, chosen in (self.signals or self.locations).items():
             if callable(chosen):
                 values[name] = chosen(state.time, state, ctrl, features)
             else:
-                where = self.places[name]
+                where = self.locations[name]
                 values[name] = jnp.ravel(arrays[where.array])[where.index].reshape(where.shape)
         return values
 
     def finite_signals(self) -> tuple[str, ...]:
         """Return the signals that are parts of the state, whose finiteness is the state's."""
         parts = ("qpos", "qvel", "act", "ctrl")
-        return tuple(name for name, place in self.places.items() if place.array in parts)
+        return tuple(name for name, location in self.locations.items() if location.array in parts)
 
     def arrays_read(self, features: Features) -> frozenset[str]:
         """Return the names of the state's arrays that a function or a signal reads."""
@@ -333,7 +333,7 @@ class Loop:
             for name, variable in zip(State._fields, traced.invars, strict=False)
             if any(variable is one for one in touched)
         }
-        read |= {place.array for place in self.places.values()}
+        read |= {location.array for location in self.locations.values()}
         return frozenset(read & set(fields))
 
     def check(self, features: Features) -> None:
@@ -366,7 +366,7 @@ class Loop:
             return signals
 
         jax.eval_shape(everything, features, key)
-        if any(b.place.array == "ctrl" for b in self.bindings.applied) and self.controller:
+        if any(b.location.array == "ctrl" for b in self.bindings.applied) and self.controller:
             raise ValueError("a feature is bound to a ctrl that the controller already sets")
         for name in features:
             if name not in used:

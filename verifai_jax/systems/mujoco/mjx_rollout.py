@@ -26,7 +26,7 @@ from verifai_jax.systems.mujoco.model import MjModel, MjxData, MjxModel, Model, 
 
 # Values at which MJX looks once, to see whether there is any friction; features may change them.
 _SWITCHES = ("dof_frictionloss", "tendon_frictionloss")
-LEAST = 1e-9
+MIN_POSITIVE = 1e-9
 """Friction instead of zero: MJX takes a row of friction without friction for an equality."""
 
 
@@ -202,7 +202,7 @@ def with_leaves(model: MjxModel, bindings: Bindings, features: Features) -> Any:
     for name, value in leaves.items():
         old = _leaf(model, name)
         if name in _SWITCHES:
-            value = jnp.maximum(value, LEAST)
+            value = jnp.maximum(value, MIN_POSITIVE)
         changes[name] = value.reshape(old.shape).astype(old.dtype)
     model = model.tree_replace(changes)
     return recompute_constants(model) if bindings.moves_constants else model
@@ -215,12 +215,12 @@ def _mjx_model(bindings: Bindings) -> tuple[Any, Any]:
     if precision not in bindings.models:
         compiled = copy.copy(bindings.model.compiled)
         for binding in bindings.parameters:
-            array, where = binding.place.array, binding.place.index
+            array, where = binding.location.array, binding.location.index
             if array in _SWITCHES:
                 flat = getattr(compiled, array).reshape(-1)
-                flat[where] = np.maximum(flat[where], LEAST)
+                flat[where] = np.maximum(flat[where], MIN_POSITIVE)
             if array in ("opt.density", "opt.viscosity", "opt.wind"):
-                compiled.opt.density = max(compiled.opt.density, LEAST)
+                compiled.opt.density = max(compiled.opt.density, MIN_POSITIVE)
         # Constants of every program that is traced, so never traced themselves.
         with jax.ensure_compile_time_eval():
             model = mjx.put_model(compiled, impl="jax")
@@ -229,14 +229,14 @@ def _mjx_model(bindings: Bindings) -> tuple[Any, Any]:
 
 
 def why_not(bindings: Bindings) -> str | None:
-    """Return the reason why MJX cannot simulate a model; None where it can."""
+    """Return the reason why MJX cannot simulate a model; None if it can."""
     try:
         _mjx_model(bindings)
     except NotImplementedError as error:
         return f"MJX cannot do this model: {error}{_cure(bindings.model)}"
     compiled = bindings.model.compiled
-    places = {"body_pos", "body_quat", "site_pos", "site_quat"}
-    if compiled.neq and bindings.arrays & places:
+    arrays = {"body_pos", "body_quat", "site_pos", "site_quat"}
+    if compiled.neq and bindings.arrays & arrays:
         return "MJX does not recompute the anchors of equality constraints that features move"
     if compiled.nplugin:
         return "MJX has no plugins"
@@ -244,7 +244,7 @@ def why_not(bindings: Bindings) -> str | None:
 
 
 def _cure(model: Model) -> str:
-    """Return the lines that make MJX take a model, tried out; empty where none are known."""
+    """Return the lines that make MJX take a model, tried out; empty if none are known."""
     mujoco = require("mujoco", extra="mujoco")
     compiled, lines = copy.copy(model.compiled), []
     known = {int(kind) for kind in mjx_module().SensorType}
@@ -310,7 +310,7 @@ def _assign(mujoco: ModuleType, compiled: MjModel, attribute: str, value: Any) -
 
 
 def _refusal(compiled: MjModel) -> str | None:
-    """Return what MJX says against a model; None where it takes it."""
+    """Return what MJX says against a model; None if it takes it."""
     try:
         mjx = mjx_module()
         mjx.make_data(mjx.put_model(compiled, impl="jax"))
@@ -333,7 +333,7 @@ def _integrator(mjx: ModuleType, model: MjxModel) -> Any:
 
 
 def reverse_hint(compiled: MjModel) -> str | None:
-    """Return why reverse mode does not work, and what makes it work; empty where it works."""
+    """Return why reverse mode does not work, and what makes it work; empty if it works."""
     if compiled.opt.integrator != 1 or not has_constraints(compiled):  # 1: Runge-Kutta
         return None
     return (

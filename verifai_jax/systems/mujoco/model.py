@@ -1,7 +1,7 @@
 """A MuJoCo model and the names of its parts: `"body/pole/mass"`, `"option/gravity[2]"`.
 
     model = load("envs/mujoco_cartpole.xml")
-    place(model.compiled, "geom/floor/friction[0]")       # which numbers of the model that is
+    locate(model.compiled, "geom/floor/friction[0]")       # which numbers of the model that is
     reading(model.compiled, "joint/hinge/qpos")           # which numbers of a state that is
 
 A path is `kind/name/field`, with an index `[i]` or a slice `[i:j]` where a field has several
@@ -95,7 +95,7 @@ _PATH = re.compile(r"^(?P<kind>[^/\[\]]+)/(?P<rest>.+?)(\[(?P<index>[^\]]*)\])?$
 
 
 @dataclass(frozen=True)
-class Place:
+class Location:
     """The place of some numbers in one array.
 
     - `array`: its name in MjModel or MjData; `"opt.gravity"` is in the model's options.
@@ -340,7 +340,7 @@ def names(model: MjModel, kind: str) -> list[str]:
     return [name for name in every if name]
 
 
-def place(model: MjModel, path: str) -> list[Place]:
+def locate(model: MjModel, path: str) -> list[Location]:
     """Return the places that a bound path sets.
 
     **Raises:** `UnknownNameError` for an unknown kind, element or field, with the nearest ones;
@@ -365,12 +365,12 @@ def place(model: MjModel, path: str) -> list[Place]:
         array = _FIELDS[kind][field]
         rows = _dofs(model, element) if array.startswith("dof_") else np.array([element])
         return [_pick(path, array, _flat(getattr(model, array), rows), index)]
-    return _place_input(model, kind, field, element, path, index)
+    return _locate_input(model, kind, field, element, path, index)
 
 
-def _place_input(
+def _locate_input(
     model: MjModel, kind: str, field: str, element: int, path: str, index: str | None
-) -> list[Place]:
+) -> list[Location]:
     if kind == "body":
         start = 6 * element + (3 if field == "torque" else 0)
         return [_pick(path, "xfrc_applied", start + np.arange(3), index)]
@@ -394,16 +394,16 @@ def _place_input(
             "this actuator has gear and gainprm"
         )
     column, sets_gain = (1, True) if field == "kp" else (2, model.actuator_biasprm[element, 1] == 0)
-    places = [Place("actuator_biasprm", np.array([element * bias + column]), (), path, -1.0)]
+    locations = [Location("actuator_biasprm", np.array([element * bias + column]), (), path, -1.0)]
     if sets_gain:
-        places.append(Place("actuator_gainprm", np.array([element * gain]), (), path))
-    return places
+        locations.append(Location("actuator_gainprm", np.array([element * gain]), (), path))
+    return locations
 
 
-def reading(model: MjModel, path: str) -> Place:
+def reading(model: MjModel, path: str) -> Location:
     """Return the place of a signal's path in the state.
 
-    **Raises:** as `place`.
+    **Raises:** as `locate`.
     """
     kind, name, field, index = _split(path, (*_READINGS, "sensor", "contact"))
     if kind == "sensor":
@@ -479,21 +479,21 @@ def _flat(array: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return np.arange(array.size).reshape(array.shape)[rows].ravel()
 
 
-def _pick(path: str, array: str, where: np.ndarray, index: str | None) -> Place:
+def _pick(path: str, array: str, where: np.ndarray, index: str | None) -> Location:
     """Return the place of those numbers of an element that an index or a slice selects."""
     if index is None:
-        return Place(array, where, () if where.size == 1 else (where.size,), path)
+        return Location(array, where, () if where.size == 1 else (where.size,), path)
     try:
         if ":" in index:
             first, last = (int(end) if end.strip() else None for end in index.split(":"))
             part = where[first:last]
             if part.size == 0:
                 raise IndexError
-            return Place(array, part, (part.size,), path)
+            return Location(array, part, (part.size,), path)
         number = int(index)
         if not 0 <= number < where.size:
             raise IndexError
-        return Place(array, where[[number]], (), path)
+        return Location(array, where[[number]], (), path)
     except (IndexError, ValueError):
         raise ValueError(
             f"{path!r}: [{index}] is no part of it; its indices are 0 to {where.size - 1}"

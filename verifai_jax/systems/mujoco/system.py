@@ -97,7 +97,9 @@ class MuJoCo(System):
 
     def why_error(self, features: Features) -> str | None:
         """Return what is wrong with the delay of a simulation that ended with `ERROR`, if it is."""
-        return self.loop.delay.refusal(features, "this system") if self.loop.delay.most else None
+        return (
+            self.loop.delay.refusal(features, "this system") if self.loop.delay.max_steps else None
+        )
 
     @property
     def likely(self) -> str:
@@ -109,7 +111,7 @@ class MuJoCo(System):
         return "native" if has_constraints(self.loop.compiled) else "mjx"
 
     def why_not(self, backend: str) -> str | None:
-        """Return the reason why an engine cannot simulate this model; None where it can."""
+        """Return the reason why an engine cannot simulate this model; None if it can."""
         if backend not in BACKENDS:
             raise unknown_name("backend", backend, (*BACKENDS, "auto"))
         return None if backend == "native" else why_not(self.loop.bindings)
@@ -292,7 +294,7 @@ def mujoco(
             if isinstance(path, str) and path.startswith("contact/")
         )
     delay = as_delay(action_delay, "action_delay")
-    if delay.most and controller is None:
+    if delay.max_steps and controller is None:
         raise ValueError("action_delay needs a controller; got none")
     loaded = load(
         model,
@@ -314,7 +316,7 @@ def mujoco(
         substeps=count_periods(control_period, timestep, "control_period", "the model's timestep"),
         delay=delay,
     )
-    _ = loop.places
+    _ = loop.locations
     system = MuJoCo(loop)
     return system if backend == "auto" else system.with_backend(backend)
 

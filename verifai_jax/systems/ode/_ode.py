@@ -103,7 +103,7 @@ class Ode(System):
     ) -> tuple[Any, Int[Array, ""]]:
         """Simulate, and let `carry = update(carry, sample)` take in each sample; none is stored.
 
-        Behind an early end the last valid sample comes again, until the end of the duration.
+        After an early end the last valid sample comes again, until the end of the duration.
 
         **Returns:** the last carry, and the status.
         """

@@ -16,7 +16,7 @@ from verifai_jax.systems.ode.integrators import Derivative, Integrator, Step, Ti
 
 
 def adaptive(
-    solver: str = "Tsit5", *, rtol: float = 1e-6, atol: float = 1e-8, most_steps: int = 256
+    solver: str = "Tsit5", *, rtol: float = 1e-6, atol: float = 1e-8, max_steps: int = 256
 ) -> Integrator:
     """Make an integrator that takes each step of `ode` by as many steps of diffrax as it needs.
 
@@ -30,7 +30,7 @@ def adaptive(
     - `solver`: the name of a solver of diffrax: `"Tsit5"` and `"Dopri8"` where the equations are
       not stiff, `"Kvaerno3"` and `"Kvaerno5"` (implicit) where they are.
     - `rtol`, `atol`: relative and absolute tolerance of a step's error.
-    - `most_steps`: of diffrax in one step of `ode`; what needs more becomes `NONFINITE`.
+    - `max_steps`: of diffrax in one step of `ode`; what needs more becomes `NONFINITE`.
 
     **Raises:** `MissingExtra` without diffrax, `UnknownNameError` for an unknown solver, and
     `ValueError` for tolerances that are not positive.
@@ -39,7 +39,7 @@ def adaptive(
     for name, tolerance in (("rtol", rtol), ("atol", atol)):
         if not is_number(tolerance) or not 0 < tolerance < 1:
             raise ValueError(f"{name} must lie between 0 and 1; got {tolerance!r}")
-    check_count("most_steps", most_steps)
+    check_count("max_steps", max_steps)
     solvers = _solvers(diffrax)
     if solver not in solvers:
         raise unknown_name("solver of diffrax", solver, solvers)
@@ -60,7 +60,7 @@ def adaptive(
             saveat=diffrax.SaveAt(t1=True),
             stepsize_controller=controller,
             adjoint=diffrax.DirectAdjoint(),
-            max_steps=most_steps,
+            max_steps=max_steps,
             throw=False,
         )
         reached = solution.result == diffrax.RESULTS.successful

@@ -47,11 +47,11 @@ class DelayLine:
         """Return the value at a time in seconds; beyond the ends that of the end."""
         values, latest = jnp.asarray(self.values), jnp.asarray(self.latest)
         count = values.shape[0]
-        place = (latest - jnp.asarray(time, latest.dtype)) / self.period
+        position = (latest - jnp.asarray(time, latest.dtype)) / self.period
         # Unlike jnp.clip, whose derivative at an end is halved.
-        place = jnp.where(place < 0, 0, jnp.where(place > count - 1, count - 1, place))
-        left = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, count - 2)
-        share = (place - left).astype(values.dtype)
+        position = jnp.where(position < 0, 0, jnp.where(position > count - 1, count - 1, position))
+        left = jnp.clip(jnp.floor(position).astype(jnp.int32), 0, count - 2)
+        share = (position - left).astype(values.dtype)
         return values[left] * (1 - share) + values[left + 1] * share
 
     @property

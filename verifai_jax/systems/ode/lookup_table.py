@@ -99,22 +99,22 @@ class LookupTable:
             float, *(a for a in arrays if jnp.issubdtype(a.dtype, jnp.floating))
         )
         values = jnp.asarray(self.values, dtype)
-        places = [
-            self._place(axis, x.astype(dtype)) for axis, x in zip(self.axes, arrays, strict=True)
+        positions = [
+            self._position(axis, x.astype(dtype)) for axis, x in zip(self.axes, arrays, strict=True)
         ]
         total: Any = 0.0
         # The corners of the cell, each weighted by the shares along the axes.
-        for corner in itertools.product((0, 1), repeat=len(places)):
-            index = tuple(left + side for (left, _), side in zip(places, corner, strict=True))
+        for corner in itertools.product((0, 1), repeat=len(positions)):
+            index = tuple(left + side for (left, _), side in zip(positions, corner, strict=True))
             weight: Any = 1.0
-            for (_, share), side in zip(places, corner, strict=True):
+            for (_, share), side in zip(positions, corner, strict=True):
                 weight = weight * (share if side else 1 - share)
             entry = values[index]
             weight = jnp.asarray(weight, dtype)
             total = total + entry * weight.reshape(weight.shape + (1,) * (entry.ndim - weight.ndim))
         return total
 
-    def _place(self, axis: tuple[float, ...], x: Any) -> tuple[Any, Any]:
+    def _position(self, axis: tuple[float, ...], x: Any) -> tuple[Any, Any]:
         """Return the index of the breakpoint before a number, and the share of the way on."""
         points = np.asarray(axis)
         if self.beyond == "clip":

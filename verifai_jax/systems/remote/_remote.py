@@ -36,9 +36,9 @@ from verifai_jax.systems.remote.tls import File, server_context
 
 log = logging.getLogger("verifai_jax.remote")
 
-MOST_BYTES = 16 << 20
+MAX_BYTES = 16 << 20
 """Bytes of one message of a client, unless `remote` is given another limit."""
-MOST_MEMORY = 256 << 20
+MAX_MEMORY = 256 << 20
 """Bytes of unfinished messages of all clients together, unless `remote` is given another limit."""
 LOOPBACKS = ("127.0.0.1", "::1")
 """Addresses of this machine, by IPv4 and IPv6."""
@@ -153,8 +153,8 @@ def remote(
     signals: SignalNames | None = None,
     dt: float | None = None,
     length: int | None = None,
-    most_bytes: int = MOST_BYTES,
-    most_memory: int = MOST_MEMORY,
+    max_bytes: int = MAX_BYTES,
+    max_memory: int = MAX_MEMORY,
 ) -> Remote:
     """Make a system that programs simulate which connect to this one.
 
@@ -175,8 +175,8 @@ def remote(
       status `error`; waits, and says so in the log, when left out.
     - `signals`, `dt`, `length`: the form of every trace; see `blackbox.TraceForm`. A client that
       sends another gets an error, and the row has status `error`.
-    - `most_bytes`: of one message from a client.
-    - `most_memory`: bytes of unfinished messages of all clients together, at least `most_bytes`;
+    - `max_bytes`: of one message from a client.
+    - `max_memory`: bytes of unfinished messages of all clients together, at least `max_bytes`;
       beyond it the client whose message began first is sent away, and may come back.
 
     **Returns:** a `Remote`, which listens once it is needed, or in a `with` statement.
@@ -195,13 +195,13 @@ def remote(
         if value is not None and not (isinstance(value, int | float) and value > 0):
             raise ValueError(f"{name} must be a positive number of seconds; got {value!r}")
     check_count("retries", retries, 0)
-    if not isinstance(most_bytes, int) or not 1024 <= most_bytes < 2**31:
-        raise ValueError(f"most_bytes must be an integer from 1024 to 2**31 - 1; got {most_bytes}")
-    if not isinstance(most_memory, int) or most_memory < most_bytes:
+    if not isinstance(max_bytes, int) or not 1024 <= max_bytes < 2**31:
+        raise ValueError(f"max_bytes must be an integer from 1024 to 2**31 - 1; got {max_bytes}")
+    if not isinstance(max_memory, int) or max_memory < max_bytes:
         raise ValueError(
-            f"most_memory must be an integer of at least most_bytes={most_bytes}; got {most_memory}"
+            f"max_memory must be an integer of at least max_bytes={max_bytes}; got {max_memory}"
         )
-    if token is None and not all(_is_loopback(place[4][0]) for place in _places(host, port)):
+    if token is None and not all(_is_loopback(address[4][0]) for address in _addresses(host, port)):
         raise ValueError(
             f"host {host!r} is open to other machines, and whoever connects answers for the "
             "simulator: give token='...', the same here and to the clients, or host='127.0.0.1'"
@@ -210,7 +210,7 @@ def remote(
         raise ValueError("private_key belongs to a certificate: give certificate='...', too")
     tls = None if certificate is None else server_context(certificate, private_key)
     declared = TraceForm(signals, dt, length)
-    rules = Rules(token, timeout, retries, patience, most_bytes, declared, most_memory, tls)
+    rules = Rules(token, timeout, retries, patience, max_bytes, declared, max_memory, tls)
     return Remote(host, port, rules)
 
 
@@ -233,17 +233,17 @@ def _next(batch: Batch, server: Server) -> tuple[int, Outcome]:
         return outcome
 
 
-def _places(host: str, port: int) -> list[Any]:
+def _addresses(host: str, port: int) -> list[Any]:
     """Return the addresses that `host` resolves to, each once; both loopbacks for `localhost`."""
-    places = []
+    addresses = []
     for name in LOOPBACKS if host == "localhost" else (host,):
         try:
             kind = socket.SOCK_STREAM
             resolved = socket.getaddrinfo(name, port, type=kind, flags=socket.AI_PASSIVE)
         except OSError as error:
             raise ValueError(f"host {host!r} is no address of this machine: {error}") from error
-        places += [p for p in resolved if p[4] not in [other[4] for other in places]]
-    return places
+        addresses += [p for p in resolved if p[4] not in [other[4] for other in addresses]]
+    return addresses
 
 
 def _is_loopback(address: str) -> bool:
@@ -256,7 +256,7 @@ def _listen(host: str, port: int) -> list[socket.socket]:
         opened: list[socket.socket] = []
         chosen = port
         try:
-            for family, kind, _, _, place in _places(host, port):
+            for family, kind, _, _, address in _addresses(host, port):
                 if host == "localhost" and family == socket.AF_INET6 and not _has_ipv6():
                     continue
                 sock = socket.socket(family, kind)
@@ -265,7 +265,7 @@ def _listen(host: str, port: int) -> list[socket.socket]:
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 if family == socket.AF_INET6:
                     sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-                sock.bind((place[0], chosen, *place[2:]))
+                sock.bind((address[0], chosen, *address[2:]))
                 sock.listen(128)
                 chosen = sock.getsockname()[1]
             return opened

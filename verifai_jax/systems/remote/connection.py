@@ -44,9 +44,9 @@ class Rules:
     timeout: float | None
     retries: int
     patience: float | None
-    most_bytes: int
+    max_bytes: int
     declared: TraceForm
-    most_memory: int
+    max_memory: int
     tls: ssl.SSLContext | None = None
 
 
@@ -126,7 +126,7 @@ class Client:
             "type": "hello",
             "protocol": wire.PROTOCOL,
             "challenge": None if rules.token is None else self.challenge,
-            "most_bytes": rules.most_bytes,
+            "max_bytes": rules.max_bytes,
             "signals": rules.declared.widths or None,
             "dt": rules.declared.dt,
             "length": rules.declared.length,
@@ -142,18 +142,18 @@ class Client:
             spoken = wire.brief(hello.get("protocol"))
             raise wire.WireError(f"this server speaks protocol {wire.PROTOCOL}; got {spoken}")
         self._authenticate(hello, rules.token)
-        for name, most in (("capacity", 10_000), ("parallel", hello.get("capacity", 1))):
+        for name, maximum in (("capacity", 10_000), ("parallel", hello.get("capacity", 1))):
             value = hello.get(name, 1)
-            if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= most:
+            if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= maximum:
                 raise wire.WireError(
-                    f"{name} must be an integer from 1 to {most}; got {wire.brief(value)}"
+                    f"{name} must be an integer from 1 to {maximum}; got {wire.brief(value)}"
                 )
             setattr(self, name, value)
         if isinstance(hello.get("name"), str):
             self.name = f"{wire.printable(hello['name'])} ({self.name})"
         self.window = self.parallel
         self.greeted, self.deadline = True, math.inf
-        self.frames.most = rules.most_bytes
+        self.frames.max_bytes = rules.max_bytes
 
     def _authenticate(self, hello: dict[str, Any], token: str | None) -> None:
         if token is None:

@@ -27,13 +27,13 @@ log = logging.getLogger("verifai_jax.remote")
 
 TICK = 0.1
 """Seconds between two checks of timeouts."""
-MOST_LOGGED = 20
+MAX_LOGGED = 20
 """Faults of one client that are logged."""
-MOST_UNREAD = 1 << 20
+MAX_UNREAD = 1 << 20
 """Bytes that a client may leave unread while it gives cause for more."""
 UNCOUNTED = 1 << 16
 """Bytes that a client may hold without that those of all are counted."""
-MOST_CLIENTS = 256
+MAX_CLIENTS = 256
 """Clients that may be connected at a time."""
 REMEMBERED = 1 << 16
 """Simulations of which is remembered which client made them."""
@@ -167,14 +167,14 @@ class Server(threading.Thread):
         except OSError:  # It is gone already.
             sock.close()
             return
-        if len(self.clients) >= MOST_CLIENTS:
+        if len(self.clients) >= MAX_CLIENTS:
             self._make_room()
-        full = len(self.clients) >= MOST_CLIENTS
+        full = len(self.clients) >= MAX_CLIENTS
         client = Client(sock, address)
         self.clients.add(client)
         self._selector.register(sock, selectors.EVENT_READ, client)
         if full:
-            self._send_away(client, f"there are {MOST_CLIENTS} clients already", retry=True)
+            self._send_away(client, f"there are {MAX_CLIENTS} clients already", retry=True)
         else:
             client.hello(self.rules)
         self._flush(client)
@@ -191,13 +191,13 @@ class Server(threading.Thread):
 
     def _bound_memory(self) -> None:
         """Send away whoever keeps a message unfinished longest while all hold too much."""
-        while sum(client.held for client in self.clients) > self.rules.most_memory:
+        while sum(client.held for client in self.clients) > self.rules.max_memory:
             client = min(self.clients, key=lambda client: (client.began, -client.held))
             # It may be as honest as the others, so its points have lost nothing but time.
             self.waiting.extendleft(reversed(client.has.values()))
             client.has.clear()
-            why = f"messages of all clients hold more than {self.rules.most_memory} bytes"
-            if client.leaving or len(client.out) > MOST_UNREAD:
+            why = f"messages of all clients hold more than {self.rules.max_memory} bytes"
+            if client.leaving or len(client.out) > MAX_UNREAD:
                 self._drop(client, f"was dropped: {why}")
             else:
                 self._send_away(client, why, retry=True)
@@ -335,11 +335,11 @@ class Server(threading.Thread):
     def _blame(self, client: Client, what: str, number: int | None = None) -> None:
         """Tell a client of a fault that concerns one result only."""
         client.faults += 1
-        if client.faults <= MOST_LOGGED:
+        if client.faults <= MAX_LOGGED:
             about = "" if number is None else f" (point {number})"
-            last = "; no more of its faults are logged" if client.faults == MOST_LOGGED else ""
+            last = "; no more of its faults are logged" if client.faults == MAX_LOGGED else ""
             log.warning("simulator %s%s: %s%s", client.name, about, what, last)
-        if len(client.out) > MOST_UNREAD:
+        if len(client.out) > MAX_UNREAD:
             raise wire.WireError("it is sent errors and does not read them")
         client.tell(what, number)
 
@@ -381,7 +381,7 @@ class Server(threading.Thread):
     def _free(self) -> list[Client]:
         return [client for client in self.clients if client.here and client.room > 0]
 
-    def _hand(self, client: Client, points: deque[Point], most: int) -> bool:
+    def _hand(self, client: Client, points: deque[Point], maximum: int) -> bool:
         """Hand points to a client; return whether any left the queue.
 
         What it has simulated before is left to another one, where there is one: a simulation that
@@ -391,7 +391,7 @@ class Server(threading.Thread):
             other.here and other is not client for other in self.clients
         )
         handed, left, before = [], [], len(points)
-        while points and len(handed) < most:
+        while points and len(handed) < maximum:
             point = points.popleft()
             if point.batch.cancelled:
                 continue

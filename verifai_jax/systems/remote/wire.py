@@ -56,11 +56,11 @@ def to_text(value: object) -> str:
 class Frames:
     """A stream of bytes, cut into messages as they arrive.
 
-    - `most`: how many bytes a frame may have, raw ones included.
+    - `max_bytes`: how many bytes a frame may have, raw ones included.
     """
 
-    def __init__(self, most: int) -> None:
-        self.most = most
+    def __init__(self, maximum: int) -> None:
+        self.max_bytes = maximum
         self._bytes = bytearray()
         self._needed = _LENGTH.size  # Bytes without which nothing more can be read.
         self._alien: list[str] = []
@@ -100,10 +100,10 @@ class Frames:
         return len(self._bytes)
 
     def _check_size(self, size: int) -> None:
-        if size > self.most:
+        if size > self.max_bytes:
             raise WireError(
-                f"a frame of {brief(size)} bytes was announced, at most {self.most} are accepted; "
-                "a frame begins with its length as 4 bytes, big-endian"
+                f"a frame of {brief(size)} bytes was announced, at most {self.max_bytes} are "
+                "accepted; a frame begins with its length as 4 bytes, big-endian"
             )
 
     def _parse(self, text: bytes) -> Message:
@@ -246,8 +246,8 @@ def brief(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def printable(value: object, most: int = 80) -> str:
+def printable(value: object, maximum: int = 80) -> str:
     """Write a stranger's text in one line that cannot garble a log or a terminal."""
     text = value if isinstance(value, str) else brief(value)
-    text = "".join(c if c.isprintable() else " " for c in text[: most + 1])
-    return text if len(text) <= most else text[: most - 3] + "..."
+    text = "".join(c if c.isprintable() else " " for c in text[: maximum + 1])
+    return text if len(text) <= maximum else text[: maximum - 3] + "..."

@@ -30,7 +30,7 @@ class _Round(NamedTuple):
     checkpoint: dict[str, Any]
 
 
-class Ahead:
+class Prefetch:
     """The rounds that are on their way; see the module's docstring.
 
     **Arguments:**
@@ -91,8 +91,8 @@ class Ahead:
             # Small rounds go together, in one block.
             while count < self._engine.block and self._next + count < self._limit:
                 try:
-                    most = min(self._batch, self._limit - self._next - count)
-                    points = np.asarray(self._proposals.next(most))
+                    maximum = min(self._batch, self._limit - self._next - count)
+                    points = np.asarray(self._proposals.next(maximum))
                 except Exception as error:
                     self._failure = error  # Raised when the rounds before it are stored.
                     break

@@ -159,10 +159,10 @@ def _signals(seen: Replay) -> dict[str, Any]:
         values = np.asarray(seen.trace.signals[name], np.float64)
         if values.ndim != 1 or len(shown) == SIGNALS:
             continue
-        places = np.unique(np.linspace(0, len(values) - 1, SAMPLES).round().astype(int))
+        indices = np.unique(np.linspace(0, len(values) - 1, SAMPLES).round().astype(int))
         shown[name] = {
-            "times": clock[places],
-            "values": values[places],
+            "times": clock[indices],
+            "values": values[indices],
             "least": np.min(values),
             "greatest": np.max(values),
         }

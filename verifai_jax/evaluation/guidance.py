@@ -1,7 +1,7 @@
 """The guide's term, the outcome and the trace of a simulation, for a search.
 
-    steering = Steering(guide=True, outcome=True)
-    steering.values(problem, trace, features)           # [size], traced by JAX
+    guidance = Steering(guide=True, outcome=True)
+    guidance.values(problem, trace, features)           # [size], traced by JAX
 
 Nothing of it decides a verdict. It is computed with the traces of a search that wants it, and
 nowhere else.
@@ -20,7 +20,7 @@ from verifai_jax.mtl.deciding import deciding_instant
 from verifai_jax.problem.problem import Problem
 
 
-class Steering(NamedTuple):
+class Guidance(NamedTuple):
     """The parts of it that are wanted.
 
     - `guide`: the value of the guide's term.
@@ -43,7 +43,7 @@ class Steering(NamedTuple):
         """Return whatever is wanted of one simulation, as `Verdicts` names it; traced by JAX."""
         wanted: dict[str, PyTree] = {}
         if self.size:
-            wanted["steering"] = self.values(problem, trace, features)
+            wanted["guidance"] = self.values(problem, trace, features)
         if self.trace:
             trace = trace.hold()
             signals = {name: as_array(trace.signals[name]) for name in problem.monitored}
@@ -63,7 +63,7 @@ class Steering(NamedTuple):
         return jnp.concatenate([part.astype(jnp.float32) for part in parts])
 
 
-NOTHING = Steering()
+NOTHING = Guidance()
 """Nothing but the robustness."""
 
 

@@ -20,7 +20,7 @@ def shortest(
     - `matrix`: rows of length one, up to rounding, so that one tolerance fits them all.
     - `bound`: least value of each row.
 
-    **Returns:** the vector; None where the inequalities contradict each other.
+    **Returns:** the vector; None if the inequalities contradict each other.
     """
     if np.all(bound <= 0):
         return np.zeros(matrix.shape[1])
@@ -41,7 +41,7 @@ def shortest(
 
 def shortest_in_box(
     rows: Float[np.ndarray, "m k"],
-    most: Float[np.ndarray, " m"],
+    maximum: Float[np.ndarray, " m"],
     low: Float[np.ndarray, " k"],
     high: Float[np.ndarray, " k"],
 ) -> Float[np.ndarray, " k"] | None:
@@ -49,22 +49,22 @@ def shortest_in_box(
 
     **Arguments:**
 
-    - `rows`, `most`: linear inequalities; rows of zeros are left out.
+    - `rows`, `maximum`: linear inequalities; rows of zeros are left out.
     - `low`, `high`: the box.
 
-    **Returns:** the vector; None where there is none.
+    **Returns:** the vector; None if there is none.
     """
     sizes = np.linalg.norm(rows, axis=1)
-    rows, most, sizes = rows[sizes > 0], most[sizes > 0], sizes[sizes > 0]
+    rows, maximum, sizes = rows[sizes > 0], maximum[sizes > 0], sizes[sizes > 0]
     identity = np.eye(rows.shape[1])
     z = shortest(
         np.concatenate([-rows / sizes[:, None], identity, -identity]),
-        np.concatenate([-most / sizes, low, -high]),
+        np.concatenate([-maximum / sizes, low, -high]),
     )
     return None if z is None else np.clip(z, low, high)
 
 
-def least_change(
+def smallest_change(
     theta: Float[np.ndarray, " p"],
     nominal: Float[np.ndarray, " p"],
     rho: Float[np.ndarray, " n"],
@@ -87,12 +87,12 @@ def least_change(
     - `free`: coordinates that may move.
     - `bounded`: whether they stay in the unit cube.
 
-    **Returns:** the step; None where the linear model has no such point.
+    **Returns:** the step; None if the linear model has no such point.
     """
-    places = np.flatnonzero(free)
+    indices = np.flatnonzero(free)
     rows = np.flatnonzero(np.isfinite(rho))
-    linear = gradients[np.ix_(rows, places)]
-    gap = (theta - nominal)[places]
+    linear = gradients[np.ix_(rows, indices)]
+    gap = (theta - nominal)[indices]
     # With z = theta + step - nominal: linear @ z >= bound.
     bound = target - rho[rows] + linear @ gap
     sizes = np.linalg.norm(linear, axis=1)
@@ -101,12 +101,12 @@ def least_change(
     moved = sizes > 0
     matrix, bound = linear[moved] / sizes[moved, None], bound[moved] / sizes[moved]
     if bounded:
-        identity = np.eye(len(places))
+        identity = np.eye(len(indices))
         matrix = np.vstack([matrix, identity, -identity])
-        bound = np.concatenate([bound, -nominal[places], nominal[places] - 1])
+        bound = np.concatenate([bound, -nominal[indices], nominal[indices] - 1])
     z = shortest(matrix, bound)
     if z is None:
         return None
     step = np.zeros_like(theta)
-    step[places] = z - gap
+    step[indices] = z - gap
     return step

@@ -1,8 +1,8 @@
-"""Marks of simulations, numbers of what they covered, and who was the first to have each.
+"""Coverage ids of simulations, numbers of what they covered, and who was the first to have each.
 
-    marks = MarkBook(problem)
-    rows = marks.of(points, verdicts)                   # [n, marks], -1 for nothing
-    fresh = marks.add(rows)                             # [n], marks that no earlier row had
+    coverage = CoverageCounts(problem)
+    rows = coverage.of(points, verdicts)                   # [n, ids], -1 for nothing
+    fresh = coverage.add(rows)                             # [n], ids that no earlier row had
 
 The numbers: statuses first, then what features cover (transitions of an automaton, and pairs of
 them), then what traces show (`problem.behaviour`): cells, and the clause nearest to breaking.
@@ -21,48 +21,48 @@ from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search.base import KIND
 
-SEEN = "marks.seen"
-"""Entry of a checkpoint: how many rows had each mark."""
+SEEN = "coverage.seen"
+"""Entry of a checkpoint: how many rows had each coverage id."""
 
 
-class MarkBook:
-    """The marks of a run, counted; see the module's docstring."""
+class CoverageCounts:
+    """The coverage ids of a run, counted; see the module's docstring."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
-        self.features = problem.space.root.mark_count
+        self.features = problem.space.root.coverage_id_count
         self.behaviour = 0 if problem.behaviour is None else problem.behaviour.total
         self.counts = np.zeros(len(Status) + self.features + self.behaviour, np.int64)
 
     @property
     def width(self) -> int:
-        """Number of marks of a row at most."""
+        """Number of coverage ids of a row at most."""
         return 1 + self._feature_width + self._shown
 
     @property
     def _feature_width(self) -> int:
         space = self.problem.space
         point = jax.ShapeDtypeStruct((space.dim,), jnp.float32)
-        return jax.eval_shape(lambda u: space.root.marks(space.unflatten(u)), point).shape[0]
+        return jax.eval_shape(lambda u: space.root.coverage_ids(space.unflatten(u)), point).shape[0]
 
     @property
     def _shown(self) -> int:
         return 0 if self.problem.behaviour is None else self.problem.behaviour.size
 
-    def of(self, points: Float[Any, "n d"], verdicts: Verdicts) -> Int[np.ndarray, "n marks"]:
-        """Return the marks of rows."""
+    def of(self, points: Float[Any, "n d"], verdicts: Verdicts) -> Int[np.ndarray, "n ids"]:
+        """Return the coverage ids of rows."""
         parts = [verdicts.status[:, None].astype(np.int32)]
         if self.features:
-            own = np.asarray(self.problem.space.marks_at(points))
+            own = np.asarray(self.problem.space.coverage_ids_at(points))
             parts.append(np.where(own >= 0, own + len(Status), -1))
         if self._shown:
-            assert verdicts.marks is not None
+            assert verdicts.coverage_ids is not None
             first = len(Status) + self.features
-            parts.append(np.where(verdicts.marks >= 0, verdicts.marks + first, -1))
+            parts.append(np.where(verdicts.coverage_ids >= 0, verdicts.coverage_ids + first, -1))
         return np.concatenate(parts, axis=1).astype(np.int32)
 
-    def of_kinds(self, rows: Int[np.ndarray, "n marks"]) -> Int[np.ndarray, "n marks"]:
-        """Return the marks as a search is told them: features, cells and verdicts are kinds."""
+    def of_kinds(self, rows: Int[np.ndarray, "n ids"]) -> Int[np.ndarray, "n ids"]:
+        """Return the ids that a search gets: features, cells and verdicts are separate kinds."""
         cells = len(Status) + self.features
         behaviour = self.problem.behaviour
         clauses = cells + (0 if behaviour is None else behaviour.cells)
@@ -72,8 +72,8 @@ class MarkBook:
         numbers = np.where((rows >= 0) & (rows < len(Status)), 2 * KIND + rows, numbers)
         return numbers.astype(np.int32)
 
-    def add(self, rows: Int[np.ndarray, "n marks"]) -> Int[np.ndarray, " n"]:
-        """Count the marks of rows; return how many of each row no earlier one had."""
+    def add(self, rows: Int[np.ndarray, "n ids"]) -> Int[np.ndarray, " n"]:
+        """Count the coverage ids of rows; return how many of each row no earlier one had."""
         fresh = np.zeros(len(rows), np.int32)
         for i, row in enumerate(rows):
             own = np.unique(row[row >= 0])
