@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from verifai_jax.checking import test as test
     from verifai_jax.comparison import Comparison as Comparison
     from verifai_jax.comparison import compare as compare
+    from verifai_jax.comparison import transfer as transfer
     from verifai_jax.core.loggers import CSVLogger as CSVLogger
     from verifai_jax.core.loggers import TensorBoardLogger as TensorBoardLogger
     from verifai_jax.core.trace import Status as Status
@@ -118,6 +119,7 @@ if TYPE_CHECKING:
     from verifai_jax.systems.environments import brax as brax
     from verifai_jax.systems.environments import gymnasium as gymnasium
     from verifai_jax.systems.environments import gymnax as gymnax
+    from verifai_jax.systems.environments import playground as playground
     from verifai_jax.systems.mujoco import Scaled as Scaled
     from verifai_jax.systems.mujoco import mjx as mjx
     from verifai_jax.systems.mujoco import mujoco as mujoco

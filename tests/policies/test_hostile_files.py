@@ -118,6 +118,34 @@ def test_graphs_that_are_none(tmp_path, nodes, message):
         policy(file)
 
 
+def doubled(count):
+    nodes = [("Concat", ["x", "x"], ["v0"])]
+    nodes += [("Concat", [f"v{i}", f"v{i}"], [f"v{i + 1}"]) for i in range(count)]
+    return [helper.make_node(*n, axis=0) for n in nodes] + [
+        helper.make_node("ReduceSum", [f"v{count}"], ["y"])
+    ]
+
+
+@pytest.mark.parametrize(
+    ("nodes", "shape"),
+    [
+        ([("ConstantOfShape", ["s"], ["z"])], [100_000, 100_000]),
+        ([("Expand", ["x", "s"], ["z"])], [100_000, 100_000, 2]),
+        ([("Tile", ["x", "s"], ["z"])], [100_000, 100_000]),
+        ([("Pad", ["x", "s"], ["z"])], [0, 0, 100_000, 100_000]),
+        ([("Gather", ["x", "s"], ["w"]), ("Gather", ["x", "w"], ["z"])], [0] * 9_000_000),
+        (doubled(40), [1]),
+    ],
+)
+def test_small_graphs_that_compute_gigabytes(tmp_path, nodes, shape):
+    if isinstance(nodes[0], tuple):
+        nodes = [helper.make_node(*node) for node in [*nodes, ("ReduceSum", ["z"], ["y"])]]
+    sizes = onnx.numpy_helper.from_array(np.array(shape, np.int64), "s")
+    loaded = policy(graph(nodes, tmp_path / "bomb.onnx", [sizes]))
+    with pytest.raises(PolicyError, match="numbers, and one of a policy may compute 16,777,216"):
+        loaded.act(np.zeros(2, np.float32))
+
+
 def test_tensors_are_read_from_the_folder_of_the_model_only(tmp_path):
     tensor = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[2])
     tensor.data_location = TensorProto.EXTERNAL
@@ -132,6 +160,12 @@ def test_tensors_are_read_from_the_folder_of_the_model_only(tmp_path):
         file = graph([helper.make_node("Add", ["x", "w"], ["y"])], tmp_path / "far.onnx", [tensor])
         with pytest.raises(PolicyError, match=message):
             policy(file)
+    (tmp_path / "apart").mkdir()
+    (tmp_path / "weights.bin").rename(tmp_path / "apart" / "weights.bin")
+    (tmp_path / "weights.bin").symlink_to(tmp_path / "apart" / "weights.bin")
+    with pytest.raises(PolicyError, match=r"weights\.bin is a link to another folder"):
+        policy(file)
+    (tmp_path / "weights.bin").unlink()
     (tmp_path / "weights.bin").write_bytes(np.float32([1, 2]).tobytes())
     np.testing.assert_array_equal(policy(file).act(np.zeros(2, np.float32)), [1, 2])
 

@@ -1,16 +1,18 @@
 """The result of a comparison: how often each fails, by how much they differ, and where."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from jaxtyping import Array, Key
 
 from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.notebook import InNotebook
+from verifai_jax.core.notebook import InNotebook, picture_html
 from verifai_jax.core.text import format_percent
+from verifai_jax.core.trace import Trace
 from verifai_jax.features import FeatureSpace
 from verifai_jax.statistics.paired_rates import PairedRates
 
@@ -161,3 +163,130 @@ def judge(rates: PairedRates, margin: float) -> str:
     if margin and rates.low >= -margin and rates.high <= margin:
         return SAME
     return BETTER if rates.high < 0 else UNDECIDED
+
+
+@dataclass(frozen=True, eq=False)
+class Transfer(InNotebook):
+    """The same policy in two engines, `a` and `b`, as `transfer` returns it.
+
+    - `names`: of the two problems.
+    - `table`: a row for each pair: its features; `robustness_a`, `violated_a` and those of b; the
+      greatest `gap` of the traces in units of the range of a `signal`; `rounding`, the gap that
+      rounding can make; `parted`, the seconds at which they part beyond it; `differs`, whether they
+      do; `searched`, whether the search chose it; `proper`, whether both ended.
+    - `space`: of the common features.
+    - `influence`: of each coordinate the share of the gap's variance among samples, from 0 to 1.
+    - `worst`: the row that parts most, with its traces in a and in b; None where none does.
+    - `tolerance`, `seed`: as given.
+    - `stopped`: `"budget"` or `"interrupted"`.
+    - `seconds`: that it took.
+    - `notes`: what else the two differ in.
+    - `sources`: what each was made of, as a run records it.
+    """
+
+    names: tuple[str, str]
+    table: "pd.DataFrame" = field(repr=False)
+    space: FeatureSpace = field(repr=False)
+    influence: Mapping[str, float]
+    worst: tuple[int, Trace, Trace] | None = field(repr=False)
+    tolerance: float
+    stopped: str
+    seconds: float
+    seed: int
+    notes: tuple[str, ...] = ()
+    sources: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, repr=False)
+
+    @property
+    def differs(self) -> bool:
+        """True where traces of any pair part by more than rounding can do."""
+        return bool(self.table["differs"].any())
+
+    @property
+    def flips(self) -> "pd.DataFrame":
+        """The pairs that part and of which only one fails."""
+        table: Any = self.table
+        return table[table["differs"] & (table["violated_a"] != table["violated_b"])]
+
+    def random_key(self, row: int) -> Key[Array, ""]:
+        """Return the random key of both simulations of a row of the table."""
+        return simulation_key(run_keys(self.seed)[1], row)
+
+    def rules(self, **options: Any) -> Any:
+        """Describe by a few boxes where only one of the two fails; see `analysis.rules`.
+
+        **Raises:** `ValueError` where there is no such pair.
+        """
+        rows: Any = self.table[self.table["proper"]]
+        rows = rows.assign(violated=rows.index.isin(self.flips.index), rho=-rows["gap"])
+        samples = lazy_import("verifai_jax.analysis.data.samples", "Samples")
+        return lazy_import("verifai_jax.analysis", "rules")(
+            samples.of(rows, "all", list(self.space.columns), self.space), **options
+        )
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Draw the pair that parts most, and the gaps of all by the feature that matters most.
+
+        **Arguments:**
+
+        - `path`: of a picture to write; none when left out.
+
+        **Returns:** the figure.
+        """
+        return lazy_import("verifai_jax.plotting.transfer", "plot_transfer")(self, path)
+
+    def _notebook_parts(self) -> Iterable[str]:
+        yield picture_html(self.plot())
+
+    def __str__(self) -> str:
+        table: Any = self.table[self.table["proper"]]
+        sampled, found = table[~table["searched"]], table[table["searched"]]
+        a, b = self.names
+        lines = [f"the same policy in {a} and in {b}"]
+        if not self.differs:
+            largest = table["gap"].max()
+            lines.append(
+                f"  no difference beyond rounding in {len(table):,} pairs, {len(found):,} of them "
+                f"searched: traces part by {largest:z.1g} of a signal's range at most"
+            )
+        else:
+            lines += self._differences(sampled, found)
+        lost = len(self.table) - len(table)
+        if lost:
+            lines.append(f"  {lost:,} pairs have no verdict in one of the two")
+        lines.append(f"  {len(self.table):,} pairs in {self.seconds:z.1f} s, seed {self.seed}")
+        return "\n".join(lines + [f"  note: {note}" for note in self.notes])
+
+    def _differences(self, sampled: "pd.DataFrame", found: "pd.DataFrame") -> list[str]:
+        """Return what is to be said of pairs that part."""
+        lines, flips = [], self.flips
+        for rows, kind in ((sampled, "sampled"), (found, "searched")):
+            if not len(rows):
+                continue
+            turned: Any = rows[rows.index.isin(flips.index)]
+            only_b = int(turned["violated_b"].sum())
+            sides = ""
+            if len(turned):
+                sides = f": {only_b:,} fail in {self.names[1]} only, {len(turned) - only_b:,} in "
+                sides += f"{self.names[0]} only"
+            lines.append(
+                f"  verdicts differ in {len(turned):,} of {len(rows):,} {kind} pairs "
+                f"({format_percent(len(turned) / len(rows))}){sides}"
+            )
+        apart: Any = self.table[self.table["differs"]]
+        worst = apart.loc[apart["gap"].idxmax()]
+        lines.append(
+            f"  traces part in {len(apart):,} of {len(sampled) + len(found):,} pairs, by up to "
+            f"{format_percent(worst['gap'])} of the range of {worst['signal']}; the first after "
+            f"{apart['parted'].min():z.3g} s, half of them by {apart['parted'].median():z.3g} s"
+        )
+        named = [f"{n} ({format_percent(s)})" for n, s in self.influence.items() if s > 0.05][:3]
+        if named:
+            lines.append(f"  how far depends on {', '.join(named)}")
+        values = ", ".join(
+            f"{n} = {v:z.4g}" if isinstance(v := worst[n], float | np.floating) else f"{n} = {v}"
+            for n in self.space.columns
+        )
+        lines.append(f"  furthest in row {worst.name}: {values}")
+        return lines
+
+    __repr__ = __str__

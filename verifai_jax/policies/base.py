@@ -9,6 +9,7 @@ on
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -18,6 +19,8 @@ from jaxtyping import Array, Float, PyTree
 
 from verifai_jax.core.errors import check_names
 from verifai_jax.policies.errors import PolicyError
+from verifai_jax.policies.onnx_graph import Graph
+from verifai_jax.policies.writing import traced, write
 
 Compute = Callable[[PyTree, PyTree, PyTree], tuple[Any, PyTree]]
 """A pure function `(weights, observation, memory) -> (outputs, memory)`."""
@@ -160,6 +163,49 @@ class Policy:
         outputs, after = self(observation, *memory)
         return self.actions(outputs), after
 
+    def save(self, path: str | Path, observation: PyTree = None) -> Path:
+        """Write the policy as a file that `vj.policy` and, for ONNX, any runtime reads.
+
+        The file gives the action, so scales, squashing and bounds are part of it. The memory of a
+        policy that remembers becomes inputs and outputs `memory.0`, `memory.0.next` and so on.
+
+        **Arguments:**
+
+        - `path`: ends in `.onnx`, in `.safetensors`, or in `.npz`, which needs no other package.
+        - `observation`: an example of an observation, where the network does not say its size.
+
+        **Returns:** the path.
+
+        **Raises:** `PolicyError` for another ending, and for a policy that ONNX cannot express:
+        one that draws random numbers, or that runs in Python.
+        """
+        graph, arrays, start = self.as_graph(observation)
+        return write(graph, arrays, start, Path(path))
+
+    def as_graph(
+        self, observation: PyTree = None
+    ) -> tuple[Graph, dict[str, np.ndarray], tuple[np.ndarray, ...]]:
+        """Return the policy as a graph of ONNX operators with its arrays and its first memory.
+
+        **Raises:** `PolicyError` as `save`.
+        """
+        if observation is None:
+            example = getattr(self.compute, "example", None)
+            observation = None if example is None else example(self.weights)
+        if observation is None:
+            raise PolicyError("the policy does not say what it observes: give observation= too")
+        seen = jax.tree.map(lambda o: np.asarray(o, np.float32), observation)
+        parts = (self.weights, self.normaliser)
+
+        def decide(parts: PyTree, observation: PyTree, memory: PyTree) -> tuple[Any, PyTree]:
+            weights, normaliser = parts
+            policy = dataclasses.replace(self, weights=weights, normaliser=normaliser)
+            if self.initial_memory is None:
+                return policy.act(observation), None
+            return policy.act(observation, memory)
+
+        return traced(decide, parts, seen, self.initial_memory)
+
 
 @dataclass(frozen=True)
 class Stacked:
@@ -167,6 +213,12 @@ class Stacked:
 
     inner: Compute
     count: int
+
+    def example(self, weights: PyTree) -> np.ndarray | None:
+        """Return zeros in the form of one observation; None where the network does not say it."""
+        network, _ = weights
+        inner = getattr(self.inner, "example", lambda _: None)(network)
+        return None if inner is None else np.zeros(np.size(inner) // self.count)
 
     def __call__(self, weights: PyTree, observation: Array, memory: PyTree) -> tuple[Any, PyTree]:
         """Compute with the frames that the memory holds and this observation."""

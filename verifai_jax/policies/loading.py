@@ -6,6 +6,8 @@ policy("actor.safetensors", activation="elu")           # weights, and what they
 policy(torch_module, observation=np.zeros(48))
 """
 
+import io
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,9 +24,9 @@ from verifai_jax.policies.base import Actions, Normaliser, Policy, bounds, stack
 from verifai_jax.policies.errors import MAX_BYTES, PolicyError
 from verifai_jax.policies.networks import Mlp, activation_name, linear_layers, natural
 from verifai_jax.policies.objects import from_object, read_brax
-from verifai_jax.policies.onnx_graph import read_onnx
+from verifai_jax.policies.onnx_graph import read_graph, read_onnx
 from verifai_jax.policies.sb3 import read_normaliser, read_sb3
-from verifai_jax.policies.torch_archive import read_state
+from verifai_jax.policies.torch_archive import open_archive, read_member, read_state
 from verifai_jax.rl.policy import Policy as OwnPolicy
 from verifai_jax.rl.policy import load_policy
 
@@ -137,12 +139,16 @@ def _of_file(
             f"{path} has {path.stat().st_size / 1e6:z.0f} MB, and a policy may have "
             f"{MAX_BYTES / 1e6:z.0f} MB"
         )
-    weights_alone = kind in (".safetensors", ".pt", ".pth")
+    data = path.read_bytes()
+    stored = _stored_graph(data, path)
+    weights_alone = kind in (".safetensors", ".pt", ".pth") and stored is None
     if not weights_alone and (activation or network or layers):
         raise PolicyError(f"{path} says its network: leave out activation=, network= and layers=")
+    if stored is not None:
+        graph, weights, first = read_graph(*stored, str(path))
+        return Policy(weights, graph, first)
     if kind == ".npz":
         return load_policy(path)
-    data = path.read_bytes()
     if kind == ".zip":
         return read_sb3(data, str(path))
     if kind == ".onnx":
@@ -150,6 +156,33 @@ def _of_file(
         return Policy(weights, graph, first)
     arrays = _safetensors(data, path) if kind == ".safetensors" else read_state(data, str(path))
     return _of_weights(arrays, activation, network, layers, str(path))
+
+
+def _stored_graph(data: bytes, path: Path) -> tuple[Any, dict[str, np.ndarray]] | None:
+    """Return the graph and the arrays of a file of `Policy.save`; None for another file.
+
+    **Raises:** `PolicyError` for one that is damaged.
+    """
+    try:
+        if path.suffix.lower() == ".npz":
+            archive = open_archive(data, str(path))
+            arrays = {
+                n.removesuffix(".npy"): np.lib.format.read_array(
+                    io.BytesIO(read_member(archive, n, str(path))), allow_pickle=False
+                )
+                for n in archive.namelist()
+            }
+            about = json.loads(str(arrays.pop("about")))
+            return (about["graph"], arrays) if "graph" in about else None
+        if path.suffix.lower() == ".safetensors":
+            header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+            about = header.get("__metadata__", {}).get("graph")
+            return None if about is None else (json.loads(about), _safetensors(data, path))
+    except PolicyError:
+        raise
+    except Exception as error:
+        raise PolicyError(f"{path} holds no policy: {one_line(str(error))}") from error
+    return None
 
 
 def _safetensors(data: bytes, path: Path) -> dict[str, np.ndarray]:

@@ -55,6 +55,12 @@ class Mlp:
     categories: tuple[int, ...] = ()
     pixels: bool = False
 
+    def example(self, weights: PyTree) -> np.ndarray | None:
+        """Return zeros in the form of an observation; None for images, of unknown size."""
+        if self.pixels:
+            return None
+        return np.zeros(len(self.categories) or weights[0][0].shape[0])
+
     def __call__(self, weights: PyTree, observation: Array, memory: None) -> tuple[Array, None]:
         """Return the outputs of the last layer."""
         layers, x = weights, observation
@@ -64,7 +70,8 @@ class Mlp:
         elif self.categories:
             parts = jnp.split(jnp.reshape(x, -1), len(self.categories))
             hot = [
-                jax.nn.one_hot(part[0], n) for part, n in zip(parts, self.categories, strict=True)
+                (part[0] == jnp.arange(n)).astype(float)
+                for part, n in zip(parts, self.categories, strict=True)
             ]
             x = jnp.concatenate(hot)
         elif x.ndim and x.shape[-1] != layers[0][0].shape[0]:

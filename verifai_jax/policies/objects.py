@@ -83,6 +83,10 @@ def _is_a(source: object, module: str, name: str) -> bool:
 class RandomPolicy(Policy):
     """A policy that draws: a function of `(observation, key)`, such as those of Brax."""
 
+    def as_graph(self, observation: PyTree = None) -> Any:
+        """Refuse: a graph of ONNX does not draw."""
+        raise PolicyError("a policy that draws cannot be saved: give its deterministic function")
+
     def act(self, observation: PyTree, key: Key[Array, ""]) -> Any:
         """Return an action drawn with the random key of the step."""
         return self.actions(without_extras(self.compute.function(observation, key)))  # pyright: ignore

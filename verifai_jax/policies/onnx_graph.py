@@ -6,8 +6,11 @@ Weights are a pytree; integers that say shapes and indices stay numbers, so that
 fixed shapes. Source: the ONNX specification, `docs/IR.md` and `docs/Operators.md`.
 """
 
+import hashlib
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,34 +20,71 @@ from jaxtyping import Array, PyTree
 
 from verifai_jax.core.errors import check_names, require
 from verifai_jax.core.text import one_line
-from verifai_jax.policies.errors import MAX_BYTES, PolicyError
-from verifai_jax.policies.onnx_operators import OPERATORS, Node
+from verifai_jax.policies.errors import MAX_BYTES, MAX_NUMBERS, PolicyError
+from verifai_jax.policies.onnx_operators import OPERATORS, Node, output_size
 
 Values = dict[str, Any]
+
+OPSET = 18
+"""The operator set of the graphs that `writing` makes; runtimes since 2023 read it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Graph:
     """The function of a graph: `(weights, observation, memory) -> (outputs, memory)`.
 
+    Graphs of equal content are equal, so that policies which differ in their weights share a
+    program.
+
     - `nodes`: in the order in which they are computed.
     - `constants`: arrays that are no weights: shapes, indices, flags.
-    - `inputs`: names of the observations, with their ranks.
+    - `inputs`: names of the observations, with their shapes.
     - `memory`: pairs of an input and the output that is its next value.
     - `output`: name of the output.
     """
 
     nodes: tuple[Node, ...]
     constants: Mapping[str, np.ndarray]
-    inputs: Mapping[str, int]
+    inputs: Mapping[str, tuple[int, ...]]
     memory: tuple[tuple[str, str], ...]
     output: str
+
+    @cached_property
+    def digest(self) -> str:
+        """Hash of all parts."""
+        parts = (self.nodes, sorted(self.constants.items()), list(self.inputs.items()))
+        text = repr(_hashable((*parts, self.memory, self.output)))
+        return hashlib.sha256(text.encode()).hexdigest()[:20]
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Graph) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    def __repr__(self) -> str:
+        return f"Graph({self.digest})"
+
+    def example(self, weights: PyTree) -> Any:
+        """Return zeros in the form of an observation, without the axis of a batch."""
+        zeros = {n: np.zeros(s[1:] if s[:1] == (1,) else s) for n, s in self.inputs.items()}
+        return next(iter(zeros.values())) if len(zeros) == 1 else zeros
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the graph as plain data, of which `read_graph` makes it again.
+
+        Only for the graphs of `writing.traced`, whose attributes are numbers and texts.
+        """
+        nodes = [[n.operator, n.inputs, n.outputs, n.attributes] for n in self.nodes]
+        inputs = {name: list(shape) for name, shape in self.inputs.items()}
+        return {"nodes": nodes, "inputs": inputs, "memory": self.memory, "output": self.output}
 
     def __call__(self, weights: PyTree, observation: Any, memory: PyTree) -> tuple[Array, PyTree]:
         """Compute the outputs of one observation, or of a batch of the graph's own rank."""
         values: Values = {**self.constants, **weights}
         added = 0
-        for name, rank in self.inputs.items():
+        for name, shape in self.inputs.items():
+            rank = len(shape)
             given = observation[name] if isinstance(observation, Mapping) else observation
             given = jnp.asarray(given)
             if not jnp.issubdtype(given.dtype, jnp.floating):
@@ -66,17 +106,32 @@ class Graph:
         return outputs, after
 
 
+def _hashable(value: object) -> object:
+    """Return a description of parts of a graph that is equal for equal content."""
+    if isinstance(value, np.ndarray | np.generic):
+        return np.asarray(value).dtype.str, np.shape(value), np.asarray(value).tobytes()
+    if isinstance(value, Node):
+        return tuple(_hashable(getattr(value, f.name)) for f in fields(value))
+    if isinstance(value, Mapping):
+        return tuple((name, _hashable(v)) for name, v in sorted(value.items()))
+    if isinstance(value, tuple | list):
+        return tuple(map(_hashable, value))
+    return value
+
+
 def run(nodes: Sequence[Node], values: Values) -> None:
     """Compute nodes one after the other, and put their outputs among the values.
 
     **Raises:** `PolicyError` that names the node, its operator and the shapes that it got.
     """
+    total = 0
     for node in nodes:
         absent = [name for name in node.inputs if name and name not in values]
         if absent:
             raise PolicyError(f"{node} reads {absent[0]!r}, an output that is not supported")
         inputs = [values[name] if name else None for name in node.inputs]
         try:
+            _check_size(node, total + output_size(node, *inputs))
             if node.operator == "If":
                 outputs = _branch(node, inputs[0], values)
             else:
@@ -89,7 +144,17 @@ def run(nodes: Sequence[Node], values: Values) -> None:
                 f"{node} cannot be computed from inputs of shapes {shapes}: {one_line(str(error))}"
             ) from error
         outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+        total += sum(int(np.size(made)) for made in outputs)
+        _check_size(node, total)
         values.update(zip(node.outputs, outputs, strict=False))
+
+
+def _check_size(node: Node, count: int) -> None:
+    if count > MAX_NUMBERS:
+        raise PolicyError(
+            f"with {node} the graph computes {count:z.3g} numbers, and one of a policy may compute "
+            f"{MAX_NUMBERS:,}"
+        )
 
 
 def _branch(node: Node, condition: Any, values: Values) -> tuple[Any, ...]:
@@ -143,54 +208,109 @@ def read_onnx(
     arrays = {t.name: _tensor(t, path, what) for t in graph.initializer}
     fed = [i for i in graph.input if i.name not in arrays]
     nodes = _nodes(graph, opset, {*arrays, *(i.name for i in fed)}, path, what)
-    weights = {n: jnp.asarray(a) for n, a in arrays.items() if a.dtype.kind == "f" and a.size}
-    constants = {n: a for n, a in arrays.items() if n not in weights}
+    weights, constants = _sorted_out(arrays)
+    for each in fed:
+        if math.prod(_shape(each)) > MAX_NUMBERS:
+            raise PolicyError(f"{what} takes an input {each.name!r} of shape {list(_shape(each))}")
     made = [o.name for o in graph.output]
     feeds = dict(_memory(fed, graph.output, memory))
     left = [i for i in fed if i.name not in feeds]
     remembered = [i for i in fed if i.name in feeds]
     if not left:
         raise PolicyError(f"{what} has no input for an observation")
-    inputs = {i.name: len(i.type.tensor_type.shape.dim) for i in left}
+    inputs = {i.name: _shape(i) for i in left}
     chosen = _output([n for n in made if n not in feeds.values()], output, made, what)
-    start = tuple(jnp.zeros(_shape(i)) for i in remembered) or None
+    whole = package.TensorProto.INT32
+    start = (
+        tuple(
+            jnp.zeros(_shape(i), np.int32 if i.type.tensor_type.elem_type == whole else None)
+            for i in remembered
+        )
+        or None
+    )
     ordered = tuple((i.name, feeds[i.name]) for i in remembered)
     return Graph(nodes, constants, inputs, ordered, chosen), weights, start
+
+
+def _sorted_out(
+    arrays: Mapping[str, np.ndarray],
+) -> tuple[dict[str, Array], dict[str, np.ndarray]]:
+    """Return the weights among arrays, which are real numbers, and the others."""
+    weights = {n: jnp.asarray(a) for n, a in arrays.items() if a.dtype.kind == "f" and a.size}
+    return weights, {n: a for n, a in arrays.items() if n not in weights}
+
+
+def read_graph(
+    data: Mapping[str, Any], arrays: Mapping[str, np.ndarray], what: str
+) -> tuple[Graph, dict[str, Array], PyTree]:
+    """Return what `read_onnx` does, from `Graph.to_json` and all arrays by name.
+
+    **Raises:** `PolicyError` for data that are no graph.
+    """
+    try:
+        nodes = tuple(
+            Node(operator, outputs[0], tuple(inputs), tuple(outputs), {
+                name: tuple(v) if isinstance(v, list) else v for name, v in attributes.items()
+            }, OPSET)
+            for operator, inputs, outputs, attributes in data["nodes"]
+        )  # fmt: skip
+        inputs = {str(n): tuple(int(k) for k in shape) for n, shape in data["inputs"].items()}
+        memory = tuple((str(one), str(after)) for one, after in data["memory"])
+        start = tuple(jnp.asarray(arrays[one]) for one, _ in memory) or None
+        output = str(data["output"])
+    except Exception as error:
+        raise PolicyError(f"{what} is damaged: its graph is none ({error!r})") from error
+    rest = {n: a for n, a in arrays.items() if n not in dict(memory)}
+    for name, array in arrays.items():
+        if array.dtype.kind not in "fiub" or np.any(np.isnan(array)):
+            raise PolicyError(f"the array {name!r} of {what} holds NaN, or no numbers")
+    check_nodes(nodes, {*arrays, *inputs}, [output, *(after for _, after in memory)], what)
+    weights, constants = _sorted_out(rest)
+    return Graph(nodes, constants, inputs, memory, output), weights, start
+
+
+def check_nodes(nodes: Sequence[Node], known: set[str], outputs: Sequence[str], what: str) -> None:
+    """Check that operators exist, and that what nodes and outputs read is computed before.
+
+    **Raises:** `PolicyError` that names the node.
+    """
+    known = set(known)
+    missing = sorted({n.operator for n in nodes} - {*OPERATORS, "If"})
+    if missing:
+        first = next(n for n in nodes if n.operator == missing[0])
+        raise PolicyError(
+            f"{what} uses {', '.join(missing)}, which is not supported (node {first.name!r}): "
+            "leave it out of the exported model, or give the policy as a Python function"
+        )
+    for node in nodes:
+        absent = [name for name in node.inputs if name and name not in known]
+        if absent:
+            raise PolicyError(
+                f"{what} is damaged: {node} reads {absent[0]!r}, which no node before it computes"
+            )
+        known.update(node.outputs)
+    for name in outputs:
+        if name not in known:
+            raise PolicyError(f"{what} is damaged: no node computes its output {name!r}")
 
 
 def _nodes(
     graph: Any, opset: int, known: set[str], path: Path | None, what: str
 ) -> tuple[Node, ...]:
-    """Return the nodes of a graph, whose operators exist and whose inputs are computed before."""
-    missing = sorted({n.op_type for n in graph.node} - {*OPERATORS, "If"})
-    if missing:
-        first = next(n for n in graph.node if n.op_type == missing[0])
-        raise PolicyError(
-            f"{what} uses {', '.join(missing)}, which is not supported (node "
-            f"{first.name or first.output[0]!r}): leave it out of the exported model, or give the "
-            "policy as a Python function"
-        )
-    found, known = [], set(known)
+    """Return the nodes of a graph, checked."""
+    found, inner = [], set(known)
     for node in graph.node:
         if node.domain not in ("", "ai.onnx"):
             raise PolicyError(
                 f"{what} uses {node.op_type} of {node.domain}, which is not ONNX's own"
             )
-        absent = [name for name in node.input if name and name not in known]
-        if absent:
-            raise PolicyError(
-                f"{what} is damaged: node {node.name or node.op_type!r} reads {absent[0]!r}, "
-                "which no node before it computes"
-            )
-        attributes = {a.name: _attribute(a, opset, known, path, what) for a in node.attribute}
+        attributes = {a.name: _attribute(a, opset, inner, path, what) for a in node.attribute}
         name = node.name or (node.output[0] if node.output else "")
         found.append(
             Node(node.op_type, name, tuple(node.input), tuple(node.output), attributes, opset)
         )
-        known.update(node.output)
-    for made in graph.output:
-        if made.name not in known:
-            raise PolicyError(f"{what} is damaged: no node computes its output {made.name!r}")
+        inner.update(node.output)
+    check_nodes(found, known, [o.name for o in graph.output], what)
     return tuple(found)
 
 
@@ -253,6 +373,8 @@ def _external(tensor: Any, path: Path | None) -> np.ndarray:
     file = path.parent / name
     if length != count or min(offset, count) < 0 or count > MAX_BYTES:
         raise ValueError(f"it says {length} bytes for shape {list(tensor.dims)}")
+    if file.resolve().parent != path.resolve().parent:
+        raise ValueError(f"{name} is a link to another folder")
     if offset + count > file.stat().st_size:
         raise ValueError(f"{name} is smaller than the model says")
     with file.open("rb") as opened:

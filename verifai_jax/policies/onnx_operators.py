@@ -72,9 +72,14 @@ def _folded(name: str) -> Callable[..., Any]:
     return operator
 
 
-def _real(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return an operator that is a function of one real array."""
+def _activation(function: Callable[[Value], Value]) -> Callable[..., Any]:
+    """Return an operator that is a function of one array."""
     return lambda node, x: function(x)
+
+
+def _axis(node: Node, x: Value, usual: int) -> int:
+    axis = node.get("axis", usual)
+    return axis + x.ndim if axis < 0 else axis
 
 
 def _divide(node: Node, a: Value, b: Value) -> Value:
@@ -98,18 +103,10 @@ def _gemm(node: Node, a: Value, b: Value, c: Value | None = None) -> Value:
     return product if c is None else product + (c if beta == 1 else beta * c)
 
 
-def _elu(node: Node, x: Value) -> Value:
-    return jax.nn.elu(x, node.get("alpha", 1.0))
-
-
 def _selu(node: Node, x: Value) -> Value:
     alpha = node.get("alpha", 1.6732631921768188)
     gamma = node.get("gamma", 1.0507010221481323)
     return gamma * jnp.where(x > 0, x, alpha * jnp.expm1(jnp.minimum(x, 0)))
-
-
-def _hard_sigmoid(node: Node, x: Value) -> Value:
-    return jnp.clip(node.get("alpha", 0.2) * x + node.get("beta", 0.5), 0, 1)
 
 
 def _softmax(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -121,10 +118,6 @@ def _softmax(function: Callable[..., Any]) -> Callable[..., Any]:
         return function(x.reshape(*x.shape[:axis], -1), axis=-1).reshape(x.shape)
 
     return operator
-
-
-def _gelu(node: Node, x: Value) -> Value:
-    return jax.nn.gelu(x, approximate=node.get("approximate", "none") == "tanh")
 
 
 def _clip(node: Node, x: Value, low: Value | None = None, high: Value | None = None) -> Value:
@@ -186,28 +179,10 @@ def _reshape(node: Node, x: Value, shape: Value | None = None) -> Value:
     return x.reshape(sizes)
 
 
-def _flatten(node: Node, x: Value) -> Value:
-    axis = node.get("axis", 1)
-    axis = axis + x.ndim if axis < 0 else axis
-    return x.reshape(math.prod(x.shape[:axis]), -1)
-
-
-def _transpose(node: Node, x: Value) -> Value:
-    return x.transpose(node.get("perm", tuple(range(x.ndim))[::-1]))
-
-
 def _squeeze(node: Node, x: Value, axes: Value | None = None) -> Value:
     found = _axes(node, axes)
     found = tuple(i for i, n in enumerate(x.shape) if n == 1) if found is None else found
     return _module(x).squeeze(x, found)
-
-
-def _unsqueeze(node: Node, x: Value, axes: Value | None = None) -> Value:
-    return _module(x).expand_dims(x, _axes(node, axes) or ())
-
-
-def _concat(node: Node, *inputs: Value) -> Value:
-    return _module(*inputs).concatenate(inputs, axis=node.attributes["axis"])
 
 
 def _split(node: Node, x: Value, sizes: Value | None = None) -> tuple[Value, ...]:
@@ -282,11 +257,6 @@ def _pad(
 def _range(node: Node, start: Value, end: Value, step: Value) -> Any:
     values = [np.asarray(v) for v in (start, end, step)]
     return np.arange(*(v.item() for v in values), dtype=values[0].dtype)
-
-
-def _shape(node: Node, x: Value) -> Any:
-    start, end = node.get("start", 0), node.get("end", None)
-    return np.array(x.shape[start:end], np.int64)
 
 
 def _reduce(name: str) -> Callable[..., Any]:
@@ -428,118 +398,112 @@ def _dropout(
     return x
 
 
-def _hard_swish(x: Value) -> Value:
-    return x * jnp.clip(x / 6 + 0.5, 0, 1)
+_OF_NUMPY = {
+    "Add": "add", "Sub": "subtract", "Mul": "multiply", "Pow": "power", "Sqrt": "sqrt",
+    "Exp": "exp", "Log": "log", "Abs": "abs", "Neg": "negative", "Floor": "floor", "Ceil": "ceil",
+    "Round": "round", "Sign": "sign", "Sin": "sin", "Cos": "cos", "Tan": "tan", "Atan": "arctan",
+    "Tanh": "tanh", "Equal": "equal", "Greater": "greater", "Less": "less",
+    "GreaterOrEqual": "greater_equal", "LessOrEqual": "less_equal", "And": "logical_and",
+    "Or": "logical_or", "Xor": "logical_xor", "Not": "logical_not",
+}  # fmt: skip
+"""Operators that are functions of NumPy, entry by entry."""
+_REDUCTIONS = {
+    "ReduceMean": "mean", "ReduceSum": "sum", "ReduceMax": "max", "ReduceMin": "min",
+    "ReduceProd": "prod", "ReduceL2": "l2",
+}  # fmt: skip
+"""Operators over axes, by the function of NumPy."""
+_ACTIVATIONS: dict[str, Callable[[Value], Value]] = {
+    "Sigmoid": jax.nn.sigmoid,
+    "Softplus": jax.nn.softplus,
+    "Softsign": jax.nn.soft_sign,
+    "HardSwish": lambda x: x * jnp.clip(x / 6 + 0.5, 0, 1),
+    "Mish": lambda x: x * jnp.tanh(jax.nn.softplus(x)),
+    "Erf": jax.scipy.special.erf,
+}
+"""Operators without attributes, as functions of one array."""
+_ELEMENTWISE = {*_OF_NUMPY, "Min", "Max", "Sum", "Mean", "Div", "Mod", "PRelu", "Where"}
 
 
-def _prelu(node: Node, x: Value, slope: Value) -> Value:
-    return jnp.where(x > 0, x, slope * x)
+def output_size(node: Node, *inputs: Any) -> int:
+    """Return how many numbers an operator gives at most, before it is computed.
 
-
-def _where(node: Node, condition: Value, a: Value, b: Value) -> Value:
-    return _module(condition, a, b).where(condition, a, b)
+    Only for those that can give many more than they take; 0 for all others.
+    """
+    shapes: list[tuple[int, ...]] = [() if v is None else np.shape(v) for v in inputs]
+    match node.operator, len(inputs):
+        case "ConstantOfShape", 1:
+            return math.prod(_static(node, inputs[0]))
+        case "Expand", 2:
+            return math.prod(np.broadcast_shapes(shapes[0], _static(node, inputs[1])))
+        case "Tile", 2:
+            return math.prod(shapes[0]) * math.prod(_static(node, inputs[1]))
+        case "Range", 3:
+            start, end, step = (float(np.asarray(value)) for value in inputs)
+            return int(max(0.0, (end - start) / step)) if step else 0
+        case "Pad", _:
+            pads = node.get("pads", ()) if len(inputs) == 1 else _static(node, inputs[1])
+            return math.prod(n + 2 * max(0, 0, *pads) for n in shapes[0])
+        case "Conv" | "MaxPool" | "AveragePool", _:
+            channels = shapes[1][0] if node.operator == "Conv" else shapes[0][1]
+            wide = 2 * max(0, 0, *node.get("pads", ()))
+            return shapes[0][0] * channels * math.prod(n + wide for n in shapes[0][2:])
+        case "Gather", 2:
+            rows = max(1, shapes[0][node.get("axis", 0)])
+            return math.prod(shapes[0]) // rows * math.prod(shapes[1])
+        case "MatMul", 2:
+            a, b = shapes
+            batch = math.prod(np.broadcast_shapes(a[:-2], b[:-2]))
+            return batch * math.prod(a[-2:-1]) * math.prod(b[-1:] if len(b) > 1 else ())
+        case "Gemm", _:
+            return max(shapes[0]) * max(shapes[1])
+        case operator, _ if operator in _ELEMENTWISE:
+            return math.prod(np.broadcast_shapes(*shapes))
+    return 0
 
 
 OPERATORS: dict[str, Callable[..., Any]] = {
-    **{
-        operator: _same(name)
-        for operator, name in {
-            "Add": "add",
-            "Sub": "subtract",
-            "Mul": "multiply",
-            "Pow": "power",
-            "MatMul": "matmul",
-            "Sqrt": "sqrt",
-            "Exp": "exp",
-            "Log": "log",
-            "Abs": "abs",
-            "Neg": "negative",
-            "Floor": "floor",
-            "Ceil": "ceil",
-            "Round": "round",
-            "Sign": "sign",
-            "Sin": "sin",
-            "Cos": "cos",
-            "Tan": "tan",
-            "Atan": "arctan",
-            "Tanh": "tanh",
-            "Equal": "equal",
-            "Greater": "greater",
-            "Less": "less",
-            "GreaterOrEqual": "greater_equal",
-            "LessOrEqual": "less_equal",
-            "And": "logical_and",
-            "Or": "logical_or",
-            "Xor": "logical_xor",
-            "Not": "logical_not",
-        }.items()
-    },
-    "Min": _folded("minimum"),
-    "Max": _folded("maximum"),
-    "Sum": _folded("add"),
+    **{operator: _same(name) for operator, name in _OF_NUMPY.items()},
+    **{operator: _reduce(name) for operator, name in _REDUCTIONS.items()},
+    **{operator: _activation(function) for operator, function in _ACTIVATIONS.items()},
+    "MatMul": _same("matmul"),
+    "Min": _folded("minimum"), "Max": _folded("maximum"), "Sum": _folded("add"),
     "Mean": lambda node, *inputs: sum(inputs) / len(inputs),
-    "Div": _divide,
-    "Mod": _mod,
+    "Div": _divide, "Mod": _mod, "Gemm": _gemm,
     "Reciprocal": lambda node, x: 1 / x,
-    "Gemm": _gemm,
     "Relu": lambda node, x: _module(x).maximum(x, _module(x).asarray(0, x.dtype)),
-    "Elu": _elu,
-    "Selu": _selu,
+    "Elu": lambda node, x: jax.nn.elu(x, node.get("alpha", 1.0)),
     "Celu": lambda node, x: jax.nn.celu(x, node.get("alpha", 1.0)),
     "LeakyRelu": lambda node, x: jax.nn.leaky_relu(x, node.get("alpha", 0.01)),
-    "PRelu": _prelu,
-    "Sigmoid": _real(jax.nn.sigmoid),
-    "HardSigmoid": _hard_sigmoid,
-    "HardSwish": _real(_hard_swish),
-    "Softplus": _real(jax.nn.softplus),
-    "Softsign": _real(jax.nn.soft_sign),
-    "Mish": _real(lambda x: x * jnp.tanh(jax.nn.softplus(x))),
-    "Erf": _real(jax.scipy.special.erf),
-    "Softmax": _softmax(jax.nn.softmax),
-    "LogSoftmax": _softmax(jax.nn.log_softmax),
-    "Gelu": _gelu,
-    "Clip": _clip,
-    "Cast": _cast,
-    "CastLike": lambda node, x, like: x.astype(like.dtype),
-    "Constant": _constant,
-    "ConstantOfShape": _constant_of_shape,
-    "Identity": lambda node, x: x,
-    "Dropout": _dropout,
+    "PRelu": lambda node, x, slope: jnp.where(x > 0, x, slope * x),
+    "Selu": _selu,
+    "HardSigmoid": lambda node, x: jnp.clip(
+        node.get("alpha", 0.2) * x + node.get("beta", 0.5), 0, 1
+    ),
+    "Gelu": lambda node, x: jax.nn.gelu(x, node.get("approximate", "none") == "tanh"),
+    "Softmax": _softmax(jax.nn.softmax), "LogSoftmax": _softmax(jax.nn.log_softmax),
+    "Clip": _clip, "Cast": _cast, "CastLike": lambda node, x, like: x.astype(like.dtype),
+    "Constant": _constant, "ConstantOfShape": _constant_of_shape,
+    "Identity": lambda node, x: x, "Dropout": _dropout,
     "Reshape": _reshape,
-    "Flatten": _flatten,
-    "Transpose": _transpose,
+    "Flatten": lambda node, x: x.reshape(math.prod(x.shape[: _axis(node, x, 1)]), -1),
+    "Transpose": lambda node, x: x.transpose(node.get("perm", tuple(range(x.ndim))[::-1])),
     "Squeeze": _squeeze,
-    "Unsqueeze": _unsqueeze,
-    "Concat": _concat,
-    "Split": _split,
-    "Slice": _slice,
-    "Gather": _gather,
-    "GatherElements": _gather_elements,
-    "Expand": _expand,
-    "Tile": _tile,
-    "Pad": _pad,
-    "Range": _range,
-    "Shape": _shape,
+    "Unsqueeze": lambda node, x, axes=None: _module(x).expand_dims(x, _axes(node, axes) or ()),
+    "Concat": lambda node, *inputs: _module(*inputs).concatenate(
+        inputs, axis=node.attributes["axis"]
+    ),
+    "Split": _split, "Slice": _slice, "Gather": _gather, "GatherElements": _gather_elements,
+    "Expand": _expand, "Tile": _tile, "Pad": _pad, "Range": _range,
+    "Shape": lambda node, x: np.array(
+        x.shape[node.get("start", 0) : node.get("end", None)], np.int64
+    ),
     "Size": lambda node, x: np.array(math.prod(x.shape), np.int64),
-    "Where": _where,
-    "ReduceMean": _reduce("mean"),
-    "ReduceSum": _reduce("sum"),
-    "ReduceMax": _reduce("max"),
-    "ReduceMin": _reduce("min"),
-    "ReduceProd": _reduce("prod"),
-    "ReduceL2": _reduce("l2"),
-    "ArgMax": _arg("argmax"),
-    "ArgMin": _arg("argmin"),
-    "LayerNormalization": _layer_normalization,
-    "BatchNormalization": _batch_normalization,
+    "Where": lambda node, condition, a, b: _module(condition, a, b).where(condition, a, b),
+    "ArgMax": _arg("argmax"), "ArgMin": _arg("argmin"),
+    "LayerNormalization": _layer_normalization, "BatchNormalization": _batch_normalization,
     "InstanceNormalization": _instance_normalization,
-    "Conv": _conv,
-    "MaxPool": _pool(largest=True),
-    "AveragePool": _pool(largest=False),
-    "GlobalAveragePool": _global_pool("mean"),
-    "GlobalMaxPool": _global_pool("max"),
-    "LSTM": lstm,
-    "GRU": gru,
-    "RNN": rnn,
-}
+    "Conv": _conv, "MaxPool": _pool(largest=True), "AveragePool": _pool(largest=False),
+    "GlobalAveragePool": _global_pool("mean"), "GlobalMaxPool": _global_pool("max"),
+    "LSTM": lstm, "GRU": gru, "RNN": rnn,
+}  # fmt: skip
 """The operators that policies use, by name."""

@@ -35,26 +35,28 @@ _STORAGES: dict[str, Any] = {
 def open_archive(data: bytes, what: str) -> zipfile.ZipFile:
     """Open an archive.
 
-    **Raises:** `PolicyError` for another file.
+    **Raises:** `PolicyError` for another file, and for one that unpacks to over `MAX_BYTES`.
     """
     try:
-        return zipfile.ZipFile(io.BytesIO(data))
+        archive = zipfile.ZipFile(io.BytesIO(data))
     except Exception as error:
         raise PolicyError(f"{what} is no archive, or a damaged one: {error}") from error
+    size = sum(entry.file_size for entry in archive.infolist())
+    if size > MAX_BYTES:
+        raise PolicyError(
+            f"{what} unpacks to {size / 1e6:z.0f} MB, and a policy may have "
+            f"{MAX_BYTES / 1e6:z.0f} MB"
+        )
+    return archive
 
 
 def read_member(archive: zipfile.ZipFile, name: str, what: str) -> bytes:
-    """Return the bytes of a file of an archive, at most `MAX_BYTES`.
+    """Return the bytes of a file of an archive.
 
-    **Raises:** `PolicyError` for one that is missing, damaged, larger than that or than it says.
+    **Raises:** `PolicyError` for one that is missing, damaged, or larger than the archive says.
     """
     try:
         entry = archive.getinfo(name)
-        if entry.file_size > MAX_BYTES:
-            raise ValueError(
-                f"it unpacks to {entry.file_size / 1e6:z.0f} MB, and a policy may have "
-                f"{MAX_BYTES / 1e6:z.0f} MB"
-            )
         with archive.open(entry) as file:
             data = file.read(entry.file_size + 1)
     except Exception as error:

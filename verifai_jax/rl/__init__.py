@@ -16,7 +16,7 @@ from verifai_jax.rl.policy import (
 from verifai_jax.rl.ppo import PPO
 from verifai_jax.rl.pqn import PQN
 from verifai_jax.rl.sac import SAC
-from verifai_jax.rl.task.brax import brax_task
+from verifai_jax.rl.task.brax import brax_task, playground_task
 from verifai_jax.rl.task.gymnax import gymnax_task
 from verifai_jax.rl.task.mjx import mjx_task
 from verifai_jax.rl.task.ode import ode_task
@@ -26,7 +26,7 @@ __all__ = [
     "ALGORITHMS", "PPO", "PQN", "SAC", "Algorithm", "BatchedTraining", "Checkpoint",
     "Configuration", "Continuous", "Discrete", "Policy", "PolicyFileError", "Progress", "Task",
     "Training", "brax_task", "evaluate", "gymnax_task", "load_policy", "mjx_task", "ode_task",
-    "policy_notes", "policy_sources", "save_policy", "train",
+    "playground_task", "policy_notes", "policy_sources", "save_policy", "train",
 ]  # fmt: skip
 
 

@@ -14,7 +14,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.devices import Device, enable_compile_cache, spread_over_devices
 from verifai_jax.core.keys import IMPLEMENTATION
@@ -66,7 +66,7 @@ def mean_returns(
 
 
 def batched_mean_returns(
-    task: Task, policies: Sequence[Policy], *, seed: int = 0, episodes: int = EPISODES
+    task: Task, policies: Sequence[PyTree], *, seed: int = 0, episodes: int = EPISODES
 ) -> Iterator[tuple[list[int], Float[np.ndarray, " batch"]]]:
     """Measure the same batch by batch.
 
@@ -110,11 +110,11 @@ def _mean_returns(
     episodes: int,
     devices: tuple[Device, ...],
     numbers: list[Array],
-    policies: Policy,
+    policies: PyTree,
     key: Key[Array, ""],
 ) -> Float[Array, " policies"]:
     def on_device(
-        numbers: list[Array], policies: Policy, key: Key[Array, ""]
+        numbers: list[Array], policies: PyTree, key: Key[Array, ""]
     ) -> Float[Array, " some"]:
         task = static_task.with_numbers(numbers)
         starts, step_keys = _starts(task, episodes, key)
@@ -138,8 +138,8 @@ def _starts(
     return starts, step_keys
 
 
-def _step_of(task: Task) -> Callable[[Policy, Totals, Key[Array, ""]], Totals]:
-    def step(policy: Policy, episode: Totals, key: Key[Array, ""]) -> Totals:
+def _step_of(task: Task) -> Callable[[PyTree, Totals, Key[Array, ""]], Totals]:
+    def step(policy: PyTree, episode: Totals, key: Key[Array, ""]) -> Totals:
         state, total, over = episode
         after, reward, terminated = task.step(key, state, policy.act(task.observe(state)))
         total = total + jnp.where(over, 0.0, reward)

@@ -26,6 +26,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, Key
 from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.checks import check_count, is_number
 from verifai_jax.core.errors import check_names
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.sources import made_here, sources_of
 from verifai_jax.core.text import one_line
 from verifai_jax.rl.task.task import Action, Continuous, Discrete
@@ -99,6 +100,30 @@ class Policy:
     ) -> Int[Array, ""] | Float[Array, " size"]:
         """Return the most likely action: an index, or a vector `[size]` within its range."""
         return most_likely_action(self.action, self(observation))
+
+    def save(self, path: str | Path) -> Path:
+        """Write the policy as `.npz` (`save_policy`), or its action as `.onnx` or `.safetensors`.
+
+        **Returns:** the path.
+
+        **Raises:** `PolicyError` for another ending.
+        """
+        if Path(path).suffix == ".npz":
+            save_policy(self, path)
+            return Path(path)
+        graph, arrays, start = self.as_graph()
+        return lazy_import("verifai_jax.policies.writing", "write")(
+            graph, arrays, start, Path(path)
+        )
+
+    def as_graph(self, observation: object = None) -> tuple[Any, Any, Any]:
+        """Return the policy as a graph of ONNX operators, as policies of other frameworks do."""
+        as_any = lazy_import("verifai_jax.policies.base", "Policy")(self, _act)
+        return as_any.as_graph(np.zeros(self.layers[0][0].shape[0]))
+
+
+def _act(policy: Policy, observation: Array, memory: None) -> tuple[Array, None]:
+    return policy.act(observation), memory
 
 
 def network(

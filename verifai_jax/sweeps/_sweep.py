@@ -23,20 +23,28 @@ from verifai_jax.core.callbacks import Callback, check_callbacks, notify
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.executors import Executor
 from verifai_jax.rl._evaluate import EPISODES, batched_mean_returns
-from verifai_jax.rl.policy import Policy
 from verifai_jax.search import Search
 from verifai_jax.store.cache import Cache, locked_cache
 from verifai_jax.store.log import Arrays
 from verifai_jax.sweeps.clock import CERTIFYING, TRAINING, Clock, OutOfTime
 from verifai_jax.sweeps.fingerprint import digest, fingerprint
+from verifai_jax.sweeps.function_runs import FunctionRuns
 from verifai_jax.sweeps.halving import SAFETY, Halving
 from verifai_jax.sweeps.hyperparameters import Hyperparameters
 from verifai_jax.sweeps.optuna import OptunaSampler
 from verifai_jax.sweeps.proposers import WORST, Proposer, make_proposer, objective
-from verifai_jax.sweeps.record import NONFINITE, STOPPED, TRAINED, SweepRecord, error_status
+from verifai_jax.sweeps.record import (
+    NONFINITE,
+    STOPPED,
+    TRAINED,
+    SweepRecord,
+    TrainedPolicy,
+    error_status,
+)
 from verifai_jax.sweeps.result import Sweep
 from verifai_jax.sweeps.rows import Row, columns_of, tabulate
 from verifai_jax.sweeps.study import Study
+from verifai_jax.sweeps.trainer import FunctionTrainer
 from verifai_jax.sweeps.training_runs import TrainingRuns
 from verifai_jax.sweeps.validation import check_options
 
@@ -202,7 +210,9 @@ class _RunningSweep:
     safety: dict[tuple[int, int], Certificate] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.runs = TrainingRuns(self.study, self.cache, self.clock, self.executor)
+        by_function = isinstance(self.study.trainer, FunctionTrainer)
+        kind = FunctionRuns if by_function else TrainingRuns
+        self.runs = kind(self.study, self.cache, self.clock, self.executor)
 
     def run(self, proposer: Proposer) -> SweepRecord:
         """Train and certify, or as much of it as there is time for."""
@@ -285,7 +295,11 @@ class _RunningSweep:
                     self.returns[run, rung] = float(arrays["return"])
         policies = [self._policy(entry) for entry in missing]
         task = self.study.trainer.evaluation_task
-        for some, values in batched_mean_returns(task, policies, episodes=self.options["episodes"]):
+        if task is None:
+            measured: Any = [(list(range(len(missing))), self._training_returns(missing))]
+        else:
+            measured = batched_mean_returns(task, policies, episodes=self.options["episodes"])
+        for some, values in measured:
             entries: dict[str, Arrays] = {}
             for i, value in zip(some, values, strict=True):
                 self.returns[missing[i]] = float(value)
@@ -294,6 +308,10 @@ class _RunningSweep:
             self.clock.check()
         for entry in list(self.returns)[before:]:
             self._notify(entry, {"nominal_return": self.returns[entry]})
+
+    def _training_returns(self, entries: Sequence[tuple[int, int]]) -> list[float]:
+        checkpoints = [self.runs.checkpoint(*entry) for entry in entries]
+        return [each.training_return for each in checkpoints if each is not None]
 
     def _notify(self, entry: tuple[int, int], values: Mapping[str, float]) -> None:
         """Call the callbacks with numbers of a policy."""
@@ -317,7 +335,7 @@ class _RunningSweep:
         checkpoint = self.runs.checkpoint(*entry)
         return checkpoint is not None and checkpoint.finite
 
-    def _policy(self, entry: tuple[int, int]) -> Policy:
+    def _policy(self, entry: tuple[int, int]) -> TrainedPolicy:
         checkpoint = self.runs.checkpoint(*entry)
         assert checkpoint is not None
         return checkpoint.policy
@@ -420,7 +438,7 @@ class _RunningSweep:
             self._notify(entry, {"nominal_return": self.returns[entry], **numbers})
         return certificates
 
-    def _certify_policies(self, policies: Sequence[Policy], **options: Any) -> Certificates:
+    def _certify_policies(self, policies: Sequence[TrainedPolicy], **options: Any) -> Certificates:
         def remember(name: str, compute: Callable[[], Arrays]) -> Arrays:
             try:
                 self.clock.check()

@@ -2,15 +2,19 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
+from verifai_jax.policies import Policy as LoadedPolicy
 from verifai_jax.rl.policy import Policy
 
 if TYPE_CHECKING:
     from verifai_jax.certification.result import Certificates
+
+TrainedPolicy: TypeAlias = Policy | LoadedPolicy
+"""A policy of an algorithm of `rl`, or of anybody's function."""
 
 TRAINED, NONFINITE, STOPPED = "trained", "nonfinite", "stopped"
 """Statuses of a row: trained, with a number that is not finite, and stopped here by halving.
@@ -84,7 +88,7 @@ class SweepRecord:
     seed: int
     columns: Mapping[str, Shaped[np.ndarray, " _"]]
     hyperparameters: tuple[str, ...]
-    policies: tuple[Policy | None, ...]
+    policies: tuple[TrainedPolicy | None, ...]
     worst: tuple[Mapping[str, Any] | None, ...]
     curves: Mapping[tuple[int, int], Curve]
     certificates: "Certificates | None"

@@ -28,7 +28,6 @@ from verifai_jax.falsification.model_changes import changed_since, model_changes
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import Formula
 from verifai_jax.problem.problem import Problem
-from verifai_jax.rl.policy import Policy
 from verifai_jax.search import Search
 from verifai_jax.sweeps import storage
 from verifai_jax.sweeps.curves import check_curve, curve_robustness, curve_trace
@@ -40,7 +39,7 @@ from verifai_jax.sweeps.ranking import (
     pareto_fronts,
     preference_order,
 )
-from verifai_jax.sweeps.record import SweepRecord, algorithm_uses
+from verifai_jax.sweeps.record import SweepRecord, TrainedPolicy, algorithm_uses
 from verifai_jax.sweeps.study import Study
 from verifai_jax.sweeps.summary import Findings, format_headline, format_html, format_summary
 from verifai_jax.sweeps.trainer import ALGORITHM
@@ -166,7 +165,7 @@ class Sweep(Drawn):
         # Certificates are of the model with which the sweep went on last.
         return model_changes(self.record.sources[-1:], now)
 
-    def policy(self, i: int | np.integer) -> Policy:
+    def policy(self, i: int | np.integer) -> TrainedPolicy:
         """Return the policy of row `i` of the table: `sweep.policy(i).act(observation)`.
 
         **Raises:** `IndexError` for a row that is not in the table; `ValueError` for one without a
@@ -195,7 +194,7 @@ class Sweep(Drawn):
             )
         i = self._row(i)
         if i not in self._problems:
-            self._problems[i] = self.study.problem(policy)
+            self._problems[i] = self.study.problem(policy)  # pyright: ignore[reportArgumentType]
         return self._problems[i]
 
     def _row(self, i: int | np.integer) -> int:

@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Shaped
 
 from verifai_jax.certification.result import Certificate
-from verifai_jax.rl.policy import Policy
 from verifai_jax.sweeps.curves import curve_robustness
-from verifai_jax.sweeps.record import AFTER, BEFORE, Curve
+from verifai_jax.sweeps.record import AFTER, BEFORE, Curve, TrainedPolicy
 from verifai_jax.sweeps.study import Study
 from verifai_jax.sweeps.training_runs import RunCheckpoint
 
@@ -46,7 +45,7 @@ class Table(NamedTuple):
     """The parts of a `SweepRecord` that have one entry for each row, and the learning curves."""
 
     columns: Mapping[str, Shaped[np.ndarray, " rows"]]
-    policies: tuple[Policy | None, ...]
+    policies: tuple[TrainedPolicy | None, ...]
     worst: tuple[Mapping[str, object] | None, ...]
     curves: Mapping[tuple[int, int], Curve]
 

@@ -4,7 +4,7 @@
     table.parquet         the table
     failing.parquet       counterexamples of each row
     curves.npz            the learning curves
-    policies/12.npz       the policy of row 12; `rl.load_policy` reads it too
+    policies/12.npz       the policy of row 12; `vj.policy` reads it too
 
 `sweep.json` has the checksums of the others and one of itself: what has changed is told by name.
 The study is code, which the files never name: `load_sweep(folder, study)` takes it from its caller.
@@ -21,11 +21,12 @@ import numpy as np
 from verifai_jax.core.sources import Sources
 from verifai_jax.core.text import one_line
 from verifai_jax.features import FeatureSpace
-from verifai_jax.rl.policy import Policy, load_policy, save_policy
+from verifai_jax.policies import policy as load
+from verifai_jax.rl.policy import Policy, save_policy
 from verifai_jax.store import files
 from verifai_jax.store.files import DamagedError, checksum, plain
 from verifai_jax.store.locks import write_lock
-from verifai_jax.sweeps.record import Curve, SweepRecord
+from verifai_jax.sweeps.record import Curve, SweepRecord, TrainedPolicy
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -95,7 +96,11 @@ def _write_files(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> No
         if policy is not None:
             notes = {"study": record.study, "row": i, "verdict": str(table.loc[i, "verdict"])}
             sources = record.sources[-1] if record.sources else {}
-            save_policy(policy, folder / POLICIES / f"{i}.npz", sources=sources, **notes)
+            file = folder / POLICIES / f"{i}.npz"
+            if isinstance(policy, Policy):
+                save_policy(policy, file, sources=sources, **notes)
+            else:
+                policy.save(file)
     stored.failing.to_parquet(folder / FAILING)
     arrays: dict[str, np.ndarray] = {}
     for (configuration, seed), curve in record.curves.items():
@@ -210,10 +215,10 @@ def _read_record(folder: Path, description: Mapping[str, Any]) -> SweepRecord:
             if part == "steps":
                 returns = arrays[f"{configuration}/{seed}/mean_return"]
                 curves[int(configuration), int(seed)] = Curve(arrays[name], returns)
-    policies: list[Policy | None] = []
+    policies: list[TrainedPolicy | None] = []
     for i in range(len(table)):
         file = folder / POLICIES / f"{i}.npz"
-        policies.append(load_policy(file) if file.exists() else None)
+        policies.append(load(file) if file.exists() else None)
     return SweepRecord(
         columns={str(name): table[name].to_numpy() for name in table.columns},
         policies=tuple(policies),

@@ -25,7 +25,7 @@ from verifai_jax.problem.problem import Problem, ProblemError
 from verifai_jax.rl.policy import Policy
 from verifai_jax.sweeps.curves import check_curve
 from verifai_jax.sweeps.hyperparameters import probe_values
-from verifai_jax.sweeps.trainer import ALGORITHM, STEPS, StudyError, Trainer
+from verifai_jax.sweeps.trainer import STEPS, StudyError, Trainer
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -151,9 +151,7 @@ class Study:
     @property
     def algorithms(self) -> tuple[str, ...]:
         """Names of the algorithms that the space can choose."""
-        if ALGORITHM not in self.space.domains:
-            return tuple(self.trainer.by_name)
-        return tuple(value for value, _ in probe_values(self.space.domains[ALGORITHM]))
+        return self.trainer.algorithms_in(self.space)
 
     def sources(self) -> Sources:
         """Return the files of which the study and its problem are made, and versions."""
@@ -199,8 +197,9 @@ class Study:
     def __str__(self) -> str:
         lines = [f"{self.name}: {self.description}" if self.description else self.name]
         lines.append(f"  hyper-parameters: {', '.join(self.space.columns)}")
-        task = type(self.trainer.task).__name__
-        lines.append(f"  trains: {', '.join(self.algorithms)} on {task}, {self._length()}")
+        names = [n for n in self.algorithms if n != self.trainer.name]
+        trains = " on ".join([*filter(None, [", ".join(names)]), self.trainer.name])
+        lines.append(f"  trains: {trains}, {self._length()}")
         for name, formula in self.untrained_problem().formulas.items():
             lines.append(f"  {name}: {formula}")
         return "\n".join(lines)

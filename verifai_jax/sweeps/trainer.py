@@ -9,17 +9,20 @@ lacks.
 """
 
 import dataclasses
-from collections.abc import Mapping
+import inspect
+import pickle
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias, cast
 
 import jax
 import numpy as np
 from jaxtyping import Array, Key
 
-from verifai_jax.core.checks import is_number
+from verifai_jax.core.checks import check_count, is_number
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.features import FeatureSpace
+from verifai_jax.policies import policy as load
 from verifai_jax.rl import algorithms
 from verifai_jax.rl.algorithm import Algorithm
 from verifai_jax.rl.batched_training import Configuration
@@ -38,29 +41,59 @@ class StudyError(ValueError):
     """An error for a study that cannot be swept."""
 
 
+Train: TypeAlias = Callable[..., Any]
+"""A function `train(key, hyperparameters, steps=..., resume=...) -> policy`."""
+
+
 @dataclass(frozen=True, eq=False)
 class Trainer:
-    """A task and the algorithms that may learn it.
+    """A task and the algorithms that may learn it, or a function that trains.
+
+    A function `train(key, hyperparameters, steps=..., resume=...) -> policy` trains with any
+    framework, in a process of its own, so it is defined by `def` in a module or a script. It gets
+    the random key of the training seed, a dictionary of plain values, and the environment steps of
+    the training in all. `resume` is a folder: what the function leaves there at one checkpoint, it
+    finds there when it is called for the next; the folder is empty at first. A function without
+    this argument trains anew up to each checkpoint. It returns anything that `vj.policy` takes, or
+    `(policy, {"steps": [...], "mean_return": [...]})` with its learning curve.
 
     **Arguments:**
 
-    - `task`: the task to learn, see `rl.Task`. If it is a dataclass its fields may be swept.
+    - `task`: the task to learn, see `rl.Task`. If it is a dataclass its fields may be swept. Or a
+      function that trains, whose `algorithms` is left out.
     - `algorithms`: an algorithm, or several by name; their fields are the values of the
       hyper-parameters that are not swept.
     - `steps`: environment steps of a training, rounded up to whole updates.
     - `nominal`: the task that nominal returns are measured on, such as the same one without
-      randomisation and shaping; `task` itself when left out.
+      randomisation and shaping; `task` itself when left out, and for a function the mean return of
+      its learning curve.
+    - `example`: for a function, a policy with actions of the same form, such as
+      `lambda observation: jnp.zeros(2)`: the study is checked with it before anything trains.
+    - `observation`: for a function, an example of an observation where its policies do not say what
+      they observe, as functions and modules of flax.
+    - `workers`: for a function, processes at a time; as many as there are cores when left out.
 
     **Raises:** `StudyError` without an algorithm, for something that is no algorithm or no task, a
     number of steps that is not positive, or a nominal task with other actions or observations.
     """
 
-    task: Task
+    task: Any
     algorithms: Algorithm | Mapping[str, Algorithm] = field(default_factory=PPO)
     steps: int = 32_768
     nominal: Task | None = None
+    example: Any = None
+    observation: Any = None
+    workers: int | None = None
+
+    def __new__(cls, task: Task | Train, *arguments: object, **options: object) -> "Trainer":
+        """Make the trainer of a function where `task` is one."""
+        is_function = callable(task) and not isinstance(task, Task | type)
+        return object.__new__(FunctionTrainer if cls is Trainer and is_function else cls)
 
     def __post_init__(self) -> None:
+        for name in ("example", "observation", "workers"):
+            if getattr(self, name) is not None:
+                raise StudyError(f"{name} belongs to a function that trains, not to a task")
         given = self.algorithms
         if not isinstance(given, Mapping):
             given = {type(given).__name__.lower(): given}
@@ -71,29 +104,28 @@ class Trainer:
                 raise StudyError(
                     f"algorithm {name!r} must be an algorithm such as PPO(); got {algorithm!r}"
                 )
-        for name, task in (("task", self.task), ("nominal", self.evaluation_task)):
+        nominal = self.task if self.nominal is None else self.nominal
+        for name, task in (("task", self.task), ("nominal", nominal)):
             if not isinstance(task, Task):
                 missing = [n for n in _TASK if not hasattr(task, n)]
                 raise StudyError(
                     f"{name} must have {', '.join(_TASK)}; {type(task).__name__} lacks "
                     f"{', '.join(missing)}"
                 )
-        forms = [
-            (task.action, _observation_shape(task)) for task in (self.task, self.evaluation_task)
-        ]
+        forms = [(task.action, _observation_shape(task)) for task in (self.task, nominal)]
         if forms[0] != forms[1]:
             raise StudyError(
                 f"nominal must have the actions and observations of task, {forms[0]}; "
                 f"got {forms[1]}"
             )
         object.__setattr__(self, "algorithms", dict(given))
-        object.__setattr__(self, "steps", _integer(self.steps, STEPS))
+        object.__setattr__(self, "steps", whole_number(self.steps, STEPS))
         if self.steps < 1:
             raise StudyError(f"steps must be at least 1; got {self.steps}")
 
     @property
-    def evaluation_task(self) -> Task:
-        """Task on which nominal returns are measured."""
+    def evaluation_task(self) -> Task | None:
+        """Task on which nominal returns are measured; None for those of the learning curve."""
         return self.task if self.nominal is None else self.nominal
 
     @property
@@ -130,7 +162,7 @@ class Trainer:
             if name in values and name not in _layers(algorithm)
         }
         if WIDTH in values:
-            width = _integer(values[WIDTH], WIDTH)
+            width = whole_number(values[WIDTH], WIDTH)
             for name in _layers(algorithm):
                 changes[name] = (width,) * len(getattr(algorithm, name))
         task, fields = self.task, _fields(self.task)
@@ -139,7 +171,7 @@ class Trainer:
             task = dataclasses.replace(task, **swept)  # pyright: ignore[reportArgumentType]
         if changes:
             algorithm = dataclasses.replace(algorithm, **changes)  # pyright: ignore[reportArgumentType]
-        steps = _integer(values.get(STEPS, self.steps), STEPS)
+        steps = whole_number(values.get(STEPS, self.steps), STEPS)
         return Configuration(task, algorithm, steps, seed)
 
     def algorithm_name(self, values: Mapping[str, Any]) -> str:
@@ -166,6 +198,17 @@ class Trainer:
 
         shapes = jax.eval_shape(initial_policy, jax.eval_shape(lambda: jax.random.key(0)))
         return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
+
+    def algorithms_in(self, space: FeatureSpace) -> tuple[str, ...]:
+        """Return the names of the algorithms that a space can choose."""
+        if ALGORITHM not in space.domains:
+            return tuple(self.by_name)
+        return tuple(value for value, _ in probe_values(space.domains[ALGORITHM]))
+
+    @property
+    def name(self) -> str:
+        """Kind of the task, or name of the function that trains."""
+        return type(self.task).__name__
 
     def check(self, space: FeatureSpace) -> None:
         """Check that a space of hyper-parameters can be trained; nothing compiles.
@@ -254,6 +297,84 @@ class Trainer:
         raise StudyError(f"algorithm {algorithm!r}: {last}")
 
 
+class FunctionTrainer(Trainer):
+    """The trainer of a function; see `Trainer`, which makes it."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "steps", whole_number(self.steps, STEPS))
+        if self.steps < 1:
+            raise StudyError(f"steps must be at least 1; got {self.steps}")
+        if self.example is None:
+            raise StudyError(
+                f"{self.name} trains by itself: give example=, a policy with actions of the form "
+                "that it returns, such as lambda observation: jnp.zeros(2)"
+            )
+        if self.nominal is not None and not isinstance(self.nominal, Task):
+            raise StudyError(f"nominal must be a task; got {type(self.nominal).__name__}")
+        if self.workers is not None:
+            check_count("workers", self.workers, error=StudyError)
+        names = inspect.signature(self.train).parameters
+        anything = any(p.kind is p.VAR_KEYWORD for p in names.values())
+        if "steps" not in names and not anything:
+            raise StudyError(
+                f"{self.name} must be train(key, hyperparameters, steps=..., resume=...) -> "
+                f"policy; it has the arguments {', '.join(names)}"
+            )
+
+    @property
+    def train(self) -> Train:
+        """The function."""
+        return cast(Train, self.task)
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return getattr(self.train, "__name__", type(self.train).__name__)
+
+    @property
+    def evaluation_task(self) -> Task | None:
+        """Task on which nominal returns are measured; None for those of the learning curve."""
+        return self.nominal
+
+    @property
+    def by_name(self) -> dict[str, Any]:
+        """The function by its name."""
+        return {self.name: self.train}
+
+    def algorithms_in(self, space: FeatureSpace) -> tuple[str, ...]:
+        """Return its name, whatever the space calls an algorithm."""
+        return (self.name,)
+
+    def used_hyperparameters(self, values: Mapping[str, Any]) -> tuple[str, ...]:
+        """Return all names: the function gets all values."""
+        return tuple(values)
+
+    def untrained_policy(self, name: str) -> Any:
+        """Return the example."""
+        return load(self.example, observation=self.observation)
+
+    def check(self, space: FeatureSpace) -> None:
+        """Check that the hyper-parameters are single values, and that processes find the function.
+
+        **Raises:** `StudyError`.
+        """
+        for name, domain in space.domains.items():
+            if domain.columns(name) not in ((name,), ()) or domain.size > 1:
+                raise StudyError(f"hyper-parameter {name} must be a single value; got {domain!r}")
+        try:
+            pickle.dumps(self.train)
+        except Exception as error:
+            raise StudyError(
+                f"{self.name} runs in processes of its own, which must be able to import it: "
+                "define it by `def` at the top level of a module or a script"
+            ) from error
+
+
+def resumes(train: Train) -> bool:
+    """Return whether a function that trains takes the folder of its last checkpoint."""
+    return "resume" in inspect.signature(train).parameters
+
+
 def _observation_shape(task: Task) -> tuple[int, ...]:
     """Return the shape of a task's observations."""
     form = jax.eval_shape(
@@ -286,7 +407,7 @@ def _cast(present: object, value: object, name: str) -> object:
             raise ValueError(f"{name} must be True or False; got {value!r}")
         return bool(value)
     if isinstance(present, int):
-        return _integer(value, name)
+        return whole_number(value, name)
     if isinstance(present, float | np.ndarray | np.generic | jax.Array) and np.ndim(present) == 0:
         if isinstance(value, bool | str) or not isinstance(value, int | float):
             raise ValueError(f"{name} must be a number; got {value!r}")
@@ -296,7 +417,11 @@ def _cast(present: object, value: object, name: str) -> object:
     raise ValueError(f"{name} is no single value and cannot be swept; it is {present!r}")
 
 
-def _integer(value: object, name: str) -> int:
+def whole_number(value: object, name: str) -> int:
+    """Return a whole number that a hyper-parameter must be.
+
+    **Raises:** `ValueError`.
+    """
     if not is_number(value) or int(value) != value:
         raise ValueError(f"{name} must be a whole number (DiscreteBox, Categorical); got {value!r}")
     return int(value)

@@ -26,7 +26,7 @@ from verifai_jax.store.log import Arrays
 from verifai_jax.sweeps.clock import Clock, OutOfTime
 from verifai_jax.sweeps.fingerprint import digest
 from verifai_jax.sweeps.hyperparameters import Hyperparameters
-from verifai_jax.sweeps.record import Curve
+from verifai_jax.sweeps.record import Curve, TrainedPolicy
 from verifai_jax.sweeps.study import Study
 
 RECENT = 0.1
@@ -43,7 +43,7 @@ class RunCheckpoint:
     - `seconds`: of one core, without compilation.
     """
 
-    policy: Policy
+    policy: TrainedPolicy
     finite: bool
     curve: Curve
     seconds: float

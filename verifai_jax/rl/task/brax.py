@@ -20,6 +20,8 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.rl.task.stepping import ObservedState, flat_observation, match_types
 from verifai_jax.rl.task.task import Continuous
 from verifai_jax.systems.environments._brax import Brax, brax
+from verifai_jax.systems.environments._playground import loaded
+from verifai_jax.systems.environments.brax_model import Env as PlaygroundEnv
 from verifai_jax.systems.environments.brax_model import explain_errors
 
 if TYPE_CHECKING:
@@ -105,6 +107,33 @@ def brax_task(
     chosen = tuple(sorted((options or {}).items()))
     system = (_by_name if isinstance(env, str) else _checked)(env, backend, chosen)
     task = BraxTask(system.env, system.name, time_limit)
+    jax.eval_shape(task.reset, jax.random.key(0))
+    return task
+
+
+@suggests_options
+def playground_task(
+    env: str | PlaygroundEnv,
+    *,
+    time_limit: int = 1000,
+    options: Mapping[str, object] | None = None,
+) -> BraxTask:
+    """Make a `Task` of an environment of MuJoCo Playground.
+
+    **Arguments:**
+
+    - `env`: the name of an environment, or an `MjxEnv` of your own.
+    - `time_limit`: in steps, after which an episode is cut off.
+    - `options`: overrides of the configuration of an environment by name.
+
+    **Returns:** a task with actions from -1 to 1 for each actuator.
+
+    **Raises:** `MissingExtra` without Playground; `UnknownNameError` for an unknown environment;
+    `ValueError` for observations that are no array, and for one whose assets are not installed.
+    """
+    check_count("time_limit", time_limit)
+    made, name = loaded(env, options)
+    task = BraxTask(made, name, time_limit)
     jax.eval_shape(task.reset, jax.random.key(0))
     return task
 

@@ -67,6 +67,7 @@ class Pool:
     - `simulation(features, seed) -> Trace`: picklable, as `function` is.
     - `function`: the user's part of it, which errors speak of.
     - `workers`, `timeout` (s), `retries`: see `blackbox`.
+    - `fresh`: each simulation gets a process of its own.
 
     **Raises:** `ValueError` for numbers out of range, and for a function that a new process cannot
     import.
@@ -79,6 +80,7 @@ class Pool:
         workers: int,
         timeout: float | None,
         retries: int,
+        fresh: bool = False,
     ) -> None:
         check_count("workers", workers)
         if timeout is not None and not (isinstance(timeout, int | float) and timeout > 0):
@@ -89,6 +91,7 @@ class Pool:
                 "workers need Linux or macOS; leave them out, or use a remote simulator"
             )
         self._begin(workers, timeout, retries, pickled_setup(simulation, function))
+        self.fresh = fresh
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Elsewhere it is a pool of its own, which finds the function by its name too.
@@ -96,6 +99,7 @@ class Pool:
 
     def _begin(self, workers: int, timeout: float | None, retries: int, setup: bytes) -> None:
         self.workers, self.timeout, self.retries = workers, timeout, retries
+        self.fresh = False
         self._setup = setup
         self._slots = threading.Semaphore(workers)
         # Its own operations are all the locking that it needs.
@@ -187,6 +191,10 @@ class Pool:
                         message = f"{end} (attempt {deaths} of {self.retries + 1})"
                         outcome = Outcome(None, Status.ERROR, message)
                         break
+                if self.fresh and worker is not None:
+                    batch.leave(worker)
+                    worker.end()
+                    worker = None
                 if outcome is not None:
                     batch.results.put((index, outcome))
         except BaseException as error:  # A thread must not die silently: its batch would wait.

@@ -206,7 +206,7 @@ def brax(
     and numbers that do not fit; once the system is traced, for a policy, a state or signals that
     do not, and for an environment that does not work with the installed versions.
     """
-    _import("brax.envs")
+    import_quietly("brax.envs")
     check_version("brax", OLDEST)
     if isinstance(env, str):
         name = env
@@ -245,17 +245,17 @@ def brax(
     )
 
 
-def _import(module: str) -> Any:
-    """Import a module of Brax, without the messages that it and its packages print."""
-    require("brax", extra="brax")
+def import_quietly(module: str, extra: str = "brax") -> Any:
+    """Import a module of a package, without the messages that it and its packages print."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
-        return require(module, extra="brax")
+        require(module.partition(".")[0], extra=extra)
+        return require(module, extra=extra)
 
 
 def _make(name: str, backend: str | None, options: dict[str, object]) -> Any:
     """Make one of Brax's own environments, by its name."""
-    envs = _import("brax.envs")
+    envs = import_quietly("brax.envs")
     known = getattr(envs, "_envs", {})
     if known and name not in known:
         raise unknown_name("environment of brax", name, known)
@@ -275,7 +275,7 @@ def _check_env(env: Env, name: str) -> None:
                 f"env must be the name of an environment or a brax Env; got {env!r}, "
                 f"which has no {part}"
             )
-    wrappers = _import("brax.envs.wrappers.training")
+    wrappers = import_quietly("brax.envs.wrappers.training")
     training = tuple(
         getattr(wrappers, wrapper)
         for wrapper in ("AutoResetWrapper", "EpisodeWrapper", "VmapWrapper")

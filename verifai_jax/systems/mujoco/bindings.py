@@ -126,12 +126,19 @@ class Bindings:
             )
         return _set(leaves, groups[2], features, self._base)
 
-    def start(self, features: Mapping[str, Any]) -> dict[str, Float[Array, " k"]]:
-        """Return `qpos`, `qvel` and `act` at time 0, and where mocap bodies are, if that is set."""
-        begin = self.model.begin
-        bound = {"qpos", "qvel", "act"} | {b.location.array for b in self.state} | set(begin)
+    def start(
+        self,
+        features: Mapping[str, Any],
+        begin: Mapping[str, Float[Array | np.ndarray, " k"]] | None = None,
+    ) -> dict[str, Float[Array, " k"]]:
+        """Return `qpos`, `qvel` and `act` at time 0, and where mocap bodies are, if that is set.
+
+        - `begin`: what they are where no feature sets them; as in the model's keyframe if None.
+        """
+        known = self.model.begin if begin is None else begin
+        bound = {"qpos", "qvel", "act"} | {b.location.array for b in self.state} | set(known)
         values = {
-            name: jnp.asarray(begin.get(name, self._base(name)), _float())
+            name: jnp.asarray(known.get(name, self._base(name)), _float())
             for name in STATE
             if name in bound
         }

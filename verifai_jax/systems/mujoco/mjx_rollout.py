@@ -190,8 +190,13 @@ def prepare_model(bindings: Bindings, features: Features) -> tuple[Any, Any]:
     **Raises:** `NotImplementedError` for a model that MJX cannot do.
     """
     model, blank = _mjx_model(bindings)
+    return with_leaves(model, bindings, features), blank
+
+
+def with_leaves(model: MjxModel, bindings: Bindings, features: Features) -> Any:
+    """Return an MJX model with what features set, and what follows from that."""
     if not bindings.arrays:
-        return model, blank
+        return model
     leaves = bindings.leaves(features)
     changes = {}
     for name, value in leaves.items():
@@ -200,9 +205,7 @@ def prepare_model(bindings: Bindings, features: Features) -> tuple[Any, Any]:
             value = jnp.maximum(value, MIN_POSITIVE)
         changes[name] = value.reshape(old.shape).astype(old.dtype)
     model = model.tree_replace(changes)
-    if bindings.moves_constants:
-        model = recompute_constants(model)
-    return model, blank
+    return recompute_constants(model) if bindings.moves_constants else model
 
 
 def _mjx_model(bindings: Bindings) -> tuple[Any, Any]:
