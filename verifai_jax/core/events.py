@@ -22,13 +22,13 @@ from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.text import format_seconds
 
 ABSENT = -1
-"""The kind at places behind the last event."""
+"""The kind at places after the last event."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Events:
-    """Events in the order in which they happen; places behind the last one are absent.
+    """Events in the order in which they happen; places after the last one are absent.
 
     - `kinds`: `[places]`, the place of each event's name in `names`; -1 where there is none.
     - `waits`: `[places]`, seconds since the event before, or the start; 0 where there is none.

@@ -23,7 +23,7 @@ except ImportError:
     fcntl = None
 
 LOCK = "writer.lock"
-"""Name of the file in a folder that is being written; `NAME.lock` beside a file NAME that is."""
+"""Name of the file in a folder that is being written; `NAME.lock` next to a file NAME that is."""
 _NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}
 
 
@@ -47,7 +47,7 @@ if hasattr(os, "register_at_fork"):
 
 @contextlib.contextmanager
 def returning_once() -> Iterator[None]:
-    """Run code of the user that may fork: only the process that entered goes on behind it.
+    """Run code of the user that may fork: only the process that entered continues after it.
 
     A copy of this process that comes back, as where an `exec` fails, ends without a word: it would
     answer for its parent, and write into the folder of its parent's run.

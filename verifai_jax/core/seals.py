@@ -1,4 +1,4 @@
-"""Records with a checksum of their own content, so that a changed file is told from a whole one.
+"""Records with a checksum of their own content, which shows whether a file was changed.
 
 file.write_text(json.dumps(sealed(record)))
 is_intact(json.loads(file.read_text()))

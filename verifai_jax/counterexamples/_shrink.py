@@ -338,7 +338,7 @@ class _Search:
         self.follow(self.starts())
         candidates.limit = candidates.budget - 2 * nominal.space.dim
         self.follow(self.starts()[:1])
-        # A boundary of many pieces has a nearest point on each: some of those beside this one.
+        # A boundary of many pieces has a nearest point on each: some of those next to this one.
         search_alongside(candidates, self.failures()[0], self.rng)
         self.follow(self.starts(self.failures()[:1], cosine=0.97)[1:], rounds=10)
         for _ in range(2):

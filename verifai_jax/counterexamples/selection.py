@@ -1,4 +1,4 @@
-"""The selection of a counterexample of a run, and of others beside it."""
+"""The selection of a counterexample of a run, and of others next to it."""
 
 from collections.abc import Mapping
 from typing import Any, TypeAlias

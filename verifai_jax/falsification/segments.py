@@ -3,7 +3,7 @@
     table/rows-000000000000-000001048576-9f3c2a1b.parquet       rows 0 to 1048575
     failures/rows-000000000000-000001048576-07d1e44a.parquet    those of them that stand out
 
-A file is written once, in whole, and renamed into place; its name has its first row, the one behind
+A file is written once, in whole, and renamed into place; its name has its first row, the one after
 its last, and its checksum. Beside each segment stand the rows of it that stand out: those that
 violate the property, have no verdict or a gradient that is not finite, and the one of least
 robustness. What counts or shows failures reads these alone. `pandas.read_parquet` opens either
@@ -132,7 +132,7 @@ def standing_out(columns: Columns) -> Int[np.ndarray, " k"]:
 
 
 def write_segment(run: Path, first: int, columns: Columns) -> Segment:
-    """Write rows from `first` on into the folder of a run, and those that stand out beside them.
+    """Write rows from `first` on into the folder of a run, and those that stand out next to them.
 
     **Raises:** `OSError` where they cannot be written.
     """

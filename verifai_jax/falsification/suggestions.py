@@ -6,7 +6,7 @@
     suggestions.waiting(rows)                           # rows to simulate next, [n, row]
 
 What was suggested is in the checkpoint, written before the first of it is simulated: a run that
-goes on asks again for nothing that it was told.
+goes on does not ask again for suggestions that it has already received.
 """
 
 from collections.abc import Iterable, Mapping

@@ -420,7 +420,7 @@ def new_folder(folder: str | Path | None) -> Iterator[Path | None]:
         yield None
         return
     path = Path(folder)
-    if not (path / LOCK).exists():  # Whoever writes there is told by the lock.
+    if not (path / LOCK).exists():  # The lock says who writes there.
         _check_empty(path)
     with locked(path):
         _check_empty(path)  # Another run may have begun in it, and ended, since.

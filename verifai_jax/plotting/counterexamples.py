@@ -148,7 +148,7 @@ def _course(
     """Return times and values that draw a function of time through these control points."""
     count = len(knots)
     if wave.hold == "linear":
-        # The first and the last value hold before and behind given times.
+        # The first and the last value hold before and after given times.
         times = control_times(count, wave.hold, wave.times, length)
         clock = np.concatenate([[0.0], times, [max(length, float(times[-1]))]])
         return clock, np.concatenate([knots[:1], knots, knots[-1:]])
@@ -197,7 +197,7 @@ def _draw_bars(axes: Axes, explained: Explained) -> None:
 
 
 def plot_shrunk(shrunk: Shrunk, path: str | Path | None = None) -> Figure:
-    """Draw the coordinates that depart from nominal, beside the signal that breaks the property.
+    """Draw the coordinates that depart from nominal, next to the signal that breaks the property.
 
     **Arguments:**
 

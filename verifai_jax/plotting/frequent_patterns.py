@@ -1,4 +1,4 @@
-"""Frequent patterns as bars beside the shares expected."""
+"""Frequent patterns as bars next to the shares expected."""
 
 from pathlib import Path
 from typing import Any

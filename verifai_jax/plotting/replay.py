@@ -267,7 +267,7 @@ def _shade(axes: Axes, clock: Float[np.ndarray, " t"], fails: Bool[np.ndarray, "
 
 
 def _name_signal(axes: Axes, name: str) -> None:
-    """Write a name beside its panel, across: panels are less high than names are long."""
+    """Write a name next to its panel, across: panels are less high than names are long."""
     axes.set_ylabel(
         wrap_name(name, WIDEST_NAME, 4), rotation=0, ha="right", va="center", fontsize=9
     )

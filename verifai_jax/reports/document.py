@@ -1,4 +1,4 @@
-"""Reports as files: one HTML file, and its claims as JSON beside it.
+"""Reports as files: one HTML file, and its claims as JSON next to it.
 
 write_report(run, "balance.html")               # balance.html and balance.claims.json
 write_report(sweep, "sweep.html")               # a sweep, an estimate, a comparison
@@ -40,7 +40,7 @@ def write_report(
     problem: Problem | None = None,
     progress: bool | None = None,
 ) -> Path:
-    """Write the evidence report on a result as one HTML file, and its claims as JSON beside it.
+    """Write the evidence report on a result as one HTML file, and its claims as JSON next to it.
 
     **Arguments:**
 

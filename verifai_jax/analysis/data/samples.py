@@ -75,7 +75,7 @@ class Samples:
         - `source`: a run, its table, a DataFrame with feature columns and row numbers as index, or
           `Samples`, which are taken as they are, with other `columns` where they are given.
         - `which`: `"counterexamples"`, `"safe"`, `"failed"` (rows without a verdict), or `"all"`
-          rows with a verdict. Those of a DataFrame are told by its columns `violated` and
+          rows with a verdict. Those of a DataFrame are recognised by its columns `violated` and
           `status`, else by `rho < 0`; without either, all rows are counterexamples.
         - `columns`: what to analyse; by default all features. `"rho"` and `"rho.NAME"`, the
           robustness, are columns too, but only if named here.

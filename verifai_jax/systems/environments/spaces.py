@@ -1,9 +1,10 @@
-"""Actions and observations of Gymnasium's spaces, told apart by the class of the space.
+"""Actions and observations of Gymnasium's spaces, distinguished by the class of the space.
 
 fit(env.action_space, action, clip=True)            # as the environment takes it, or a Misfit
 named_numbers("action", action)                     # {"action": ...}, or {"action.grip": ...}
 
-Classes are told by their names: Gymnasium is an optional package, and older ones have the same.
+Classes are recognised by their names: Gymnasium is an optional package, and older ones have the
+same.
 """
 
 from collections.abc import Iterator, Mapping

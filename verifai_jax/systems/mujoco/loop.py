@@ -72,7 +72,7 @@ class Sample(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """The carry from sample to sample beside the physics."""
+    """The carry from sample to sample in addition to the physics."""
 
     memory: Any
     age: Int[Array, ""]
@@ -226,7 +226,7 @@ class Loop:
             for name, shape in self.shapes.items()
         }
         sensors = full["sensordata"]
-        # Sensors that were added for contacts lie behind the model's own.
+        # Sensors that were added for contacts lie after the model's own.
         own = sensors[: self.compiled.nsensordata - len(self.bindings.model.contact_sensors)]
         return State(time, **{**full, "sensordata": own}), sensors
 

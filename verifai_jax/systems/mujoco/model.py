@@ -63,7 +63,7 @@ KINDS = ("body", "joint", "geom", "site", "actuator", "tendon", "equality", "pai
 GEOM_MASS = "geom_mass"
 """The masses of geoms, `[ngeom]`, of which MuJoCo keeps only what they add up to in their body."""
 
-# What can be set, beside parameters of the model: the state at time 0, and what acts on it.
+# What can be set, in addition to parameters of the model: the state at time 0, and what acts on it.
 _INPUTS = {
     "body": ("force", "torque"),
     "geom": ("mass",),
@@ -147,7 +147,7 @@ def load(
     **Arguments:**
 
     - `source`: the path of an MJCF file, its text, an `mujoco.MjSpec`, or an `mujoco.MjModel`.
-    - `contacts`: paths `contact/GEOM` and `contact/GEOM/GEOM`, for which a sensor is added behind
+    - `contacts`: paths `contact/GEOM` and `contact/GEOM/GEOM`, for which a sensor is added after
       the model's own.
     - `keyframe`: name or number of the keyframe that simulations begin with.
     - `options`: fields of the model's options to set, where they are not None.
@@ -386,7 +386,7 @@ def _locate_input(
         return [_pick(path, "ctrl", np.array([element]), index)]
     if field == "act":
         return [_pick(path, "act", _activations(model, element, path), index)]
-    # A position servo is gain kp and bias -kp; a damped one has bias -kv beside.
+    # A position servo is gain kp and bias -kp; a damped one also has bias -kv.
     gain, bias = model.actuator_gainprm.shape[1], model.actuator_biasprm.shape[1]
     if model.actuator_biastype[element] != 1:
         raise ValueError(
