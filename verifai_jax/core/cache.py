@@ -53,7 +53,7 @@ class Cache:
       None keeps everything in this process only.
     - `kind`: of the work: `"sweep"` or `"augmentation"`.
 
-    **Raises:** `CacheError` for a file that is no cache of this kind, damaged, or of another
+    **Raises:** `CacheError` for a file that is not a cache of this kind, damaged, or of another
     format.
     """
 

@@ -194,8 +194,8 @@ def shrink(
       least distance; nothing that departs in more coordinates than the row does;
       `"distance"`: the least distance, whatever their number. It is Euclidean in unit coordinates,
       of which each is 1 over its whole range (by probability, for a distribution), between two
-      choices 1, and by places in integers. Every control point of a signal and every component of a
-      vector is a coordinate of its own.
+      choices 1, and by indices in integers. Every control point of a signal and every component of
+      a vector is a coordinate of its own.
     - `budget`: simulations at most; a gradient counts as one.
     - `seed`: of the random candidates.
     - `others`: whether other counterexamples of the run are looked at too.

@@ -282,7 +282,7 @@ def advance(candidates: Candidates, track: Track, points: Points, failing: np.nd
 
 
 def share_of_segment(candidates: Candidates, u: Point, other: Point) -> float | None:
-    """Return the share of the way from nominal to `u` at which `other` lies; None if it lies off that way."""
+    """Return where `other` lies between nominal (0) and `u` (1); None if it lies elsewhere."""
     u0 = candidates.nominal.u.astype(np.float64)
     v, w = u - u0, other - u0
     share = float(w @ v / max(v @ v, 1e-30))

@@ -61,7 +61,7 @@ class Journal:
         self._file.flush()
 
     def recall(self, first: int, points: Float[np.ndarray, "n d"]) -> dict[int, RowVerdict]:
-        """Return the known rows from `first` on, of the same points, by their place among them."""
+        """Return the known rows from `first` on, of the same points, by their index among them."""
         if not self._known:
             return {}
         found = {}

@@ -24,7 +24,7 @@ class _Slot(NamedTuple):
 
 
 class Packing:
-    """The places of a pytree's leaves in one vector for each width; known once `pack` is traced."""
+    """The indices of a pytree's leaves in one vector for each width; set when `pack` is traced."""
 
     def __init__(self) -> None:
         self._slots: list[_Slot] = []

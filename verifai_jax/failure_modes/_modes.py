@@ -103,8 +103,8 @@ def modes(
     could not be weighed, and a note says so. Where the system draws random numbers, probabilities
     are over these too, and each mode holds the random key under which its likeliest failure fails.
 
-    **Raises:** `TypeError` for something that is no problem or run; `ValueError` for options out of
-    range, or a run that was loaded without its problem.
+    **Raises:** `TypeError` for something that is not a problem or run; `ValueError` for options out
+    of range, or a run that was loaded without its problem.
     """
     started = time.perf_counter()
     if not isinstance(source, Problem | Run):

@@ -120,7 +120,7 @@ class Segment:
 
 
 def standing_out(columns: Columns) -> Int[np.ndarray, " k"]:
-    """Return the places of the rows that counts, statistics and searches for failures need."""
+    """Return the indices of the rows that counts, statistics and searches for failures need."""
     proper = columns["status"] == "ok"
     out = ~proper | columns["violated"].astype(bool)
     if "gradient_finite" in columns:

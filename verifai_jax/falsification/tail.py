@@ -75,7 +75,7 @@ def replace_tail(folder: Path, first: int, batch: "pa.RecordBatch | None") -> No
 def read_tail(folder: Path) -> "list[tuple[int, pa.RecordBatch]]":
     """Return the batches of a tail that are whole, each with the number of its first row.
 
-    **Raises:** `TableError` for what is no file.
+    **Raises:** `TableError` for anything that is not a file.
     """
     import pyarrow as pa
 

@@ -118,7 +118,8 @@ def check_options(
 def check_search(problem: object, search: object) -> Search:
     """Return the search, by its name or itself, if it can work on this problem.
 
-    **Raises:** `TypeError` for what is no problem or no search; `ValueError` for one that cannot.
+    **Raises:** `TypeError` for anything that is not a problem or a search; `ValueError` for one
+    that cannot.
     """
     if not isinstance(problem, Problem):
         raise TypeError(f"falsify needs a Problem; got {type(problem).__name__}")

@@ -43,7 +43,7 @@ def plot_explanation(explained: Explained, path: str | Path | None = None) -> Fi
     **Arguments:**
 
     - `explained`: what `explain` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.
     """
@@ -202,7 +202,7 @@ def plot_shrunk(shrunk: Shrunk, path: str | Path | None = None) -> Figure:
     **Arguments:**
 
     - `shrunk`: what `shrink` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.
     """

@@ -20,7 +20,7 @@ def plot_frequent_patterns(patterns: FrequentPatterns, path: str | Path | None =
     **Arguments:**
 
     - `patterns`: what `analysis.frequent_patterns` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.
     """

@@ -57,7 +57,7 @@ def plot_replay(
     **Arguments:**
 
     - `replay`: what `run.replay` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
     - `signals`: the signals and Signal features to draw, in this order; chosen when left out.
 
     **Returns:** the figure.

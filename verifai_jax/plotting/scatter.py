@@ -41,7 +41,7 @@ def plot_features(
     **Arguments:**
 
     - `run`: what `falsify` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
     - `features`: names; by default the `maximum` that distinguish failing from safe samples best.
     - `maximum`: features at most, where they are not named.
 

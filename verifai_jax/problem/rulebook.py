@@ -35,7 +35,7 @@ class Rulebook:
     `order` lists the rules so that each comes after all that matter more: topologically, in the
     order of `names` where the edges leave it open.
 
-    **Raises:** `ValueError` for a name that is no rule, edges that go round in a circle, or more
+    **Raises:** `ValueError` for a name that is not a rule, edges that go round in a circle, or more
     than `MAX_RULES` rules.
     """
 

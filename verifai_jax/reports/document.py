@@ -63,7 +63,7 @@ def write_report(
     **Raises:** `UnknownNameError` for a unit or a reason of a feature that does not exist;
     `ValueError` for a number of simulations that is none, and for a run whose rows have changed
     since they were written;
-    `TypeError` for something that is no result.
+    `TypeError` for something that is not a result.
     """
     path, about = Path(path), About(units or {}, reasons or {})
     if modes is not None:

@@ -152,7 +152,7 @@ class Histogram(Leaf):
 
 @dataclass(frozen=True, eq=False)
 class Chosen(Leaf):
-    """An integer, or the place of an option.
+    """An integer, or the index of an option.
 
     - `values`: what the feature's choices stand for; None if the feature is the integer.
     """

@@ -51,8 +51,9 @@ class Trainer:
     - `nominal`: the task that nominal returns are measured on, such as the same one without
       randomisation and shaping; `task` itself when left out.
 
-    **Raises:** `StudyError` without an algorithm, for something that is no algorithm or no task, a
-    number of steps that is not positive, or a nominal task with other actions or observations.
+    **Raises:** `StudyError` without an algorithm, for something that is not an algorithm or
+    task, a number of steps that is not positive, or a nominal task with other actions or
+    observations.
     """
 
     task: Task

@@ -130,7 +130,7 @@ class Loop:
 
     @cached_property
     def locations(self) -> dict[str, Location]:
-        """The places of signals that are named by a path."""
+        """The locations of signals that are named by a path."""
         if callable(self.signals):
             return {}
         chosen = self._default_signals() if self.signals is None else self.signals

@@ -96,7 +96,7 @@ _PATH = re.compile(r"^(?P<kind>[^/\[\]]+)/(?P<rest>.+?)(\[(?P<index>[^\]]*)\])?$
 
 @dataclass(frozen=True)
 class Location:
-    """The place of some numbers in one array.
+    """The location of some numbers in one array.
 
     - `array`: its name in MjModel or MjData; `"opt.gravity"` is in the model's options.
     - `index`: flat indices `[k]` into it.
@@ -341,7 +341,7 @@ def names(model: MjModel, kind: str) -> list[str]:
 
 
 def locate(model: MjModel, path: str) -> list[Location]:
-    """Return the places that a bound path sets.
+    """Return the locations that a bound path sets.
 
     **Raises:** `UnknownNameError` for an unknown kind, element or field, with the nearest ones;
     `ValueError` for an index outside the field.
@@ -401,7 +401,7 @@ def _locate_input(
 
 
 def reading(model: MjModel, path: str) -> Location:
-    """Return the place of a signal's path in the state.
+    """Return the location of a signal's path in the state.
 
     **Raises:** as `locate`.
     """
@@ -480,7 +480,7 @@ def _flat(array: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _pick(path: str, array: str, where: np.ndarray, index: str | None) -> Location:
-    """Return the place of those numbers of an element that an index or a slice selects."""
+    """Return the location of those numbers of an element that an index or a slice selects."""
     if index is None:
         return Location(array, where, () if where.size == 1 else (where.size,), path)
     try:
