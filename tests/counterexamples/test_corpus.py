@@ -145,7 +145,7 @@ def test_bad_files_are_named_and_do_not_stop_the_others(tmp_path):
 
 
 @pytest.mark.slow
-def test_command(run, tmp_path, monkeypatch):
+def test_the_command_saves_counterexamples(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "spec.py").write_text(
         "import jax.numpy as jnp\nimport verifai_jax as vj\n"

@@ -81,7 +81,7 @@ def test_a_cache_knows_what_it_is_of(tmp_path):
     assert "study" not in told.partition("different sweep")[2].partition("Give")[0]
 
 
-def test_notes(tmp_path):
+def test_a_note_is_kept_with_the_cache(tmp_path):
     with Cache(tmp_path) as cache:
         assert cache.note("command") is None
         cache.note("command", {"a": [1, None]})
