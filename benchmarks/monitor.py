@@ -24,7 +24,7 @@ import jax
 import numpy as np
 
 import verifai_jax as vj
-from verifai_jax.mtl.lanes import LANES
+from verifai_jax.mtl._robustness import LANES
 
 SHAPES = {
     "G p": "G (p > 0)",

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import verifai_jax as vj
 from verifai_jax.evaluation.engine import Engine, chunks_and_lanes
 from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.mtl import lanes as lane_chunks
+from verifai_jax.mtl import _robustness as lane_chunks
 from verifai_jax.mtl import parallel, sequential, windows
 from verifai_jax.rl import batched_training
 

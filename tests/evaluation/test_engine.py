@@ -10,8 +10,7 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.evaluation.differentiation import Derivative
 from verifai_jax.evaluation.engine import Engine, engine_for
-from verifai_jax.evaluation.packing import Packing
-from verifai_jax.evaluation.streaming_monitor import streaming_monitor
+from verifai_jax.evaluation.row import Packing, streaming_monitor
 from verifai_jax.evaluation.verdicts import trace_verdict
 
 KEY = run_keys(0)[1]

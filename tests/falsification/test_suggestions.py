@@ -14,7 +14,7 @@ from verifai_jax import search
 from verifai_jax.core.cube import Cube
 from verifai_jax.falsification.suggestions import row_of
 from verifai_jax.reports.commands import run_python
-from verifai_jax.search import Absent
+from verifai_jax.search.suggested import Absent
 
 SPACE = {
     "a": vj.Box(0.0, 1.0),

@@ -8,7 +8,7 @@ import pytest
 from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.cube import Cube
 from verifai_jax.mtl.clauses import ABSENT
-from verifai_jax.search import Descent, Observations, Portfolio, interior
+from verifai_jax.search import Descent, Observations, Portfolio, descent
 
 D, WAVES, ROUNDS, SEEDS = 8, 30, 3500, 8
 LEVEL = -2.767
@@ -69,7 +69,7 @@ def histories():
 @pytest.mark.proves
 def test_what_comes_early_is_what_came_without_them(histories):
     (u, _, cost), (same, _, _) = histories
-    before = cost < interior.BEGINS
+    before = cost < descent.BEGINS
     assert before.sum() > 100 * SEEDS
     np.testing.assert_array_equal(u[before], same[before])
     assert all(np.any(u[i] != same[i]) for i in range(SEEDS))
@@ -100,13 +100,13 @@ def test_most_descents_are_given_up_early():
 
 def shares(**changes):
     zero = jnp.zeros(())
-    state = interior.begin(jax.random.key(0), Cube((0, 0)), 1)
+    state = descent.begin(jax.random.key(0), Cube((0, 0)), 1)
     state = state._replace(idle=zero + 200, spent=zero + 200, own=zero + 2, theirs=zero + 1)
-    return float(interior._share(state._replace(**changes)))
+    return float(descent._share(state._replace(**changes)))
 
 
 def test_shares_follow_the_evidence():
-    most, least = interior.MAX_SHARE, interior.MIN_SHARE
+    most, least = descent.MAX_SHARE, descent.MIN_SHARE
     assert shares() == pytest.approx(most / 4)
     assert shares(own=jnp.array(0.5)) == pytest.approx(most)
     assert shares(own=jnp.array(20.0)) == pytest.approx(least)
@@ -114,5 +114,5 @@ def test_shares_follow_the_evidence():
     assert shares(own=jnp.array(20.0), spent=jnp.array(0.0)) == pytest.approx(most)
     assert shares(idle=jnp.array(0.0)) == pytest.approx(least)
     assert shares(theirs=jnp.array(0.0)) == 0.0
-    dead = interior.begin(jax.random.key(0), Cube((0, 0)), 1).descent._replace(useless=jnp.int32(2))
+    dead = descent.begin(jax.random.key(0), Cube((0, 0)), 1).descent._replace(useless=jnp.int32(2))
     assert shares(descent=dead) == pytest.approx(least)

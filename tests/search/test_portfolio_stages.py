@@ -7,7 +7,7 @@ import pytest
 from playing import tell_of
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search import Diverse, Portfolio, interior, portfolio
+from verifai_jax.search import Diverse, Portfolio, descent, portfolio
 from verifai_jax.search.portfolio import MANY, NEVER, PATIENT, PortfolioStage
 
 CUBE = Cube((0,) * 3)
@@ -56,7 +56,7 @@ def test_rounds_of_many_points_begin_without_descents():
 
 def test_descents_into_the_interior_come_last():
     state = begin(4)
-    waited = state.interior._replace(cost=jnp.float32(interior.BEGINS))
+    waited = state.interior._replace(cost=jnp.float32(descent.BEGINS))
     assert Portfolio().stage(state._replace(interior=waited), CUBE, 4) == Portfolio()
     # Where the others have failures they have no turn.
     failing = waited._replace(theirs=jnp.float32(0))
@@ -88,7 +88,7 @@ def test_a_stage_proposes_what_the_whole_proposes():
     np.testing.assert_array_equal(points, same)
     whole, stage = states[-1], others[-1]
     # And what decides about the next stage is counted alike.
-    assert interior.waits(whole.interior) == interior.waits(stage.interior)
+    assert descent.waits(whole.interior) == descent.waits(stage.interior)
     for name in ("cost", "spent", "idle", "own", "theirs", "credit"):
         np.testing.assert_array_equal(
             getattr(whole.interior, name), getattr(stage.interior, name), err_msg=name

@@ -8,7 +8,7 @@ from playing import tell_of
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.search import Portfolio
-from verifai_jax.search.interior import APART
+from verifai_jax.search.descent import APART
 from verifai_jax.search.portfolio import OPENING, TAKEN
 
 CUBE = Cube((0,) * 4)

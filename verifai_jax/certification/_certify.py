@@ -21,8 +21,8 @@ from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.devices import enable_compile_cache
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.executors import Executor
+from verifai_jax.core.programs import power_of_two
 from verifai_jax.core.progress import say_done, shows_progress
-from verifai_jax.core.shapes import power_of_two
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem

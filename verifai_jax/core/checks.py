@@ -118,3 +118,20 @@ def check_count(
     if count is None or count < minimum:
         raise error(f"{name} must be an integer of at least {minimum}; got {value!r}")
     return count
+
+
+def check_options(
+    budget: object, batch: object, seed: object, max_seconds: object, stop_after: object
+) -> None:
+    """Refuse numbers out of range.
+
+    **Raises:** `ValueError`.
+    """
+    for name, value in (("budget", budget), ("batch", batch), ("stop_after", stop_after)):
+        if name == "stop_after" and value is None:
+            continue
+        check_count(name, value)
+    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or not 0 <= seed < 2**63:
+        raise ValueError(f"seed must be an integer from 0 to 2**63 - 1; got {seed!r}")
+    if max_seconds is not None:
+        check_positive("max_seconds", max_seconds)

@@ -1,14 +1,18 @@
-"""A typed cache of what is compiled for one object, kept and freed with that object.
+"""Few programs: a cache of what is compiled for one object, and few shapes of what it is given.
 
     ENGINES: Slot[EngineMode, Engine] = Slot("engines")
     engine = problem.programs.get(ENGINES, mode, lambda: Engine(problem, *mode))
 
-Whoever compiles declares a slot, which fixes the types of its keys and of its values.
+Whoever compiles declares a slot, which fixes the types of its keys and of its values. What is
+compiled is kept and freed with the object. Each shape compiles a program of its own, so numbers of
+rows become powers of two.
 """
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from typing import Generic, TypeVar, cast
+from typing import Any, Generic, TypeVar, cast
+
+import numpy as np
 
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
@@ -44,3 +48,23 @@ class ProgramCache:
     def clear(self) -> None:
         """Forget everything, so that its memory can be freed."""
         self._slots.clear()
+
+
+def power_of_two(count: int) -> int:
+    """Return the least power of two that is at least `count`, and at least 1."""
+    return 1 << max(count - 1, 0).bit_length()
+
+
+def pad_rows(rows: Any, count: int | None = None) -> np.ndarray:
+    """Return rows followed by copies of the last one.
+
+    **Arguments:**
+
+    - `rows`: an array `[n, ...]`; an empty one stays as it is.
+    - `count`: rows of the result, at least `n`; the next power of two when left out.
+    """
+    rows = np.asarray(rows)
+    missing = (power_of_two(len(rows)) if count is None else count) - len(rows)
+    if not missing:
+        return rows
+    return np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)])

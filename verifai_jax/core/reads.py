@@ -15,7 +15,7 @@ import sys
 from contextlib import suppress
 from types import FrameType
 
-from verifai_jax.core.user_files import PACKAGE, is_user_file, library_prefixes
+from verifai_jax.core.source_objects import PACKAGE, is_user_file, library_prefixes
 
 MAX_FILES = 200
 """Files of one module at most."""

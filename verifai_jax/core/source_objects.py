@@ -5,6 +5,8 @@
 
 A function of a user's file stands for its module. One that no file holds, of a notebook or an
 interpreter, stands for itself: its text, and the plain values that it takes from around it.
+`is_user_file` tells a user's own files from those of Python and of packages. Neither JAX nor
+anything else of this package is imported here, so that it may be asked at any time.
 """
 
 import functools
@@ -12,11 +14,12 @@ import hashlib
 import inspect
 import os
 import sys
+import sysconfig
 from collections.abc import Iterator, Mapping
+from functools import cache
+from pathlib import Path
 from types import CodeType, FunctionType, MethodType, ModuleType
 from typing import Any, NamedTuple, TypeAlias
-
-from verifai_jax.core.user_files import is_user_file
 
 MAX_OBJECTS = 4000
 """Objects that are looked at, at most."""
@@ -200,3 +203,44 @@ def _text_of_code(code: CodeType) -> str:
         _text_of_code(each) if isinstance(each, CodeType) else repr(each) for each in code.co_consts
     ]
     return "\n".join([code.co_code.hex(), *code.co_names, *constants])
+
+
+PACKAGE = Path(__file__).resolve().parents[1]
+"""Folder of this package."""
+_INSTALLED = ("site-packages", "dist-packages")
+"""Names of folders into which packages are installed."""
+
+
+def is_notebook_cell(file: str) -> bool:
+    """Return whether a name stands for the cell of a notebook."""
+    return "ipykernel_" in file or file.startswith("<ipython")
+
+
+@cache
+def is_user_file(file: str) -> bool:
+    """Return whether a file is a user's: neither this package nor Python nor installed."""
+    if file.startswith("<") and not file.startswith(("<stdin", "<string", "<ipython")):
+        return False
+    if "ipykernel_" in file:
+        return True
+    path = Path(file).absolute()
+    if any(name in path.parts for name in _INSTALLED):
+        return False
+    return not any(path.is_relative_to(folder) for folder in _libraries())
+
+
+@cache
+def library_prefixes() -> tuple[str, ...]:
+    """Return the beginnings of paths of Python's files and of most that are installed."""
+    return tuple(f"{folder}{os.sep}" for folder in _libraries())
+
+
+@cache
+def _libraries() -> tuple[Path, ...]:
+    """Return the folders of this package, of Python and of what is installed."""
+    names = ("stdlib", "platstdlib", "purelib", "platlib")
+    folders = {Path(sysconfig.get_path(name)) for name in names}
+    folders |= {PACKAGE, Path(__file__).parents[1], Path(os.__file__).parent}
+    # The plugin of pytest stands beside the package.
+    folders |= {folder.parent / "_verifai_jax_pytest.py" for folder in tuple(folders)}
+    return tuple(folders | {folder.resolve() for folder in folders})

@@ -22,9 +22,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from verifai_jax.core.reads import files_read_by, modules_loaded_by
-from verifai_jax.core.source_objects import Function, Module, OwnFiles, parts_of
+from verifai_jax.core.source_objects import (
+    Function,
+    Module,
+    OwnFiles,
+    is_notebook_cell,
+    is_user_file,
+    parts_of,
+)
 from verifai_jax.core.source_scan import MAX_FILES, Import, files_of_model, scan
-from verifai_jax.core.user_files import is_notebook_cell, is_user_file
 
 PACKAGES = (
     *(

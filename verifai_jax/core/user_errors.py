@@ -24,8 +24,8 @@ from typing import Any, NamedTuple
 import jax
 
 from verifai_jax.core.errors import nearest_names
+from verifai_jax.core.source_objects import is_notebook_cell, is_user_file
 from verifai_jax.core.text import storable
-from verifai_jax.core.user_files import is_notebook_cell, is_user_file
 from verifai_jax.core.waveform import IS_CALLED
 
 MAX_CODE = 80

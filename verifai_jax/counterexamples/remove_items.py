@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.core.shapes import power_of_two
+from verifai_jax.core.programs import power_of_two
 from verifai_jax.counterexamples.candidates import Candidates
 
 EXHAUSTIVE = 8

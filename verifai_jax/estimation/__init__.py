@@ -5,8 +5,15 @@ result = vj.estimate(problem, method="monte_carlo")
 simulations_until(1e-6, failures=0, simulations=50_000)
 """
 
-from verifai_jax.estimation._estimate import estimate as estimate
-from verifai_jax.estimation.result import METHODS as METHODS
-from verifai_jax.estimation.result import Estimate as Estimate
-from verifai_jax.statistics.binomial import simulations_until as simulations_until
-from verifai_jax.statistics.binomial import upper_bound as upper_bound
+from typing import TYPE_CHECKING
+
+from verifai_jax.core.lazy import attach
+
+if TYPE_CHECKING:
+    from verifai_jax.estimation._estimate import estimate as estimate
+    from verifai_jax.estimation.result import METHODS as METHODS
+    from verifai_jax.estimation.result import Estimate as Estimate
+    from verifai_jax.statistics.binomial import simulations_until as simulations_until
+    from verifai_jax.statistics.binomial import upper_bound as upper_bound
+
+__getattr__, __dir__, __all__ = attach(__name__)

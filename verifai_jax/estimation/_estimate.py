@@ -9,13 +9,13 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from verifai_jax._version import __version__
-from verifai_jax.core.checks import check_fraction
+from verifai_jax.core.checks import check_fraction, check_options
 from verifai_jax.core.errors import suggests_options, unknown_name
-from verifai_jax.core.executors import Executor
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import SimulationProgress, shows_progress
 from verifai_jax.estimation.double_precision import DoublePrecisionEvaluator
@@ -36,10 +36,12 @@ from verifai_jax.estimation.moved_priors import notice_own_chance
 from verifai_jax.estimation.normal_space import LimitState
 from verifai_jax.estimation.result import METHODS, Estimate
 from verifai_jax.evaluation.backends import resolved
-from verifai_jax.falsification.validation import check_options
 from verifai_jax.problem.dependence import depends_on_key, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.binomial import clopper_pearson
+
+if TYPE_CHECKING:
+    from verifai_jax.core.executors import Executor
 
 GRADIENTS_FROM = 3
 """Continuous coordinates from which the searches for failing regions take gradients."""
@@ -60,7 +62,7 @@ def estimate(
     backend: str | None = None,
     max_seconds: float | None = None,
     progress: bool | None = None,
-    executor: Executor | None = None,
+    executor: "Executor | None" = None,
 ) -> Estimate:
     """Estimate the probability, under the prior of the features, that a simulation fails.
 

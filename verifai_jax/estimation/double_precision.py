@@ -9,23 +9,25 @@ precision, and simulated in that of the run.
 """
 
 from functools import cached_property, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
+
+if TYPE_CHECKING:
+    from verifai_jax.core.executors import Executor
+    from verifai_jax.evaluation.host_engine import HostEngine
 
 EXACT = 2**24
 """Greatest integer up to which all integers are float32 numbers."""
@@ -94,7 +96,7 @@ class DoublePrecisionEvaluator:
         batch: int,
         precision: str,
         seed: int,
-        executor: Executor | None = None,
+        executor: "Executor | None" = None,
     ) -> None:
         space = problem.space
         self._held = max(space.levels, default=0) <= EXACT
@@ -234,7 +236,9 @@ class HeldKeys:
         self._keys = jax.jit(jax.vmap(partial(simulation_key, run_keys(seed)[1])))
         self._engine: Engine | HostEngine
         if problem.black_box:
-            self._engine = HostEngine(problem, precision)
+            from verifai_jax.evaluation import host_engine
+
+            self._engine = host_engine.HostEngine(problem, precision)
             self._features = jax.jit(jax.vmap(problem.space.unflatten))
         else:
             self._engine = Engine(

@@ -9,7 +9,7 @@ run notes what was chosen, and why.
 """
 
 import time
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import numpy as np
@@ -18,8 +18,10 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.programs import Slot
 from verifai_jax.core.text import format_error
 from verifai_jax.evaluation.engine import Engine, engine_for
-from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.problem.problem import Problem
+
+if TYPE_CHECKING:
+    from verifai_jax.evaluation.host_engine import HostEngine
 
 MIN_BUDGET = 64
 """Simulations below which nothing is compiled, or measured: either takes longer than they do."""
@@ -79,6 +81,8 @@ def resolved(
 def _fastest(
     problem: Problem, on_host: str, traced: str, batch: int, precision: str, budget: int
 ) -> Choice:
+    from verifai_jax.evaluation.host_engine import HostEngine
+
     # Measured once for a problem, so that its runs in one process agree on the backend.
     host, compiled = problem.on_backend(on_host), problem.on_backend(traced)
     other = problem.programs.peek(SPEEDS, (traced, batch, precision))
@@ -112,7 +116,7 @@ SPEEDS: Slot[tuple[str, int, str], float] = Slot("speeds")
 """Simulations a second of each (backend, batch, precision), as measured."""
 
 
-def _speed(engine: Engine | HostEngine, problem: Problem, batch: int) -> float:
+def _speed(engine: "Engine | HostEngine", problem: Problem, batch: int) -> float:
     """Measure simulations a second: the best of three batches after one to warm up."""
     key = run_keys(0)[1]
     u = np.random.default_rng(0).random((batch, problem.space.dim), np.float32)

@@ -18,14 +18,13 @@ earlier simulations or draws numbers that do not come from its key.
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
 import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.core.errors import check_names
-from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.trace import Trace
@@ -48,6 +47,9 @@ from verifai_jax.evaluation.resimulate import (
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import System
+
+if TYPE_CHECKING:
+    from verifai_jax.core.executors import Executor
 
 ROWS = 256
 """Rows that are examined in any case, ..."""
@@ -117,7 +119,7 @@ class Confirmer:
         *,
         simulator: System | Callable[..., Trace] | Problem | str | None = None,
         max_rows: int | None = None,
-        executor: Executor | None = None,
+        executor: "Executor | None" = None,
         target: str | None = None,
     ) -> None:
         if max_rows is not None and (

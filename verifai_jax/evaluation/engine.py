@@ -22,19 +22,15 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
 
 from verifai_jax.core.compilation import Compilation, XlaOptimization, compile_soon, tracing
 from verifai_jax.core.devices import spread_over_devices
-from verifai_jax.core.fingerprint import fingerprint
+from verifai_jax.core.fingerprint import as_traced, fingerprint
 from verifai_jax.core.keys import IMPLEMENTATION, as_key, simulation_key
 from verifai_jax.core.lifting import CAPACITY, LiftedNumbers
 from verifai_jax.core.precision import in_precision
-from verifai_jax.core.programs import Slot
+from verifai_jax.core.programs import Slot, pad_rows
 from verifai_jax.core.remembered import is_kept, lower_or_recall, remembered_as
-from verifai_jax.core.shapes import pad_rows
-from verifai_jax.core.steps import as_traced
 from verifai_jax.evaluation.differentiation import Derivative, reverse_refused
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
-from verifai_jax.evaluation.inputs import CubePoints, Inputs
-from verifai_jax.evaluation.packing import Packing
-from verifai_jax.evaluation.row import Row, RowFunction
+from verifai_jax.evaluation.row import CubePoints, Inputs, Packing, Row, RowFunction
 from verifai_jax.evaluation.verdicts import Verdicts, violations
 from verifai_jax.mtl.clauses import goals_of
 from verifai_jax.problem.problem import Problem

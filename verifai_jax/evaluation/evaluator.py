@@ -13,20 +13,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys
+from verifai_jax.core.programs import power_of_two
 from verifai_jax.core.progress import count_done
-from verifai_jax.core.shapes import power_of_two
 from verifai_jax.evaluation.engine import Engine, engine_for
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
-from verifai_jax.evaluation.host_engine import HostEngine
-from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.raising import ALIKE, Raising
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
+    from verifai_jax.core.executors import Executor
     from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
+    from verifai_jax.evaluation.host_engine import HostEngine
+    from verifai_jax.evaluation.journal import Journal
 
 
 class Evaluator:
@@ -59,8 +59,8 @@ class Evaluator:
         clauses: bool = False,
         precision: str = "float32",
         seed: int = 0,
-        journal: Journal | None = None,
-        executor: Executor | None = None,
+        journal: "Journal | None" = None,
+        executor: "Executor | None" = None,
         target: str | None = None,
         guidance: Guidance = NOTHING,
         keep_traces: bool = False,
@@ -73,16 +73,20 @@ class Evaluator:
         # Points are float32 whatever the precision; what a person gives is not.
         self._dtype = np.dtype(precision if self.given else "float32")
         self.engine: Engine | HostEngine | ExecutorEngine
+        self._host: HostEngine | None = None
+        self._sender: ExecutorEngine | None = None
         if executor is not None:
             from verifai_jax.evaluation import executor_engine
 
-            self.engine = executor_engine.ExecutorEngine(
+            self.engine = self._sender = executor_engine.ExecutorEngine(
                 problem, batch, executor, gradient=gradient, clauses=clauses,
                 precision=precision, journal=journal, target=target, guidance=guidance,
                 given=self.given,
             )  # fmt: skip
         elif problem.black_box:
-            self.engine = HostEngine(
+            from verifai_jax.evaluation import host_engine
+
+            self.engine = self._host = host_engine.HostEngine(
                 problem, precision, journal, guidance=guidance, keep_traces=keep_traces,
                 given=self.given,
             )  # fmt: skip
@@ -143,9 +147,9 @@ class Evaluator:
         start = self.simulations if first is None else first
         u = self._with_values(u)
         count, parts = len(u), []
-        if not isinstance(self.engine, Engine | HostEngine) and count:
+        if self._sender is not None and count:
             self.simulations = start + count
-            verdicts = self.engine.evaluate(u, self.key, start, temperature)
+            verdicts = self._sender.evaluate(u, self.key, start, temperature)
             count_done(count)
             self._check_raising(verdicts)
             return verdicts
@@ -159,8 +163,8 @@ class Evaluator:
             points = u if block.stop - block.start >= count else u[block]
             if points.dtype != self._dtype:
                 points = np.asarray(points, self._dtype)
-            if isinstance(self.engine, HostEngine):
-                verdicts = self.engine.evaluate(
+            if self._host is not None:
+                verdicts = self._host.evaluate(
                     points, self.key, start + begin, some,
                     padded_to=max(padded_to, self._padded_to), keep_traces=keep_traces,
                     journals=journals,
@@ -181,17 +185,16 @@ class Evaluator:
 
         **Raises:** `TypeError` for an evaluator without an executor.
         """
-        if isinstance(self.engine, Engine | HostEngine):
+        if self._sender is None:
             raise TypeError("points are sent to workers only by an evaluator with an executor")
-        return self.engine.submit(self._with_values(u), self.key, first)
+        return self._sender.submit(self._with_values(u), self.key, first)
 
     @property
     def _looks_often(self) -> bool:
         """Whether few rows are simulated at a time, since all may raise."""
         if self._raising is None or not self._raising.always:
             return False
-        engine = self.engine
-        return isinstance(engine, HostEngine) and not engine.system.can_simulate_batch
+        return self._host is not None and not self._host.system.can_simulate_batch
 
     def _check_raising(self, verdicts: Verdicts) -> None:
         if self._raising is not None:

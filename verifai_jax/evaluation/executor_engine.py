@@ -29,8 +29,7 @@ from verifai_jax.core.executors import (
     seconds_per_block,
     ship,
 )
-from verifai_jax.core.programs import Slot
-from verifai_jax.core.shapes import power_of_two
+from verifai_jax.core.programs import Slot, power_of_two
 from verifai_jax.evaluation.engine import chunks_and_lanes
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.host_engine import HostEngine

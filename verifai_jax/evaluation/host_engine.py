@@ -21,8 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, Integer, Key, PyTree
 
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.precision import in_precision
-from verifai_jax.core.programs import Slot
-from verifai_jax.core.shapes import pad_rows, power_of_two
+from verifai_jax.core.programs import Slot, pad_rows, power_of_two
 from verifai_jax.core.text import storable
 from verifai_jax.core.trace import Status, Trace, without_wrapping
 from verifai_jax.core.user_errors import format_user_error

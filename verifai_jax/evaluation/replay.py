@@ -20,7 +20,6 @@ from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.core.text import format_features
 from verifai_jax.core.trace import Status, Trace
-from verifai_jax.evaluation.host_engine import on_host_clock
 from verifai_jax.evaluation.verdicts import boolean_semantics, trace_verdict, violations
 from verifai_jax.mtl import Explanation, explain
 from verifai_jax.problem.problem import Problem
@@ -168,7 +167,7 @@ def replay(
         features = problem.space.from_row(row)
         if problem.black_box:
             trace = problem.system(features, key)
-            read = on_host_clock(trace)
+            read = lazy_import("verifai_jax.evaluation.host_engine", "on_host_clock")(trace)
         else:
             precise = jax.tree.map(lambda leaf: _cast(leaf, precision), features)
             trace = read = jax.jit(problem.system)(precise, key)

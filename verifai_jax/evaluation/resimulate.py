@@ -13,7 +13,7 @@ by JAX, and one program replays at every step.
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import cache, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,6 @@ import numpy as np
 from jaxtyping import Array, Int, Key, PyTree, UInt32
 
 from verifai_jax.core.devices import enable_compile_cache
-from verifai_jax.core.executors import Executor, Shipment, check_executor, gather, ship
 from verifai_jax.core.keys import as_key, simulation_key
 from verifai_jax.core.precision import in_precision, reproducible_settings
 from verifai_jax.core.programs import Slot
@@ -29,11 +28,13 @@ from verifai_jax.core.progress import count_done
 from verifai_jax.core.text import format_error
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine
-from verifai_jax.evaluation.host_engine import HostEngine
-from verifai_jax.evaluation.inputs import TableRows
+from verifai_jax.evaluation.row import TableRows
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import System
+
+if TYPE_CHECKING:
+    from verifai_jax.core.executors import Executor, Shipment
 
 ONE_BY_ONE = 16
 """Rows up to which they are replayed one by one: that program is compiled much sooner."""
@@ -213,9 +214,11 @@ class HostReplays:
         problem: Problem,
         precision: str,
         key: Key[Any, ""],
-        executor: Executor | None = None,
+        executor: "Executor | None" = None,
         target: str | None = None,
     ) -> None:
+        from verifai_jax.evaluation.host_engine import HostEngine
+
         self.problem, self.precision, self.key = problem, precision, key
         self.refiner = Refiner(problem.system)
         self._renewed: System | None = None
@@ -223,6 +226,7 @@ class HostReplays:
         self._engine = HostEngine(problem, precision)
         self._executor = executor
         if executor is not None:
+            from verifai_jax.core.executors import check_executor, ship
             from verifai_jax.evaluation.executor_engine import SHIPMENTS, identity
 
             check_executor(executor)
@@ -258,7 +262,7 @@ class HostReplays:
         self, system: System, each: Sequence[PyTree], numbers: Int[np.ndarray, " n"]
     ) -> list[Verdicts]:
         # One monitor for all steps.
-        engine = HostEngine(
+        engine = type(self._engine)(
             self.problem, self.precision, system=system, monitor=self._engine.monitor
         )
         count = len(numbers)
@@ -278,6 +282,7 @@ class HostReplays:
     def _sent(
         self, features: PyTree, numbers: Int[np.ndarray, " n"], factor: int, anew: bool
     ) -> Verdicts:
+        from verifai_jax.core.executors import gather
         from verifai_jax.evaluation.executor_engine import TOGETHER
 
         executor, system = self._executor, self.problem.system
@@ -307,7 +312,7 @@ def finest_replays(
     problem: Problem,
     run: str,
     key: Key[Any, ""],
-    executor: Executor | None = None,
+    executor: "Executor | None" = None,
     target: str | None = None,
 ) -> tuple[Replays | HostReplays | None, list[str], str]:
     """Return replays of a problem's rows in the finest precision that it can be traced in.
@@ -349,7 +354,7 @@ def finest_replays(
 
 @reproducible_settings()
 def replay_block(
-    shipment: Shipment[Problem],
+    shipment: "Shipment[Problem]",
     how: tuple[str | None, str, int, bool],
     words: UInt32[np.ndarray, "2"],
     leaves: Sequence[np.ndarray],

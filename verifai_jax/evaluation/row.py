@@ -1,28 +1,159 @@
 """The function of one row that engines batch: robustness, status, clauses, derivatives, Booleans.
 
+    inputs = CubePoints(problem)                        # points of the unit cube, or given features
+    inputs = TableRows(refiner, formats)                # features of a table, at a finer step
+    inputs = WithParameters(problem, size, system_of)   # points, and parameters that all share
     function = RowFunction(problem, inputs, "float32", gradient=True, goals=None, guidance=NOTHING)
     function(row, key, temperature, shared, Derivative(d))          # Row, traced by JAX
 
+An engine compiles one program for each kind of inputs; everything else about it is the same.
 Derivatives are of an objective, which is a simulation and its monitor: `objective` is that alone,
 and `finish` makes a row's result of its values and their derivatives.
 """
 
-from collections.abc import Callable
+import abc
+import math
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.clauses import CLAUSES
+from verifai_jax.core.lifting import lifting
 from verifai_jax.core.trace import Trace
 from verifai_jax.evaluation.differentiation import Derivative
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
-from verifai_jax.evaluation.inputs import Inputs
-from verifai_jax.evaluation.streaming_monitor import streaming_monitor
-from verifai_jax.evaluation.verdicts import boolean_semantics, trace_coverage_ids, trace_verdict
-from verifai_jax.mtl import hard, robustness, smooth
+from verifai_jax.evaluation.verdicts import (
+    boolean_semantics,
+    trace_coverage_ids,
+    trace_verdict,
+    with_status,
+)
+from verifai_jax.mtl import hard, online, robustness, smooth
 from verifai_jax.mtl.clauses import ABSENT, Goals
 from verifai_jax.problem.problem import Problem
+
+
+class Inputs(abc.ABC):
+    """The inputs of one row, and those that all rows share; both are pytrees that JAX traces."""
+
+    row_form: PyTree
+    """Shapes and types of one row, as `jax.ShapeDtypeStruct`s."""
+    shared_form: PyTree = ()
+    """The same of what all rows share."""
+    dim: int = 0
+    """Coordinates by which the robustness may be differentiated."""
+    keeps_features: bool = False
+    """Whether the simulated features are part of the results."""
+    streaming: bool = False
+    """Whether the monitor may travel with the rollout, where the system allows it."""
+    purpose: str = "the simulation"
+    """What is simulated, for people who wait until it is compiled."""
+
+    @abc.abstractmethod
+    def coordinates(self, row: PyTree, shared: PyTree, precision: str) -> Float[Array, " dim"]:
+        """Return what the robustness is differentiated by, in this precision."""
+
+    @abc.abstractmethod
+    def simulated(
+        self, coordinates: Float[Array, " dim"], row: PyTree, shared: PyTree
+    ) -> tuple[PyTree, Callable[..., Any]]:
+        """Return the features and the system to simulate."""
+
+
+class CubePoints(Inputs):
+    """Points of the unit cube of a problem's feature space.
+
+    **Arguments:**
+
+    - `problem`: that says the space.
+    - `given`: whether rows are those of `given_rows`: points, followed by the real numbers of
+      features that somebody gave, which are simulated as they are; NaN for those of the point.
+    - `precision`: of what is given.
+    """
+
+    keeps_features = True
+    streaming = True
+
+    def __init__(self, problem: Problem, given: bool = False, precision: str = "float32") -> None:
+        self.problem, self.given = problem, given
+        self.dim = problem.space.dim
+        size = self.dim + (problem.space.width if given else 0)
+        dtype = jnp.dtype(precision if given else "float32")
+        self.row_form = jax.ShapeDtypeStruct((size,), dtype)
+
+    def coordinates(self, row: PyTree, shared: PyTree, precision: str) -> Float[Array, " dim"]:
+        return row[: self.dim].astype(precision)
+
+    def simulated(
+        self, coordinates: Float[Array, " dim"], row: PyTree, shared: PyTree
+    ) -> tuple[PyTree, Callable[..., Any]]:
+        space = self.problem.space
+        with lifting():
+            if self.given:
+                features = space.unflatten_given(coordinates, row[self.dim :])
+            else:
+                features = space.unflatten(coordinates)
+        return features, self.problem.system
+
+
+class TableRows(Inputs):
+    """Features as a table holds them, simulated by a system that depends on a shared number.
+
+    **Arguments:**
+
+    - `form`: the features of one row, as `jax.ShapeDtypeStruct`s in the engine's precision.
+    - `system_at`: the system for the shared number, a `factor` of refinement.
+    """
+
+    purpose = "closer replays"
+
+    def __init__(self, form: PyTree, system_at: Callable[[Any], Callable[..., Any]]) -> None:
+        self.row_form, self.system_at = form, system_at
+        self.shared_form = jax.ShapeDtypeStruct((), jnp.int32)
+
+    def coordinates(self, row: PyTree, shared: PyTree, precision: str) -> Float[Array, " dim"]:
+        return jnp.zeros(0, precision)
+
+    def simulated(
+        self, coordinates: Float[Array, " dim"], row: PyTree, shared: PyTree
+    ) -> tuple[PyTree, Callable[..., Any]]:
+        return row, self.system_at(shared)
+
+
+class WithParameters(Inputs):
+    """Points of the unit cube, and a vector of parameters of the system that all rows share.
+
+    The coordinates are the parameters, followed by the point.
+
+    **Arguments:**
+
+    - `problem`: its space and formulas.
+    - `size`: how many parameters.
+    - `system_of`: the system of a vector of parameters.
+    """
+
+    def __init__(
+        self, problem: Problem, size: int, system_of: Callable[[Array], Callable[..., Any]]
+    ) -> None:
+        self.problem, self.size, self.system_of = problem, size, system_of
+        self.dim = size + problem.space.dim
+        self.row_form = jax.ShapeDtypeStruct((problem.space.dim,), jnp.float32)
+        self.shared_form = jax.ShapeDtypeStruct((size,), jnp.float32)
+
+    def coordinates(self, row: PyTree, shared: PyTree, precision: str) -> Float[Array, " dim"]:
+        return jnp.concatenate([shared.astype(precision), row.astype(precision)])
+
+    def simulated(
+        self, coordinates: Float[Array, " dim"], row: PyTree, shared: PyTree
+    ) -> tuple[PyTree, Callable[..., Any]]:
+        theta, u = coordinates[: self.size], coordinates[self.size :]
+        with lifting():
+            features = self.problem.space.unflatten(u)
+        return features, self.system_of(theta)
 
 
 class Row(NamedTuple):
@@ -171,3 +302,80 @@ class RowFunction(NamedTuple):
             return values
         share = guide.share(guide.value(trace, features, self.problem.end))
         return (1 - guide.weight) * values + guide.weight * share.astype(values.dtype)
+
+
+SMALL = 16
+"""Numbers that a monitor may hold to be worth carrying: one with windows of samples, which it
+moves at every step, holds more."""
+
+Monitor = Callable[[PyTree, Key[Array, ""]], tuple[Float[Array, " formulas"], Int[Array, ""]]]
+"""A function `(features, key) -> robustness, status`."""
+
+
+def streaming_monitor(problem: Problem) -> Monitor | None:
+    """Return the monitor of a problem; None if carrying it does not pay."""
+    system = problem.system
+    if not system.can_fold or system.dt is None or problem.end != "hold":
+        return None
+    try:
+        monitors = [online(formula, system.dt) for formula in problem.formulas.values()]
+        if sum(monitor.memory for monitor in monitors) > SMALL:
+            return None
+    except ValueError:
+        # It looks ahead without end; or its clock is wrong, which the engine says better.
+        return None
+
+    def update(carry: PyTree, sample: Mapping[str, Array]) -> PyTree:
+        states, finite = carry
+        for name in problem.monitored:
+            signal = jnp.asarray(sample[name])
+            if jnp.issubdtype(signal.dtype, jnp.inexact):
+                finite &= jnp.all(jnp.isfinite(signal))
+        stepped = [m.step(state, sample) for m, state in zip(monitors, states, strict=True)]
+        return tuple(stepped), finite
+
+    def monitor(features: PyTree, key: Key[Array, ""]) -> tuple[Array, Array]:
+        start = (tuple(monitor.init() for monitor in monitors), jnp.array(True))
+        (states, finite), status = system.fold(features, key, start, update)
+        rho = jnp.stack([m.finish(state) for m, state in zip(monitors, states, strict=True)])
+        return with_status(rho, status, finite)
+
+    return monitor
+
+
+class _Slot(NamedTuple):
+    group: str
+    start: int
+    shape: tuple[int, ...]
+    dtype: Any
+
+
+class Packing:
+    """The places of a pytree's leaves in one vector for each width; known once `pack` is traced."""
+
+    def __init__(self) -> None:
+        self._slots: list[_Slot] = []
+        self._form: Any = None
+
+    def pack(self, row: PyTree) -> dict[str, Array]:
+        """Concatenate one row's leaves bit by bit: all of four bytes, all of eight."""
+        leaves, self._form = jax.tree.flatten(row)
+        self._slots, parts, filled = [], {}, {}
+        for leaf in map(jnp.asarray, leaves):
+            group = f"uint{8 * leaf.dtype.itemsize}"
+            start = filled.get(group, 0)
+            self._slots.append(_Slot(group, start, leaf.shape, np.dtype(leaf.dtype)))
+            bits = leaf.astype(group) if leaf.dtype == bool else leaf.view(group)
+            parts.setdefault(group, []).append(bits.ravel())
+            filled[group] = start + leaf.size
+        return {group: jnp.concatenate(vectors) for group, vectors in parts.items()}
+
+    def unpack(self, packed: dict[str, Array], n: int) -> PyTree:
+        """Return the first `n` rows of a batch of packed rows."""
+        whole = {group: np.asarray(block)[:n] for group, block in packed.items()}
+
+        def taken(slot: _Slot) -> np.ndarray:
+            bits = whole[slot.group][:, slot.start : slot.start + math.prod(slot.shape)]
+            return np.ascontiguousarray(bits).view(slot.dtype).reshape(n, *slot.shape)
+
+        return jax.tree.unflatten(self._form, [taken(slot) for slot in self._slots])

@@ -23,8 +23,8 @@ from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.guidance import Guidance
 from verifai_jax.evaluation.host_engine import HostEngine
-from verifai_jax.evaluation.inputs import CubePoints
 from verifai_jax.evaluation.remarks import Remarks
+from verifai_jax.evaluation.row import CubePoints
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.core.checks import check_fraction
+from verifai_jax.core.checks import check_fraction, check_options
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.precision import in_precision
@@ -51,7 +51,6 @@ from verifai_jax.failure_modes.region_search import find_regions, share_explaine
 from verifai_jax.failure_modes.result import Mode, Modes
 from verifai_jax.falsification import simulate
 from verifai_jax.falsification.run import Run
-from verifai_jax.falsification.validation import check_options
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.dependence import depends_on_key, without_derivative
 from verifai_jax.problem.problem import Problem

@@ -16,7 +16,7 @@ from verifai_jax.core.notebook import InNotebook, picture_html
 from verifai_jax.core.text import format_percent
 from verifai_jax.counterexamples import explain, shrink
 from verifai_jax.counterexamples._explain import Explained
-from verifai_jax.counterexamples._shrink import Shrunk
+from verifai_jax.counterexamples.shrunk import Shrunk
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.run import Run
 from verifai_jax.problem.problem import Problem

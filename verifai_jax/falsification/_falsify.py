@@ -15,9 +15,9 @@ import numpy as np
 
 from verifai_jax import search as searches
 from verifai_jax.core.callbacks import Callback, check_callbacks
+from verifai_jax.core.checks import check_options
 from verifai_jax.core.compilation import tracing
 from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.executors import Executor
 from verifai_jax.core.precision import in_precision, reproducible_settings
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.evaluation.backends import resolved
@@ -42,7 +42,6 @@ from verifai_jax.falsification.validation import (
     check_first,
     check_gradient,
     check_guide,
-    check_options,
     check_rule,
     check_same_guide,
     check_same_space,
@@ -59,12 +58,13 @@ from verifai_jax.falsification.validation import (
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.search.suggested import without_suggestions
-from verifai_jax.statistics.stopping import StoppingRule
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from verifai_jax.core.executors import Executor
     from verifai_jax.features.given import Rows
+    from verifai_jax.statistics.stopping import StoppingRule
 
 
 @suggests_options
@@ -79,7 +79,7 @@ def falsify(
     seed: int = 0,
     max_seconds: float | None = None,
     stop_after: int | None = None,
-    stop_when: StoppingRule | None = None,
+    stop_when: "StoppingRule | None" = None,
     warm_start: "Run | ErrorTable | pd.DataFrame | None" = None,
     folder: str | Path | None = None,
     precision: str = "float32",
@@ -90,7 +90,7 @@ def falsify(
     callbacks: Iterable[Callback] = (),
     progress: bool | None = None,
     target: str | None = None,
-    executor: Executor | None = None,
+    executor: "Executor | None" = None,
     keep_going: bool = False,
 ) -> Run:
     """Search the feature space for inputs under which the system breaks its property.
@@ -230,7 +230,7 @@ def simulate(
     backend: str | None = None,
     progress: bool | None = None,
     target: str | None = None,
-    executor: Executor | None = None,
+    executor: "Executor | None" = None,
 ) -> Run:
     """Simulate given features, in their order: no search, a row of the table for each.
 
@@ -271,10 +271,10 @@ def resume(
     budget: int | None = None,
     max_seconds: float | None = None,
     stop_after: int | None = None,
-    stop_when: StoppingRule | None = None,
+    stop_when: "StoppingRule | None" = None,
     callbacks: Iterable[Callback] = (),
     progress: bool | None = None,
-    executor: Executor | None = None,
+    executor: "Executor | None" = None,
     even_if_changed: bool = False,
     keep_going: bool = False,
 ) -> Run:
@@ -331,7 +331,7 @@ def _resume(
     ends: Ending,
     progress: bool | None,
     callbacks: Sequence[Callback],
-    executor: Executor | None,
+    executor: "Executor | None",
     even_if_changed: bool,
     keep_going: bool,
 ) -> Run:

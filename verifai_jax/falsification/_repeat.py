@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from verifai_jax.core.checks import check_options
 from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.keys import run_keys, simulation_key
@@ -34,7 +35,6 @@ from verifai_jax.falsification.confirm_seeds import SeedConfirmer
 from verifai_jax.falsification.lockstep import lockstep
 from verifai_jax.falsification.validation import (
     adapt_search,
-    check_options,
     check_search,
     usual_batch,
 )

@@ -18,7 +18,6 @@ from jaxtyping import Array, Float, Int, Key
 
 from verifai_jax.evaluation.guidance import Guidance
 from verifai_jax.evaluation.verdicts import Verdicts
-from verifai_jax.falsification.coverage_counts import CoverageCounts
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Objective
 from verifai_jax.search import Search
@@ -27,6 +26,7 @@ from verifai_jax.search.proposals import Proposals
 if TYPE_CHECKING:
     import pandas as pd
 
+    from verifai_jax.falsification.coverage_counts import CoverageCounts
     from verifai_jax.falsification.surrogates import Surrogate
 
 MAX_WARM = 2048
@@ -74,7 +74,11 @@ class Learning:
         self.problem, self.search, self._key = problem, search, key
         guided = problem.guide is not None and search.learns
         self.guidance = Guidance(guide=guided, outcome=search.wants.outcomes)
-        self.coverage_ids = CoverageCounts(problem) if search.wants.coverage_ids else None
+        self.coverage_ids: CoverageCounts | None = None
+        if search.wants.coverage_ids:
+            from verifai_jax.falsification import coverage_counts
+
+            self.coverage_ids = coverage_counts.CoverageCounts(problem)
         self.surrogate: Surrogate | None = None
         self._objective = None if problem.rulebook is None else Objective(problem.rulebook)
         self.proposals: Any = None

@@ -19,12 +19,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from verifai_jax.core.compilation import while_compiling
-from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.stopwatch import Stopwatch
 from verifai_jax.evaluation.confirmer import Confirmer
 from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.checkpoint import write_checkpoint
@@ -35,14 +33,16 @@ from verifai_jax.falsification.rows import rows_of, without_failure
 from verifai_jax.falsification.simulations import MEASURED, Simulations
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.problem.problem import Problem
-from verifai_jax.search import Search, Suggested
+from verifai_jax.search import Search
 from verifai_jax.search.proposals import compiled_search
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from verifai_jax.core.executors import Executor
     from verifai_jax.falsification.prefetch import Prefetch
     from verifai_jax.falsification.suggestions import Suggestions
+    from verifai_jax.search import Suggested
 
 COMPILE, SEARCH, SIMULATE, CONFIRM, REST = "compile", "search", "simulate", "confirm", "rest"
 """What the seconds of a run are spent on."""
@@ -70,7 +70,7 @@ class Rounds:
         precision: str = "float32",
         folder: Path | None = None,
         confirm: bool = False,
-        executor: Executor | None = None,
+        executor: "Executor | None" = None,
         target: str | None = None,
         first: Float[np.ndarray, "n row"] | None = None,
         suggests: bool = False,
@@ -80,7 +80,11 @@ class Rounds:
         self.first = np.zeros((0, problem.space.dim), np.float32) if first is None else first
         self.suggestions: Suggestions | None = None
         self.learning = Learning(problem, search, run_keys(seed)[0])
-        self._journal = Journal(folder) if folder is not None and problem.black_box else None
+        self._journal = None
+        if folder is not None and problem.black_box:
+            from verifai_jax.evaluation.journal import Journal
+
+            self._journal = Journal(folder)
         self._journal_without_traces()
         self._simulations = Simulations(
             problem,
@@ -263,7 +267,7 @@ class Rounds:
                 self._simulations.begin_derivatives()
             proposals.wait()
 
-    def ask(self, search: Suggested, checkpoint: Mapping[str, Any] | None = None) -> None:
+    def ask(self, search: "Suggested", checkpoint: Mapping[str, Any] | None = None) -> None:
         """Ask somebody for suggestions from now on, or go on asking from a checkpoint.
 
         **Raises:** `ValueError` if questions are left of a checkpoint and nobody to ask.

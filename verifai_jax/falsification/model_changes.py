@@ -8,14 +8,16 @@ A run has a record of its model for each part of it that was simulated in one go
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from verifai_jax.core.sources import Change, Sources, list_changes
 from verifai_jax.core.trace import Status
-from verifai_jax.evaluation.replay import Replay
 from verifai_jax.problem.problem import Problem
+
+if TYPE_CHECKING:
+    from verifai_jax.evaluation.replay import Replay
 
 ROUNDING = 1e-4
 """Share of the signals by which a replay may differ where JAX compiles it: alone it rounds
@@ -110,7 +112,7 @@ def changed_since(changes: Sequence[Change], row: int | None, what: str = "the r
 
 
 def finding_of(
-    seen: Replay, stored: Mapping[str, Any], several: bool, near: float | None = None
+    seen: "Replay", stored: Mapping[str, Any], several: bool, near: float | None = None
 ) -> str:
     """Say that a replay does not give the number of its row; empty if it does.
 
@@ -147,7 +149,7 @@ def finding_of(
     return ""
 
 
-def _scale(seen: Replay) -> float:
+def _scale(seen: "Replay") -> float:
     """Return the greatest number that the formulas see, which rounding is a share of."""
     values = [np.asarray(seen.trace.signals[n]) for n in seen.problem.monitored]
     values += [np.asarray(list(seen.rho.values()))]

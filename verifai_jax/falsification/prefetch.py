@@ -1,6 +1,6 @@
 """Rounds on their way to the workers of an executor, for a search that does not learn.
 
-    ahead = Ahead(proposals, evaluate, batch=1024, limit=1_000_000, first=0)
+    ahead = Prefetch(proposals, evaluate, batch=1024, limit=1_000_000, first=0)
     points, verdicts = ahead.next()                     # of one round, in their order
 
 Such a search can be asked for the points of many rounds before the verdicts of the first are there,

@@ -22,7 +22,6 @@ from verifai_jax.core.seals import sealed
 from verifai_jax.core.sources import Change
 from verifai_jax.core.text import one_line
 from verifai_jax.evaluation.confirmations import describe_checks
-from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.checkpoint import (
     RECORD_CHECKSUM,
     ROWS_CHECKSUM,
@@ -55,11 +54,12 @@ from verifai_jax.falsification.tail import TAIL
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Rulebook
-from verifai_jax.statistics.binomial import Rate, clopper_pearson
-from verifai_jax.statistics.confidence_sequences import anytime_interval
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from verifai_jax.evaluation.replay import Replay
+    from verifai_jax.statistics.binomial import Rate
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +185,7 @@ class Run(InNotebook):
         return self.table.row(number)
 
     @property
-    def failure_rate(self) -> Rate | None:
+    def failure_rate(self) -> "Rate | None":
         """Failures per simulation with a 95 % interval.
 
         It is the rate as simulated, whatever closer replays say of single rows. Clopper-Pearson
@@ -198,7 +198,7 @@ class Run(InNotebook):
         return self._rate(self.table.counts.violating, 0)
 
     @property
-    def confirmed_failure_rate(self) -> Rate | None:
+    def confirmed_failure_rate(self) -> "Rate | None":
         """Confirmed failures per simulation with a 95 % interval; as `failure_rate`.
 
         Refuted rows are taken for safe. Those that closer replays left undecided, or did not reach,
@@ -211,14 +211,17 @@ class Run(InNotebook):
         confirmed = counts.get("confirmed", 0)
         return self._rate(confirmed, sum(counts.values()) - confirmed - counts.get("refuted", 0))
 
-    def _rate(self, failures: int, undecided: int) -> Rate | None:
+    def _rate(self, failures: int, undecided: int) -> "Rate | None":
         if not self.prior or self.has_several_models or self.table.changed:
             return None
         without = self.table.counts.without_verdict
         if self.simulations == without:
             return None
         stopped_by_outcomes = self.stopped in ("stop_after", "stop_when")
-        interval = anytime_interval if stopped_by_outcomes else clopper_pearson
+        if stopped_by_outcomes:
+            from verifai_jax.statistics.confidence_sequences import anytime_interval as interval
+        else:
+            from verifai_jax.statistics.binomial import clopper_pearson as interval
         return interval(failures, self.simulations, undecided=undecided + without)
 
     @property
@@ -265,7 +268,7 @@ class Run(InNotebook):
         """Say in a sentence which files of the model are others by now; empty if none is."""
         return changed_since(self.changes(row), row)
 
-    def compared(self, seen: Replay) -> Replay:
+    def compared(self, seen: "Replay") -> "Replay":
         """Return a replay of a row in the run's precision, with what speaks against taking it so.
 
         Its `changed` says which files of the model are others by now, and its `finding` that it
@@ -345,7 +348,7 @@ class Run(InNotebook):
 
     def replay(
         self, row: "int | np.integer | pd.Series | Mapping[str, Any]", precision: str | None = None
-    ) -> Replay:
+    ) -> "Replay":
         """Simulate a row of the table again and keep its trace.
 
         - `row`: a row number, or a row of `table.all` (its index is the row number), or any
@@ -373,7 +376,7 @@ class Run(InNotebook):
             number, values = None if index is None else int(index), row
         precision = self.precision if precision is None else precision
         if number is None or not 0 <= number < self.simulations:
-            return replay(self.problem, values, run_keys(self.seed)[1], number, precision)
+            return self._replayed(self.problem, values, number, precision)
         stored = self.table.row(number).to_dict()
         own = isinstance(row, int | np.integer) or all(
             values[name] == stored[name] or values[name] != values[name]
@@ -381,19 +384,29 @@ class Run(InNotebook):
         )
         if own and precision == self.precision and (seen := self._natively(number, values, stored)):
             return replace(seen, changed=self.changed_since(number))
-        seen = replay(self.problem, values, run_keys(self.seed)[1], number, precision)
+        seen = self._replayed(self.problem, values, number, precision)
         if own and precision == self.precision:
             return self.compared(seen)
         if not own or not finding_of(seen, stored, self._several, NEAR):
             return replace(seen, changed=self.changed_since(number))
         # The other precision may be all that differs, which is not a finding.
-        again = replay(self.problem, values, run_keys(self.seed)[1], number, self.precision)
+        again = self._replayed(self.problem, values, number, self.precision)
         again = self.compared(again)
         return replace(seen, changed=again.changed, finding=again.finding)
 
+    def _replayed(
+        self,
+        problem: Problem,
+        values: "pd.Series | Mapping[str, Any]",
+        number: int | None,
+        precision: str,
+    ) -> "Replay":
+        replay = lazy_import("verifai_jax.evaluation.replay", "replay")
+        return replay(problem, values, run_keys(self.seed)[1], number, precision)
+
     def _natively(
         self, number: int, values: "pd.Series | Mapping[str, Any]", stored: Mapping[str, Any]
-    ) -> Replay | None:
+    ) -> "Replay | None":
         """Replay a row that MJX simulated in native MuJoCo; None if that has another number.
 
         MJX compiles a program for it first, for half a minute where there are contacts.
@@ -401,8 +414,7 @@ class Run(InNotebook):
         problem = self.problem
         if problem is None or problem.black_box or "native" not in problem.system.backends:
             return None
-        key = run_keys(self.seed)[1]
-        seen = replay(problem.on_backend("native"), values, key, number, self.precision)
+        seen = self._replayed(problem.on_backend("native"), values, number, self.precision)
         if finding_of(seen, stored, self._several, ROUNDING):
             return None
         return replace(seen, engine="native MuJoCo, which gives the number of the row as MJX does")
@@ -590,6 +602,6 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
 
 def as_made(run: Run) -> Run:
     """Return a run as the verb that made it does: one of `fuzz` has its coverage."""
-    return (
-        run if run.derived is None else lazy_import("verifai_jax.fuzzing.run", "as_fuzz_run")(run)
-    )
+    if run.derived is None:
+        return run
+    return lazy_import("verifai_jax.fuzzing.run", "as_fuzz_run")(run)

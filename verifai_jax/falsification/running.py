@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from verifai_jax import search as searches
 from verifai_jax._version import __version__
@@ -31,7 +31,9 @@ from verifai_jax.falsification.silent_mistakes import cut_short_note, nominal_no
 from verifai_jax.falsification.summary import first_message
 from verifai_jax.falsification.validation import space_as_data, writing
 from verifai_jax.search import Search
-from verifai_jax.statistics.stopping import StoppingRule
+
+if TYPE_CHECKING:
+    from verifai_jax.statistics.stopping import StoppingRule
 
 RAISES = "an error of every simulation"
 """What has stopped a run whose first simulations all raise."""
@@ -52,7 +54,7 @@ class Ending(NamedTuple):
     budget: int
     max_seconds: float | None
     stop_after: int | None
-    stop_when: StoppingRule | None
+    stop_when: "StoppingRule | None"
     earlier: Mapping[str, float] = MappingProxyType({})
     """Seconds that an earlier part of the run has taken, by what they were spent on."""
 

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax import search as searches
-from verifai_jax.core.checks import check_count
+from verifai_jax.core.checks import check_count, check_options
 from verifai_jax.core.devices import describe_processor
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.locks import LOCK
@@ -46,7 +46,6 @@ from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.segments import write_complete
 from verifai_jax.falsification.validation import (
     adapt_search,
-    check_options,
     check_search,
     locked,
     usual_batch,

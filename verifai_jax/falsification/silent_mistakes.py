@@ -9,14 +9,15 @@ Each is a sentence that is true of the run, for its `notes` and so for its summa
 
 import math
 from collections.abc import Mapping
+from typing import cast
 
 import jax
 import numpy as np
 
 from verifai_jax.core.compilation import compile_soon
 from verifai_jax.core.programs import Slot
+from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.problem.dependence import has_gradient
 from verifai_jax.problem.problem import Problem
@@ -75,13 +76,13 @@ NOMINAL: Slot[str, tuple[str, ...]] = Slot("nominal")
 def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
     engine = evaluate.engine
     if problem.black_box:
+        from verifai_jax.evaluation.host_engine import HostEngine
+
         # One of its own: the journal of the run keeps rows of its table only.
         monitor = engine.monitor if isinstance(engine, HostEngine) else None
         engine = HostEngine(problem, engine.precision, monitor=monitor)
-    else:
-        assert not isinstance(engine, HostEngine)
-        if not is_quick(problem) or _samples(problem, engine.padded) > MAX_SAMPLES:
-            return ()
+    elif not is_quick(problem) or _samples(problem, cast(Engine, engine).padded) > MAX_SAMPLES:
+        return ()
     space = problem.space
     nominal = problem.nominal or {}
     varied = {name: nominal[name] for name, domain in space.root.fields if domain.size}

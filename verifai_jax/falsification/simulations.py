@@ -10,23 +10,24 @@ which is compiled when it is needed.
 """
 
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.executors import Executor
-from verifai_jax.core.shapes import power_of_two
+from verifai_jax.core.programs import power_of_two
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.guidance import Guidance
-from verifai_jax.evaluation.host_engine import HostEngine
-from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.raising import ALIKE, ALWAYS, Raising
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.validation import SLOW
 from verifai_jax.mtl.clauses import goals_of
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
+
+if TYPE_CHECKING:
+    from verifai_jax.core.executors import Executor
+    from verifai_jax.evaluation.journal import Journal
 
 MAX_DIFFERENTIATED = 16
 """Rows whose clauses are differentiated in one call of the engine."""
@@ -58,8 +59,8 @@ class Simulations:
         seed: int,
         *,
         precision: str,
-        journal: Journal | None,
-        executor: Executor | None,
+        journal: "Journal | None",
+        executor: "Executor | None",
         target: str | None,
         guidance: Guidance,
         keep_traces: bool,
@@ -157,6 +158,8 @@ class Simulations:
         the seconds, what simulates many side by side gets them together. Their round does not
         simulate them again. Where all of many raise, `hopeless` is what they say, else None.
         """
+        from verifai_jax.evaluation.host_engine import HostEngine
+
         engine = self.evaluate.engine
         assert isinstance(engine, HostEngine)
         points, raising = points[:ALWAYS], Raising()

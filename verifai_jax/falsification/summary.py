@@ -8,9 +8,9 @@ failure rate 3.02 % (95 % interval 2.79 % to 3.27 %) as simulated
 
 import numpy as np
 
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.text import format_features, format_percent, one_line, printable
 from verifai_jax.evaluation.confirmations import UNDECIDED
-from verifai_jax.evaluation.journal import count_unfinished
 from verifai_jax.falsification.no_rate import remedy, why_no_rate
 from verifai_jax.falsification.run import Run
 
@@ -62,7 +62,11 @@ def summarize(run: Run) -> str:
     lines.extend(f"  note         {note}" for note in run.notes)
     if run.damage:
         lines.append(f"  damaged      {run.damage}")
-    kept = 0 if run.folder is None else count_unfinished(run.folder, run.simulations)
+    kept = 0
+    if run.folder is not None:
+        kept = lazy_import("verifai_jax.evaluation.journal", "count_unfinished")(
+            run.folder, run.simulations
+        )
     if kept:
         lines.append(
             f"  unfinished   {kept} finished simulations of a batch in flight are kept; resuming "

@@ -9,9 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax import search as searches
-from verifai_jax.core.checks import check_count, check_positive
 from verifai_jax.core.errors import check_names
-from verifai_jax.core.executors import Executor
 from verifai_jax.core.locks import LOCK, write_lock
 from verifai_jax.core.text import format_error, one_line
 from verifai_jax.falsification.run import RECORD, Run
@@ -21,11 +19,13 @@ from verifai_jax.problem.dependence import has_gradient, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.search.contract import check_contract
-from verifai_jax.statistics.stopping import StoppingRule
 from verifai_jax.systems.base import System
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from verifai_jax.core.executors import Executor
+    from verifai_jax.statistics.stopping import StoppingRule
 
 
 @contextmanager
@@ -96,23 +96,6 @@ def batch_size(
     """
     usual = 16 if diverse else usual_batch(search, budget, stop_after, whole)
     return min(usual if asked is None else asked, budget)
-
-
-def check_options(
-    budget: object, batch: object, seed: object, max_seconds: object, stop_after: object
-) -> None:
-    """Refuse numbers out of range.
-
-    **Raises:** `ValueError`.
-    """
-    for name, value in (("budget", budget), ("batch", batch), ("stop_after", stop_after)):
-        if name == "stop_after" and value is None:
-            continue
-        check_count(name, value)
-    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or not 0 <= seed < 2**63:
-        raise ValueError(f"seed must be an integer from 0 to 2**63 - 1; got {seed!r}")
-    if max_seconds is not None:
-        check_positive("max_seconds", max_seconds)
 
 
 def check_search(problem: object, search: object) -> Search:
@@ -193,7 +176,7 @@ def _guide_text(guide: Mapping[str, Any] | None) -> str:
 
 
 def adapt_search(
-    problem: Problem, search: Search, executor: Executor | None = None
+    problem: Problem, search: Search, executor: "Executor | None" = None
 ) -> tuple[Search, tuple[str, ...]]:
     """Return the search, or its fallback where the problem lacks what it wants, and a note on that.
 
@@ -239,7 +222,7 @@ def _why_no_derivatives(problem: Problem) -> str | None:
     return None
 
 
-def _why_no_traces(problem: Problem, executor: Executor | None) -> str | None:
+def _why_no_traces(problem: Problem, executor: "Executor | None") -> str | None:
     """Return why a search cannot learn from the traces of this problem; None if it can."""
     if executor is not None:
         return "workers of an executor send no traces, which trace_surrogate learns from"
@@ -256,7 +239,7 @@ FEW_DIMENSIONS = 20
 """Dimensions up to which a Gaussian process needs no trust region."""
 
 
-def can_be_slow(problem: Problem, executor: Executor | None) -> bool:
+def can_be_slow(problem: Problem, executor: "Executor | None") -> bool:
     """Return whether the seconds of a simulation decide on the default search.
 
     Where JAX traces the system a simulation is quick, one that simulates many rows in a call takes
@@ -283,7 +266,7 @@ def slow_search(problem: Problem, seconds: float) -> tuple[Search, str] | None:
     return search, f"search {name}: a simulation takes {seconds:z.2g} s; search= sets another"
 
 
-def check_rule(search: Search, rule: StoppingRule | None) -> None:
+def check_rule(search: Search, rule: "StoppingRule | None") -> None:
     """Refuse a rule that is none, or that the samples of this search say nothing to.
 
     **Raises:** `TypeError`, `ValueError`.
@@ -310,7 +293,7 @@ def points_of(problem: Problem, rows: Rows, precision: str) -> Float[np.ndarray,
 def check_first(
     problem: Problem,
     first: "Rows | Float[np.ndarray, 'n row'] | None",
-    rule: StoppingRule | None,
+    rule: "StoppingRule | None",
     precision: str,
 ) -> Float[np.ndarray, "n row"]:
     """Return the rows that are simulated before the search begins; empty if none are given.

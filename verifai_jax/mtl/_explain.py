@@ -25,9 +25,9 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._robustness import satisfied
 from verifai_jax.mtl.evaluate import End, Evaluator
 from verifai_jax.mtl.formula import Formula, surface
-from verifai_jax.mtl.node import missing_case
 from verifai_jax.mtl.semantics import hard
 from verifai_jax.mtl.setting import Setting, check_trace, evaluator_of, prepare
+from verifai_jax.mtl.tree import missing_case
 
 
 @dataclass(frozen=True)

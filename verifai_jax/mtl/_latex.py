@@ -6,7 +6,7 @@ latex(eventually(signal("x") <= 2, 0, 4))    # \Diamond_{[0, 4]} \left(\mathit{x
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.expression import PRECEDENCE, Arithmetic, Component, Number, Signal
 from verifai_jax.mtl.formula import Formula, Term, surface
-from verifai_jax.mtl.node import missing_case
+from verifai_jax.mtl.tree import missing_case
 from verifai_jax.mtl.words import COMPARISONS, OPERATORS, number_text
 
 

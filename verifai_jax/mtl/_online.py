@@ -30,9 +30,9 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import Evaluator, samples
 from verifai_jax.mtl.formula import Formula
-from verifai_jax.mtl.node import missing_case
 from verifai_jax.mtl.rewriting import expand, simplify
 from verifai_jax.mtl.semantics import Semantics, hard
+from verifai_jax.mtl.tree import missing_case
 
 Leaf = Callable[[Formula, int], Array]
 Cells = dict[str, Any]

@@ -13,9 +13,9 @@ from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.evaluate import End, Evaluator
 from verifai_jax.mtl.formula import Formula
-from verifai_jax.mtl.node import missing_case
 from verifai_jax.mtl.semantics import hard
 from verifai_jax.mtl.setting import Setting, evaluator_of, prepare
+from verifai_jax.mtl.tree import missing_case
 
 
 class SmoothingError(NamedTuple):

@@ -19,7 +19,7 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl import windows
 from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
 from verifai_jax.mtl.formula import Formula, Interval, Term
-from verifai_jax.mtl.node import missing_case
+from verifai_jax.mtl.tree import missing_case
 
 End = Literal["hold", "truncate", "strict"]
 

@@ -12,7 +12,7 @@ from operator import methodcaller
 
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.mtl.formula import Formula, Predicate, Term, formula
-from verifai_jax.mtl.node import postorder
+from verifai_jax.mtl.tree import postorder
 from verifai_jax.mtl.words import FUNCTIONS, NUMBERS, name_text, number_text
 
 _CONSTANT: dict[str, Callable[..., float]] = {

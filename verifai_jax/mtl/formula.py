@@ -20,11 +20,10 @@ from typing import ClassVar, TypeAlias, Union
 
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.lazy import lazy_import
-from verifai_jax.mtl.node import Node
 from verifai_jax.mtl.tree import EVERYTHING as EVERYTHING
 from verifai_jax.mtl.tree import Interval as Interval
+from verifai_jax.mtl.tree import Node, Tree
 from verifai_jax.mtl.tree import Term as Term
-from verifai_jax.mtl.tree import Tree
 from verifai_jax.mtl.words import COMPARISONS, OPERATORS, Text, operator_text
 
 Formulaic: TypeAlias = Union["Formula", Term]

@@ -8,7 +8,7 @@ from decimal import Decimal
 
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.formula import FALSE, TRUE, Formula, Interval
-from verifai_jax.mtl.node import missing_case, postorder
+from verifai_jax.mtl.tree import missing_case, postorder
 from verifai_jax.mtl.words import COMPARISONS
 
 

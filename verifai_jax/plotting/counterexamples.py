@@ -15,8 +15,8 @@ from verifai_jax.core.figure import Axes, Figure
 from verifai_jax.core.text import format_seconds
 from verifai_jax.core.waveform import HELD, Waveform, acting_spans, control_times, is_waveform
 from verifai_jax.counterexamples._explain import Explained, Influence
-from verifai_jax.counterexamples._shrink import Shrunk
 from verifai_jax.counterexamples.description import format_apart, format_number
+from verifai_jax.counterexamples.shrunk import Shrunk
 from verifai_jax.mtl import Explanation, robustness_signal
 from verifai_jax.mtl.bounds import constant_bounds
 from verifai_jax.mtl.formula import formula

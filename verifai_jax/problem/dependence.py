@@ -27,9 +27,7 @@ import jax.numpy as jnp
 from jax.interpreters import ad
 from jaxtyping import Array, Key, PyTree
 
-from verifai_jax.core.precision import truncate_silently
-from verifai_jax.core.programs import Slot
-from verifai_jax.core.steps import (
+from verifai_jax.core.fingerprint import (
     as_function,
     describe_step,
     of_some,
@@ -37,6 +35,8 @@ from verifai_jax.core.steps import (
     used_inputs,
     without_unused,
 )
+from verifai_jax.core.precision import truncate_silently
+from verifai_jax.core.programs import Slot
 from verifai_jax.problem.problem import Problem
 
 

@@ -30,7 +30,7 @@ from verifai_jax.core.devices import (
     split_sharding,
     spread_over_devices,
 )
-from verifai_jax.core.shapes import power_of_two
+from verifai_jax.core.programs import power_of_two
 from verifai_jax.rl.algorithm import Algorithm, AlgorithmState, check_fit
 from verifai_jax.rl.policy import Policy
 from verifai_jax.rl.task.task import Task

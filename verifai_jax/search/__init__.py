@@ -7,72 +7,65 @@ split({"wind": "cross_entropy"}, rest="halton")
 
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
-from verifai_jax.core.cube import Cube
 from verifai_jax.core.errors import check_names, unknown_name
-from verifai_jax.search._split import Split
-from verifai_jax.search.annealing import Annealing
-from verifai_jax.search.bandit import Bandit
-from verifai_jax.search.base import Observations, Plan, Search, Wants
-from verifai_jax.search.bayes import Bayes
-from verifai_jax.search.ce_compat import CECompat
-from verifai_jax.search.cmaes import CMAES
-from verifai_jax.search.coverage import Coverage
-from verifai_jax.search.cross_entropy import CrossEntropy
-from verifai_jax.search.descent import Descent
-from verifai_jax.search.diverse import Diverse, distinct
-from verifai_jax.search.epsilon_greedy import EpsilonGreedy
-from verifai_jax.search.gradient import Gradient
-from verifai_jax.search.grid import Grid
-from verifai_jax.search.halton import Halton
-from verifai_jax.search.mutation import Mutation
-from verifai_jax.search.point_list import PointList
-from verifai_jax.search.portfolio import Portfolio
-from verifai_jax.search.sobol import Sobol
-from verifai_jax.search.suggested import Absent, Suggested
-from verifai_jax.search.trace_surrogate import TraceSurrogate
-from verifai_jax.search.turbo import TuRBO
-from verifai_jax.search.uniform import Uniform
-from verifai_jax.search.wrapper import Wrapper
+from verifai_jax.core.lazy import attach, lazy_import
 
-__all__ = [
-    "CMAES", "Annealing", "Bandit", "Bayes", "CECompat", "Coverage", "CrossEntropy", "Cube",
-    "Descent", "Diverse", "EpsilonGreedy", "Gradient", "Grid", "Halton", "Mutation",
-    "Observations", "Plan", "PointList", "Portfolio", "Search", "Sobol", "Split", "Suggested",
-    "TraceSurrogate", "TuRBO", "Uniform", "Wants", "Wrapper", "distinct", "from_json", "named",
-    "names", "split",
-    "to_json",
-]  # fmt: skip
+if TYPE_CHECKING:
+    from verifai_jax.core.cube import Cube as Cube
+    from verifai_jax.search._split import Split as Split
+    from verifai_jax.search.annealing import Annealing as Annealing
+    from verifai_jax.search.bandit import Bandit as Bandit
+    from verifai_jax.search.base import Observations as Observations
+    from verifai_jax.search.base import Plan as Plan
+    from verifai_jax.search.base import Search as Search
+    from verifai_jax.search.base import Wants as Wants
+    from verifai_jax.search.bayes import Bayes as Bayes
+    from verifai_jax.search.ce_compat import CECompat as CECompat
+    from verifai_jax.search.cmaes import CMAES as CMAES
+    from verifai_jax.search.coverage import Coverage as Coverage
+    from verifai_jax.search.cross_entropy import CrossEntropy as CrossEntropy
+    from verifai_jax.search.descent import Descent as Descent
+    from verifai_jax.search.diverse import Diverse as Diverse
+    from verifai_jax.search.diverse import distinct as distinct
+    from verifai_jax.search.epsilon_greedy import EpsilonGreedy as EpsilonGreedy
+    from verifai_jax.search.gradient import Gradient as Gradient
+    from verifai_jax.search.grid import Grid as Grid
+    from verifai_jax.search.halton import Halton as Halton
+    from verifai_jax.search.mutation import Mutation as Mutation
+    from verifai_jax.search.point_list import PointList as PointList
+    from verifai_jax.search.portfolio import Portfolio as Portfolio
+    from verifai_jax.search.sobol import Sobol as Sobol
+    from verifai_jax.search.suggested import Suggested as Suggested
+    from verifai_jax.search.trace_surrogate import TraceSurrogate as TraceSurrogate
+    from verifai_jax.search.turbo import TuRBO as TuRBO
+    from verifai_jax.search.uniform import Uniform as Uniform
+    from verifai_jax.search.wrapper import Wrapper as Wrapper
 
+# Imported when first used: a run needs few of these searches.
+__getattr__, __dir__, __all__ = attach(__name__, "from_json", "named", "names", "split", "to_json")
 
-def __dir__() -> list[str]:
-    return list(__all__)
-
-
-_SEARCHES: dict[str, type[Search]] = {
-    "uniform": Uniform,
-    "halton": Halton,
-    "sobol": Sobol,
-    "grid": Grid,
-    "annealing": Annealing,
-    "cross_entropy": CrossEntropy,
-    "ce_compat": CECompat,
-    "bandit": Bandit,
-    "epsilon_greedy": EpsilonGreedy,
-    "bayes": Bayes,
-    "turbo": TuRBO,
-    "trace_surrogate": TraceSurrogate,
-    "cmaes": CMAES,
-    "mutation": Mutation,
-    "coverage": Coverage,
-    "gradient": Gradient,
-    "descent": Descent,
-    "portfolio": Portfolio,
+_SEARCHES = {
+    "uniform": "Uniform",
+    "halton": "Halton",
+    "sobol": "Sobol",
+    "grid": "Grid",
+    "annealing": "Annealing",
+    "cross_entropy": "CrossEntropy",
+    "ce_compat": "CECompat",
+    "bandit": "Bandit",
+    "epsilon_greedy": "EpsilonGreedy",
+    "bayes": "Bayes",
+    "turbo": "TuRBO",
+    "trace_surrogate": "TraceSurrogate",
+    "cmaes": "CMAES",
+    "mutation": "Mutation",
+    "coverage": "Coverage",
+    "gradient": "Gradient",
+    "descent": "Descent",
+    "portfolio": "Portfolio",
 }
-
-_ASKING = tuple(f.name for f in fields(Suggested) if f.name not in ("suggest", "search"))
-"""Options of `Suggested` that are plain data."""
 
 
 def names() -> tuple[str, ...]:
@@ -80,7 +73,7 @@ def names() -> tuple[str, ...]:
     return tuple(_SEARCHES)
 
 
-def named(name: str, **options: Any) -> Search:
+def named(name: str, **options: Any) -> "Search":
     """Build a search by its name.
 
     **Arguments:**
@@ -92,12 +85,12 @@ def named(name: str, **options: Any) -> Search:
     """
     if name not in _SEARCHES:
         raise unknown_name("search", name, _SEARCHES)
-    known = [field.name for field in fields(_SEARCHES[name])]  # pyright: ignore[reportArgumentType]
-    check_names(f"option of search {name}", options, known)
-    return _SEARCHES[name](**options)
+    kind = lazy_import(__name__, _SEARCHES[name])
+    check_names(f"option of search {name}", options, [field.name for field in fields(kind)])
+    return kind(**options)
 
 
-def split(parts: Mapping[str, str | Search], rest: str | Search = "uniform") -> Split:
+def split(parts: "Mapping[str, str | Search]", rest: "str | Search" = "uniform") -> "Split":
     """Build a search that has one for each part of the space; see `Split`.
 
     **Arguments:**
@@ -107,52 +100,61 @@ def split(parts: Mapping[str, str | Search], rest: str | Search = "uniform") -> 
 
     **Raises:** as `named` and `Split`.
     """
+    from verifai_jax.search._split import Split
+
     return Split({name: _as_search(part) for name, part in parts.items()}, _as_search(rest))
 
 
-def _as_search(search: str | Search) -> Search:
+def _as_search(search: "str | Search") -> "Search":
     return named(search) if isinstance(search, str) else search
 
 
-def to_json(search: Search) -> dict[str, Any] | None:
+def to_json(search: "Search") -> dict[str, Any] | None:
     """Describe a search as plain data; None for one that has no name here."""
-    if isinstance(search, Split):
-        parts = [[name, to_json(part)] for name, part in search.parts]
-        rest = to_json(search.rest)
+    kind = type(search)
+    if not kind.__module__.startswith(f"{__name__}."):
+        return None
+    # By the name of its class, since comparing with the classes would import all of them.
+    if kind.__name__ == "Split":
+        splits = cast("Split", search)
+        parts = [[name, to_json(part)] for name, part in splits.parts]
+        rest = to_json(splits.rest)
         whole = rest is not None and all(part is not None for _, part in parts)
         return {"split": parts, "rest": rest} if whole else None
-    if isinstance(search, Diverse):
-        inner = to_json(search.search)
+    options = {f.name: getattr(search, f.name) for f in fields(cast(Any, search))}
+    if kind.__name__ in ("Diverse", "Suggested"):
+        inner = to_json(options.pop("search"))
         if inner is None:
             return None
-        own = {f.name: getattr(search, f.name) for f in fields(search) if f.name != "search"}
-        return {"diverse": inner, "options": own}
-    if isinstance(search, Suggested):
-        inner = to_json(search.search)
-        if inner is None:
-            return None
-        own = {name: getattr(search, name) for name in _ASKING}
-        own["units"] = dict(search.units)
-        return {"suggested": inner, "source": search.source, "options": own}
-    for name, kind in _SEARCHES.items():
-        if type(search) is kind:
-            options = {field.name: getattr(search, field.name) for field in fields(search)}  # pyright: ignore[reportArgumentType]
+        if kind.__name__ == "Diverse":
+            return {"diverse": inner, "options": options}
+        del options["suggest"]
+        options["units"] = dict(options["units"])
+        return {"suggested": inner, "source": cast("Suggested", search).source, "options": options}
+    for name, of in _SEARCHES.items():
+        if kind.__name__ == of:
             return {"name": name, "options": options}
     return None
 
 
-def from_json(data: Mapping[str, Any]) -> Search:
+def from_json(data: Mapping[str, Any]) -> "Search":
     """Build the search that `to_json` described.
 
     **Raises:** `ValueError` as `named`, and for data that describes no search.
     """
     if "split" in data:
+        from verifai_jax.search._split import Split
+
         return Split(
             {name: from_json(part) for name, part in data["split"]}, from_json(data["rest"])
         )
     if "diverse" in data:
+        from verifai_jax.search.diverse import Diverse
+
         return Diverse(from_json(data["diverse"]), **data.get("options", {}))
     if "suggested" in data:
+        from verifai_jax.search.suggested import Absent, Suggested
+
         source = Absent(str(data.get("source", "a function")))
         return Suggested(source, from_json(data["suggested"]), **data.get("options", {}))
     if not isinstance(data.get("options"), Mapping):

@@ -8,7 +8,7 @@ member whose gradients turn out zero or not finite gets next to nothing at once.
 of every point, and descents start from the best points of all as often as from new ones.
 
 Where these have found no failure for long, a fourth member joins them, with an account of its own:
-descents into the interior of the space (`interior`, `descent`).
+descents into the interior of the space (`descent`).
 
 Rounds of many simulations begin without gradients, which take longer to compile than these to run,
 until they have found no failure for a while (`PortfolioStage`).
@@ -26,8 +26,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Plan, Search, Wants, choose
 from verifai_jax.search.cross_entropy import CrossEntropy, CrossEntropyState
-from verifai_jax.search.gradient import NOTHING, Gradient, GradientState
-from verifai_jax.search.interior import (
+from verifai_jax.search.descent import (
     InteriorState,
     begin,
     learn,
@@ -37,6 +36,7 @@ from verifai_jax.search.interior import (
     wait,
     waits,
 )
+from verifai_jax.search.gradient import NOTHING, Gradient, GradientState
 from verifai_jax.search.mutation import FEW, Mutation, MutationState
 from verifai_jax.search.wrapper import Wrapper
 

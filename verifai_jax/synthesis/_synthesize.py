@@ -20,12 +20,12 @@ from jaxtyping import Float
 
 from verifai_jax import search as searches
 from verifai_jax.core.budget import Budget, split_budget
-from verifai_jax.core.checks import check_count
+from verifai_jax.core.checks import check_count, check_options
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.evaluation.backends import resolved
-from verifai_jax.falsification.validation import check_options, check_search, usual_batch
+from verifai_jax.falsification.validation import check_search, usual_batch
 from verifai_jax.problem.dependence import depends_on_key, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search

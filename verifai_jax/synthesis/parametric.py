@@ -23,14 +23,13 @@ from jaxtyping import Array, Bool, Float, PyTree
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import in_precision
-from verifai_jax.core.shapes import pad_rows
+from verifai_jax.core.programs import pad_rows
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.evaluation.inputs import WithParameters
+from verifai_jax.evaluation.row import WithParameters
 from verifai_jax.evaluation.verdicts import trace_verdict
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
-from verifai_jax.systems.base import as_system
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -242,7 +241,7 @@ class ArrayParameters:
         features = jax.eval_shape(self.problem.space.unflatten, jnp.zeros(self.problem.space.dim))
         key = jax.eval_shape(lambda: jax.random.key(0))
         start = self._restore(jnp.asarray(self.start, jnp.float32))
-        if as_system(self.system_of(start)).black_box:
+        if replace(self.problem, system=self.system_of(start)).black_box:
             raise ValueError(
                 "arrays of parameters are repaired by gradients, which a black box has not; make "
                 "the parameters features of the space, and name them"

@@ -190,8 +190,8 @@ def test_refuses_bad_options(options, match):
 
 def test_a_simulator_that_workers_cannot_import(tmp_path, monkeypatch):
     (tmp_path / "licensed.py").write_text(
-        "from verifai_jax.systems.blackbox import workers\n"
-        "if workers._preparing:\n    raise ImportError('no licence left')\n"
+        "from verifai_jax.systems.blackbox import worker_process\n"
+        "if worker_process.preparing:\n    raise ImportError('no licence left')\n"
         "def simulate(features): ...\n"
     )
     monkeypatch.syspath_prepend(tmp_path)

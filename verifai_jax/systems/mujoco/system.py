@@ -19,7 +19,7 @@ from jaxtyping import Array, Key, PyTree
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options, unknown_name
-from verifai_jax.core.steps import used_inputs
+from verifai_jax.core.fingerprint import used_inputs
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import set_durations
 from verifai_jax.systems.base import Features, Seed, System
