@@ -86,7 +86,7 @@ def command(rows: int, target: str, *more: str) -> list[str]:
 def kill_in_the_middle(rows: int, folder: Path, seconds: float) -> None:
     """Begin a run and kill it, at a random moment of the seconds that it would take."""
     process = subprocess.Popen(command(rows, str(folder)), stdout=subprocess.DEVNULL)
-    while not (folder / "search.npz").exists() and process.poll() is None:
+    while not (folder / "search.state").exists() and process.poll() is None:
         time.sleep(0.01)
     time.sleep(random.uniform(0.1, 0.8) * seconds)
     process.kill()

@@ -11,7 +11,7 @@ from rings import SMALL, STEPS, inside, rings, train
 
 import verifai_jax as vj
 from verifai_jax.augmentation import ARMS
-from verifai_jax.core.cache import CacheError
+from verifai_jax.store.cache import CacheError
 
 pytestmark = pytest.mark.thorough
 

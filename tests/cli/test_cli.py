@@ -17,8 +17,8 @@ from click.testing import CliRunner
 from verifai_jax.cli import arguments, doctor
 from verifai_jax.cli.doctor import TESTED, bad_pairs
 from verifai_jax.cli.main import main
-from verifai_jax.core.seals import sealed
-from verifai_jax.falsification.run import load
+from verifai_jax.falsification.run_folder import load
+from verifai_jax.store.files import sealed
 
 ROOT = Path(__file__).parents[2]
 PROBLEM = """
@@ -441,7 +441,7 @@ def test_a_target_by_its_variable(call, tmp_path):
 def test_folders_of_something_else(call, tmp_path):
     call("falsify", "specs/ramp.py:calm", "--search", "uniform", "--budget", 8, "--no-pictures")
     for name, file, text in (
-        ("sweeps", "sweep.sqlite", ""),
+        ("sweeps", "sweep.cache", ""),
         ("other", "run.json", '{"lap": 1}'),
         ("cut", "run.json", "{"),
     ):
@@ -453,8 +453,8 @@ def test_folders_of_something_else(call, tmp_path):
         ("runs", "run.json is missing; but its folders calm-1 are runs"),
         ("specs/ramp.py", "no run in specs/ramp.py: it is a file"),
         ("sweeps", "it is the folder of a sweep; verifai-jax sweep --resume sweeps goes on"),
-        ("other", "no run in other: its run.json is damaged, or of another program"),
-        ("cut", "no run in cut: its run.json is damaged, or of another program"),
+        ("other", "no run in other: other/run.json is damaged, or of another program"),
+        ("cut", "no run in cut: cut/run.json is damaged, or of another program"),
     ):
         assert told in call("falsify", "--resume", place, code=2)
         assert told in call("falsify", "specs/ramp.py:ramp", "--warm-start", place, code=2)

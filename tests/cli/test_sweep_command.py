@@ -10,8 +10,8 @@ from click.testing import CliRunner
 from drifting import quick_certificates
 
 from verifai_jax.cli.main import main
-from verifai_jax.core.cache import Cache
 from verifai_jax.core.targets import TargetError, definitions, load_target
+from verifai_jax.store.cache import Cache
 from verifai_jax.sweeps import Study
 from verifai_jax.sweeps import _sweep as driver
 
@@ -53,7 +53,7 @@ def test_sweep_and_what_it_writes(call, tmp_path):
     assert "nominal_return" in output
     folder = tmp_path / "sweeps" / "safe-1"
     assert "table        sweeps/safe-1/table.parquet" in output
-    assert {"table.parquet", "sweep.json", "policies", "sweep.sqlite"} <= {
+    assert {"table.parquet", "sweep.json", "policies", "sweep.cache"} <= {
         path.name for path in folder.iterdir()
     }
     call("specs/drift.py:safe", *SMALL)
@@ -65,7 +65,7 @@ def test_resume_goes_on_with_what_was_asked_for(call, tmp_path, monkeypatch):
     asked = ("--search", "cross_entropy", "--set", "elite=0.5", "--halving", 2, "--seed", 3)
     whole = call("specs/drift.py:safe", *SMALL, *asked, "--folder", "whole")
     stopped = _Stopping(after=7)
-    monkeypatch.setattr(driver, "Cache", stopped)
+    monkeypatch.setattr("verifai_jax.store.cache.Cache", stopped)
     part = call("specs/drift.py:safe", *SMALL, *asked, "--folder", "part", "--cache", "work done")
     assert "NOT FINISHED" in part
     (printed,) = (line for line in part.splitlines() if line.startswith("  resume "))
@@ -95,10 +95,8 @@ class _Stopping:
     def __init__(self, after):
         self.after = after
 
-    def __call__(self, path):
-        from verifai_jax.core.cache import Cache
-
-        cache, put = Cache(path), Cache.put
+    def __call__(self, folder, kind):
+        cache, put = Cache(folder, kind), Cache.put
 
         def stopped(work):
             put(cache, work)
@@ -156,7 +154,7 @@ def test_only_some_vary(call):
 def test_another_sweep_in_the_same_folder_is_refused(call):
     call("specs/drift.py:safe", *SMALL, "--folder", "kept")
     output = call("specs/drift.py:safe", *SMALL, "--seed", 9, "--folder", "kept", code=2)
-    assert "kept/sweep.sqlite holds a different sweep: options.seed is 9, in the cache 0" in output
+    assert "kept/sweep.cache holds a different sweep: options.seed is 9, in the cache 0" in output
 
 
 def test_a_folder_from_elsewhere_names_no_code(call, tmp_path):
@@ -164,9 +162,9 @@ def test_a_folder_from_elsewhere_names_no_code(call, tmp_path):
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     shutil.move(tmp_path / "specs", tmp_path / "kept" / "specs")
-    with Cache(tmp_path / "kept") as cache:
-        note = json.dumps(cache.note("command")).replace("specs/", "kept/specs/")
-        cache.note("command", json.loads(note))
+    cache = Cache(tmp_path / "kept")
+    note = json.dumps(cache.note("command")).replace("specs/", "kept/specs/")
+    cache.note("command", json.loads(note))
     output = call("--resume", "kept", code=2)
     assert "kept does not say which study of this project it is of" in output
 

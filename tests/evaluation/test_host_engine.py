@@ -171,8 +171,8 @@ def test_journal_recalls_only_the_same_point(tmp_path):
     journal = Journal(tmp_path)
     journal.add(7, points[1], RowVerdict(np.array([0.1, np.nan]), 1, np.array([True, False]), "é"))
     journal.settle(7)  # Nothing of the batch in flight is in the table yet.
-    with open(journal.path, "a") as file:
-        file.write('{"row": 8, "po')  # Where the process died.
+    with open(journal.path, "ab") as file:
+        file.write(journal.path.read_bytes()[:40])  # Where the process died.
     again = Journal(tmp_path)
     again.add(9, points[2], RowVerdict(np.array([0.5]), 0, np.array([True]), ""))
     again.settle(7)
@@ -185,13 +185,13 @@ def test_journal_recalls_only_the_same_point(tmp_path):
     assert not journal.path.exists()
 
 
-def test_a_line_of_the_journal_that_has_changed_is_none(tmp_path):
+def test_an_entry_of_the_journal_that_has_changed_is_none(tmp_path):
     point = np.array([[0.25, 0.5]], np.float32)
     journal = Journal(tmp_path)
     journal.add(0, point[0], RowVerdict(np.array([0.1234]), 0, np.array([True]), "x"))
     journal.settle(0)
     whole = journal.path.read_bytes()
-    for at in range(len(whole) - 1):
+    for at in range(len(whole)):
         journal.path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
         assert Journal(tmp_path).recall(0, point) == {}
     journal.path.write_bytes(whole)

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.seals import sealed
 from verifai_jax.core.targets import load_target
 from verifai_jax.falsification.shards import Shard, merge, simulate_shard
+from verifai_jax.store.files import sealed
 
 SPEC = """
 import numpy as np
@@ -149,7 +149,7 @@ def test_a_damaged_record_of_it_is_refused(folder):
     record = json.loads((folder / "run.json").read_text())
     record["sources"] = [{"files": 3}]
     (folder / "run.json").write_text(json.dumps(sealed(record)))
-    with pytest.raises(ValueError, match="'sources' of another form"):
+    with pytest.raises(ValueError, match="the files of a model has another form"):
         vj.load(folder)
 
 

@@ -6,7 +6,8 @@ import pandas as pd
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.falsification.shards import Shard, merge, simulate_shard
+from verifai_jax.falsification.shards import SHARD, Shard, merge, simulate_shard
+from verifai_jax.store.log import MARK, Log
 
 
 def line(features, key):
@@ -59,15 +60,21 @@ def test_a_part_that_was_killed_goes_on_where_it_was(parts, tmp_path):
     folder = tmp_path / "2"
     options = {"budget": 5000, "batch": 1024, "folder": folder}
     simulate_shard(LINE, Shard(2, 3), **options)
-    files = sorted(folder.glob("*.npz"))
-    times = [file.stat().st_mtime_ns for file in files]
-    files[1].unlink()
-    simulate_shard(LINE, Shard(2, 3), **options)
-    assert [file.stat().st_mtime_ns == t for file, t in zip(files, times, strict=True)] == [
-        True, False, *[True] * (len(files) - 2),
-    ]  # fmt: skip
-    (parts / "2" / files[0].name).exists()
-    assert files[1].read_bytes() == (parts / "2" / files[1].name).read_bytes()
+    whole, last = (folder / SHARD).read_bytes(), Log(folder / SHARD).names()[-1]
+    # Killed in the middle of its last block.
+    (folder / SHARD).write_bytes(whole[:-100])
+    simulated = []
+    with pytest.MonkeyPatch.context() as patch:
+        put = Log.put
+        patch.setattr(Log, "put", lambda log, block: [simulated.append(*block), put(log, block)])
+        simulate_shard(LINE, Shard(2, 3), **options)
+        assert simulated == [last]
+        simulate_shard(LINE, Shard(2, 3), **options)
+        assert simulated == [last]
+    for name in (name for name in Log(folder / SHARD).names() if name != "about"):
+        block = Log(parts / "2" / SHARD).get(name)
+        again = Log(folder / SHARD).get(name)
+        assert all(block[n].tobytes() == v.tobytes() for n, v in again.items())
     with pytest.raises(ValueError, match=r"holds another part: its seed is 0, here 1"):
         simulate_shard(LINE, Shard(2, 3), **options, seed=1)
 
@@ -81,7 +88,7 @@ def test_parts_that_do_not_fit_are_named(parts, tmp_path):
     simulate_shard(LINE, Shard(3, 3), budget=4000, batch=1024, folder=tmp_path / "other")
     with pytest.raises(ValueError, match=r"its budget is 4000, there 5000"):
         merge([one, two, tmp_path / "other"], LINE)
-    with pytest.raises(FileNotFoundError, match=r"it has no shard.json"):
+    with pytest.raises(FileNotFoundError, match=r"it has no shard.rows"):
         merge([tmp_path], LINE)
     with pytest.raises(ValueError, match="with other formulas or features"):
         merge([one, two, three], vj.Problem("line", SPACE, line, "always x < 3.4"))
@@ -95,13 +102,15 @@ def test_damaged_and_unfinished_parts_are_named(parts, tmp_path):
         for file in place.iterdir():
             if file.is_file():
                 (copies[-1] / file.name).write_bytes(file.read_bytes())
-    last = sorted(copies[1].glob("*.npz"))[-1]
-    content = last.read_bytes()
-    last.write_bytes(content[:-1] + b"!")
-    with pytest.raises(vj.RunError, match=r"is damaged: its bytes have changed"):
-        merge(copies, LINE)
-    last.unlink()
-    with pytest.raises(vj.RunError, match=r"is in none of the parts: one is not finished"):
+    file = copies[1] / SHARD
+    content = file.read_bytes()
+    for damaged in (content[:-1] + b"!", content[: content.rindex(MARK)]):
+        file.write_bytes(damaged)
+        told = r"row 2048 is in none of the parts: one is not finished, or damaged; run it again"
+        with pytest.raises(vj.RunError, match=told):
+            merge(copies, LINE)
+    file.write_bytes(content[content.index(MARK, 1) :])
+    with pytest.raises(ValueError, match=r"shard.rows is damaged: it does not say which part"):
         merge(copies, LINE)
 
 

@@ -8,7 +8,8 @@ import pytest
 
 from verifai_jax.falsification import segments
 from verifai_jax.falsification.table import FINISHED, ErrorTable, TableError
-from verifai_jax.falsification.tail import TAIL, Tail
+from verifai_jax.falsification.tail import TAIL
+from verifai_jax.store.log import Log
 
 
 def batch(rho, status=None, **features):
@@ -134,7 +135,6 @@ def test_rows_that_are_missing_are_not_numbered_anew(tmp_path, short):
     for refused in (read.resumed, read.save):
         with pytest.raises(TableError, match="rows 0 to 7 are missing"):
             refused(tmp_path / "other" if refused == read.save else 9)
-    table._tail.close()
 
 
 @pytest.fixture
@@ -218,7 +218,7 @@ def killed_at(monkeypatch, step):
 
         return counted
 
-    for owner, name in ((Path, "replace"), (Path, "unlink"), (Path, "rmdir"), (Tail, "append")):
+    for owner, name in ((Path, "replace"), (Path, "unlink"), (Path, "rmdir"), (Log, "put")):
         monkeypatch.setattr(owner, name, before(getattr(owner, name)))
     return done
 
@@ -256,14 +256,10 @@ def test_a_process_may_die_between_any_two_operations_on_files(
     while not finished:
         folder, written = tmp_path / str(step), []
         with monkeypatch.context() as patch:
-            done = killed_at(patch, step)
-            try:
+            killed_at(patch, step)
+            with contextlib.suppress(Killed):
                 interrupted(folder, written)
                 finished = True
-            except Killed:
-                for each in done:
-                    if isinstance(each, Tail):
-                        each.close()
         step += stride
         again = -1 in written
         after = written[written.index(-1) + 1 :] if again else written

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 from drifting import drifting, quick_certificates
 
-from verifai_jax.core.cache import CacheError
 from verifai_jax.core.sources import Source
 from verifai_jax.rl import policy_sources
+from verifai_jax.store.cache import CacheError
 from verifai_jax.sweeps import _sweep as driver
 from verifai_jax.sweeps._sweep import sweep
 from verifai_jax.sweeps.result import load_sweep

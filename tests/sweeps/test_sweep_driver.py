@@ -10,10 +10,10 @@ from checked_types import unchecked
 from drifting import Drift, Point, drifting, quick_certificates
 
 import verifai_jax as vj
-from verifai_jax.core.cache import Cache, CacheError
 from verifai_jax.core.errors import MissingExtra, UnknownNameError
 from verifai_jax.rl import evaluate, train
 from verifai_jax.rl._evaluate import mean_returns
+from verifai_jax.store.cache import Cache, CacheError
 from verifai_jax.sweeps import _sweep as driver
 from verifai_jax.sweeps import training_runs
 from verifai_jax.sweeps._sweep import sweep
@@ -238,9 +238,9 @@ CASES = {
 def test_interrupted_and_resumed_it_is_the_same_sweep(case, monkeypatch, tmp_path):
     study, how = drifting(), {"samples": 64, **CASES[case]}
     through = sweep(study, folder=tmp_path / "through", **how)
-    with Cache(tmp_path / "through") as kept:
-        pieces = len(kept.names())
-    monkeypatch.setattr(driver, "Cache", Stopped)
+    kept = Cache(tmp_path / "through")
+    pieces = len(kept.names())
+    monkeypatch.setattr("verifai_jax.store.cache.Cache", Stopped)
     for after in (1, pieces // 2, pieces - 2):
         monkeypatch.setattr(Stopped, "after", after)
         some = sweep(study, folder=tmp_path / str(after), **how)

@@ -16,7 +16,7 @@ from verifai_jax.rl import load_policy
 from verifai_jax.statistics.pareto import fronts
 from verifai_jax.sweeps.record import AFTER, BEFORE
 from verifai_jax.sweeps.result import Sweep, load_sweep
-from verifai_jax.sweeps.storage import FORMAT, SweepFileError
+from verifai_jax.sweeps.storage import SweepFileError
 from verifai_jax.sweeps.summary import format_hyperparameters
 
 NOT_TRAINED = {
@@ -343,12 +343,6 @@ def test_folders_that_hold_no_such_sweep(small, tmp_path):
     with pytest.raises(SweepFileError, match=r"its hyper-parameters is .*'clip'"):
         load_sweep(folder, other)
     data = json.loads((folder / "sweep.json").read_text())
-    (folder / "sweep.json").write_text(json.dumps({**data, "format": 7}))
-    with pytest.raises(SweepFileError, match=rf"has format 7, .* format {FORMAT}; read it with"):
-        load_sweep(folder)
-    (folder / "sweep.json").write_text(json.dumps({**data, "format": FORMAT - 1}))
-    with pytest.raises(SweepFileError, match=f"has format {FORMAT - 1}"):
-        load_sweep(folder)
     (folder / "sweep.json").write_text("{")
     with pytest.raises(SweepFileError, match=r"sweep.json is damaged"):
         load_sweep(folder)

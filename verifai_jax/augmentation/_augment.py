@@ -24,7 +24,6 @@ from verifai_jax.augmentation.result import Augmentation
 from verifai_jax.augmentation.searched import searched_problem
 from verifai_jax.augmentation.study import Plan, Study
 from verifai_jax.augmentation.task import SupervisedTask
-from verifai_jax.core.cache import Cache, locked_cache
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.precision import reproducible_settings
@@ -33,6 +32,7 @@ from verifai_jax.core.sources import sources_of
 from verifai_jax.falsification.validation import check_search
 from verifai_jax.features import FeatureSpace
 from verifai_jax.search import Search, named
+from verifai_jax.store.cache import locked_cache
 
 KIND = "augmentation"
 """Kind of the cache."""
@@ -91,7 +91,7 @@ def augment(
     - `hard`: inputs of the hard test, on which an independently trained network errs; 0 for none.
       It is the same for all seeds.
     - `confidence`: of each interval by itself.
-    - `folder`: a folder, or a `.sqlite` file, that keeps finished work: the same call goes on where
+    - `folder`: keeps finished work: the same call goes on where
       it was interrupted, and one with more seeds or arms computes only these.
     - `progress`: show a progress bar; by default on a terminal or in a notebook.
     - `even_if_changed`: whether to go on with finished work of a folder although files of the task
@@ -121,7 +121,7 @@ def augment(
     task.check()
     check_search(searched_problem(task, None, search, None), search)
     plan = Plan(initial, added, steps, further_steps, search, budget, seed, test, hard)
-    with locked_cache(folder, KIND), Cache(folder, KIND) as cache, ProgressBar(progress) as bar:
+    with locked_cache(folder, KIND) as cache, ProgressBar(progress) as bar:
         cache.claim(_fingerprint(task, plan), sources_of(task), even_if_changed)
         bar.begin(task.name, seeds * (1 + len(chosen)), "networks")
         study = Study(task, plan, cache, bar)
@@ -132,7 +132,7 @@ def augment(
         except KeyboardInterrupt:
             complete = False
         result = study.result(chosen, confidence, complete)
-    if folder is not None and Path(folder).is_dir():
+    if folder is not None:
         result.save(folder)
     return result
 

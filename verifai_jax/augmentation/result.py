@@ -23,10 +23,10 @@ from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.locks import write_lock
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.precision import reproducible_settings
 from verifai_jax.statistics.paired import PairedDifference
+from verifai_jax.store.locks import write_lock
 
 TABLE, ADDED, SUMMARY = "table.parquet", "added.parquet", "summary.txt"
 """Files of a result in a folder."""
@@ -189,7 +189,6 @@ class Augmentation(InNotebook):
         **Raises:** `FolderInUse` where another process writes it.
         """
         path = Path(folder)
-        path.mkdir(parents=True, exist_ok=True)
         with write_lock(path):
             with replacing(path / TABLE) as partial:
                 self.table.to_parquet(partial)

@@ -13,7 +13,8 @@ import numpy as np
 import pandas as pd
 
 from verifai_jax.augmentation.task import Weights
-from verifai_jax.core.cache import Arrays
+from verifai_jax.store.files import plain
+from verifai_jax.store.log import Arrays
 
 _ORDER = "columns"
 """Array with the names of a table's columns, in their order."""
@@ -29,7 +30,7 @@ def encode_frame(frame: pd.DataFrame) -> Arrays:
         if values.dtype.kind in "biuf":
             arrays[f"plain/{name}"] = values
         else:
-            arrays[f"json/{name}"] = np.array([json.dumps(_plain(v)) for v in values], np.str_)
+            arrays[f"json/{name}"] = np.array([json.dumps(plain(v)) for v in values], np.str_)
     return arrays
 
 
@@ -86,7 +87,3 @@ def _restored(structure: Any, arrays: Mapping[str, np.ndarray]) -> Any:
         parts = [_restored(part, arrays) for part in value]
         return parts if kind == "list" else tuple(parts)
     return None if kind == "none" else jax.numpy.asarray(arrays[str(value)])
-
-
-def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else value

@@ -40,11 +40,12 @@ from verifai_jax.augmentation.storage import (
     encode_weights,
 )
 from verifai_jax.augmentation.task import SupervisedTask, TaskError, Weights
-from verifai_jax.core.cache import Arrays, Cache
 from verifai_jax.core.progress import ProgressBar
 from verifai_jax.core.user_errors import explain_user_error
 from verifai_jax.falsification import falsify
 from verifai_jax.search import Search
+from verifai_jax.store.cache import Cache
+from verifai_jax.store.log import Arrays
 
 _PER_HARD = 40
 """Inputs that are drawn at most for each one of the hard test."""

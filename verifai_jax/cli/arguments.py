@@ -219,7 +219,7 @@ def load_run(folder: Path, target: str | None) -> "Run":
 def read_run(folder: Path, problem: "Problem | None" = None) -> "Run":
     """Read the run in a folder; say what the folder is where it holds none."""
     from verifai_jax.core.text import printable
-    from verifai_jax.falsification.run import load
+    from verifai_jax.falsification.run_folder import load
 
     read_record(folder)
     run = load(folder, problem)
@@ -243,14 +243,14 @@ def recorded_target(folder: Path, remedy: str = "--problem specs/FILE.py:NAME") 
 def read_record(folder: Path) -> dict[str, Any]:
     """Read the record of the run in a folder; say what the folder is where it holds none.
 
-    **Raises:** as `verifai_jax.falsification.record.read_record`.
+    **Raises:** as `verifai_jax.falsification.run_folder.read_record`.
     """
-    from verifai_jax.falsification import record
+    from verifai_jax.falsification import run_folder
 
     try:
-        return record.read_record(folder)
+        return run_folder.read_record(folder)
     except FileNotFoundError as missing:
-        raise FileNotFoundError(_describe_folder(folder, record.RECORD, str(missing))) from None
+        raise FileNotFoundError(_describe_folder(folder, run_folder.RECORD, str(missing))) from None
 
 
 def _describe_folder(folder: Path, record: str, missing: str) -> str:
@@ -274,7 +274,7 @@ def _describe_folder(folder: Path, record: str, missing: str) -> str:
 
 def is_sweep(folder: Path) -> bool:
     """Return whether a folder is one that `verifai-jax sweep` has written."""
-    return any((folder / name).is_file() for name in ("sweep.json", "sweep.sqlite"))
+    return any((folder / name).is_file() for name in ("sweep.json", "sweep.cache"))
 
 
 def split_names(text: str) -> list[str]:
@@ -364,7 +364,7 @@ def next_folder(parent: str, name: str) -> Iterator[Path]:
     A command that ends without a file in it removes it.
     """
     from verifai_jax.core.text import folder_name
-    from verifai_jax.falsification.validation import writing
+    from verifai_jax.store.locks import writing
 
     name, number, first = folder_name(name), 1, not Path(parent).exists()
     while True:

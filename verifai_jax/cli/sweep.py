@@ -65,7 +65,7 @@ _MAX_ROWS = 12
 @click.option(
     "--cache",
     type=click.Path(path_type=Path),
-    help="Folder or .sqlite file of finished work  [default: the sweep's folder]",
+    help="Folder of finished work  [default: the sweep's folder]",
 )
 @click.option("--resume", type=click.Path(path_type=Path), help="Folder of a sweep to resume.")
 @EVEN_IF_CHANGED
@@ -193,15 +193,14 @@ def _keywords(given: Mapping[str, Any], options: tuple[str, ...]) -> dict[str, A
 
 def _read_command(folder: Path) -> dict[str, Any]:
     """Read the command of an interrupted sweep from its cache."""
-    from verifai_jax.core.cache import Cache, CacheError, cache_file
+    from verifai_jax.store.cache import Cache, CacheError, cache_file
 
     if not cache_file(folder).exists():
         raise FileNotFoundError(f"no sweep to resume in {folder}{_describe_folder(folder)}")
-    with Cache(folder) as cache:
-        note = cache.note("command")
+    note = Cache(folder).note("command")
     if note is None:
         raise CacheError(
-            f"the sweep in {folder} was begun in Python, and Python has to go on with it: call "
+            f"the sweep in {folder} was begun in Python, or its command is damaged: call "
             f"vj.sweep(study, ..., folder={str(folder)!r}) again"
         )
     if (

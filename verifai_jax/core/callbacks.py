@@ -13,7 +13,7 @@ Nothing that a callback does changes a result; what it raises ends the computati
 from collections.abc import Callable, Iterable, Mapping
 from typing import TypeAlias
 
-from verifai_jax.core.locks import returning_once
+from verifai_jax.core.forks import returning_once
 
 Values: TypeAlias = Mapping[str, float]
 """Numbers by name."""

@@ -142,7 +142,7 @@ def target_of_project(target: object, folder: Path, *, kind: str, remedy: str) -
 
 RESULTS = ("runs", "sweeps")
 """Names of the folders in which the command line keeps results."""
-_OF_RESULTS = ("run.json", "sweep.json", "sweep.sqlite")
+_OF_RESULTS = ("run.json", "sweep.json", "sweep.cache")
 
 
 def _is_of_project(location: str, folder: Path) -> bool:

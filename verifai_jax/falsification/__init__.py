@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from verifai_jax.falsification._falsify import resume as resume
     from verifai_jax.falsification._falsify import simulate as simulate
     from verifai_jax.falsification.run import Run as Run
-    from verifai_jax.falsification.run import load as load
+    from verifai_jax.falsification.run_folder import load as load
     from verifai_jax.falsification.running import RunError as RunError
     from verifai_jax.falsification.table import ErrorTable as ErrorTable
 

@@ -24,13 +24,8 @@ from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
 from verifai_jax.falsification.model_changes import continued_with
-from verifai_jax.falsification.run import (
-    RECORD,
-    Run,
-    as_made,
-    check_not_continued,
-    load,
-)
+from verifai_jax.falsification.run import Run
+from verifai_jax.falsification.run_folder import RECORD, as_made, check_not_continued, load
 from verifai_jax.falsification.running import Ending, Running
 from verifai_jax.falsification.silent_mistakes import notes_before
 from verifai_jax.falsification.table import ErrorTable
@@ -47,17 +42,16 @@ from verifai_jax.falsification.validation import (
     check_same_space,
     check_search,
     earlier_rows,
-    locked,
     new_folder,
     points_of,
     recorded_search,
     rows_of_first,
     slow_search,
-    writing,
 )
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.search.suggested import without_suggestions
+from verifai_jax.store.locks import write_lock, writing
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -308,7 +302,7 @@ def resume(
     if not isinstance(run, Run) and not (Path(run) / RECORD).exists():
         load(run)  # Says what is missing; a lock would be written to what is no run.
     # The rows are read under the lock, so that nobody adds to them meanwhile.
-    with locked(folder):
+    with write_lock(folder):
         if isinstance(run, str | Path):
             run = load(run, problem)
             problem = run.problem  # As the run simulated it.

@@ -1,6 +1,5 @@
 """Rows as columns of NumPy arrays, and their other forms: of pandas, of Arrow, a checksum."""
 
-import zlib
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -9,6 +8,7 @@ from jaxtyping import Int, Shaped
 
 from verifai_jax.core.text import one_line
 from verifai_jax.core.trace import Status
+from verifai_jax.store.files import checksum
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -135,7 +135,7 @@ def column_to_arrow(values: Shaped[np.ndarray, " n"]) -> "pa.Array":
     return pa.array(values, pa.string() if texts else None, from_pandas=True)
 
 
-def checksum(values: Shaped[np.ndarray, " n"], before: int | None = None) -> int:
+def column_checksum(values: Shaped[np.ndarray, " n"], before: int | None = None) -> int:
     """Return the checksum of a column; of a part of it after one with the checksum `before`."""
     import pandas as pd
 
@@ -144,9 +144,9 @@ def checksum(values: Shaped[np.ndarray, " n"], before: int | None = None) -> int
         values = to_arrow({"": values}).column(0).to_numpy(zero_copy_only=False)
     text = values.dtype.kind in "OUT"
     if before is None:
-        before = zlib.crc32(b"text" if text else values.dtype.str.encode())
+        before = checksum(b"text" if text else values.dtype.str.encode())
     if text:
         codes, known = pd.factorize(values)
-        each = [*(zlib.crc32(str(text).encode(errors="replace")) for text in known), 0]
+        each = [*(checksum(str(text).encode(errors="replace")) for text in known), 0]
         values = np.array(each, np.uint32)[codes]
-    return zlib.crc32(values.tobytes(), before)
+    return checksum(values.tobytes(), before)

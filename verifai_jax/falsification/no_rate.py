@@ -13,7 +13,6 @@ _WHY: dict[str, str] = {
     "coverage": "this search goes where coverage grows",
     "learned": "this search goes where failures are",
 }
-_UNKNOWN = "its rows are no independent samples of the prior"
 _UNIFORM = "use search='uniform' for a rate"
 _REMEDY: dict[str, str] = {
     "first": "leave out first= for a rate",
@@ -46,10 +45,6 @@ _BETWEEN: dict[str, str] = {
     ),
 }
 _NO_RATE = "The points between the {rows} samples: nothing is known of them."
-_BETWEEN_UNKNOWN = (
-    "The points between the {rows} simulations: nothing is known of them. The rows are no "
-    "independent samples of the prior, so that the share of failing ones is no probability."
-)
 
 
 def why_no_rate(run: Run) -> str:
@@ -59,7 +54,7 @@ def why_no_rate(run: Run) -> str:
     if run.origin == "first":
         count = len(run.first)
         return "its first row was given" if count == 1 else f"its first {count:,} rows were given"
-    return _WHY.get(run.origin, _UNKNOWN)
+    return _WHY[run.origin]
 
 
 def remedy(run: Run) -> str:
@@ -70,7 +65,7 @@ def remedy(run: Run) -> str:
 def what_lies_between(run: Run) -> str:
     """Say what is not known of the points that a run did not simulate."""
     origin = "prior" if run.prior else run.origin
-    text = _BETWEEN.get(origin, _BETWEEN_UNKNOWN)
+    text = _BETWEEN[origin]
     if run.prior and run.failure_rate is None:
         text = _NO_RATE  # No simulation has a verdict, or they are of several models.
     return text.format(rows=f"{run.simulations:,}", given=f"{len(run.first):,}")

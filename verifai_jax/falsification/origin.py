@@ -3,14 +3,13 @@
 origin_of(search, first=0)         "prior", "first", "given", "sequence", "coverage", "learned"
 """
 
-from typing import Literal, get_args
+from typing import Literal
 
 from verifai_jax.search import Search
 
 Origin = Literal["prior", "first", "given", "sequence", "coverage", "learned"]
 """Where rows come from: as the points of a search (`search/base.py`), and `"first"` for samples of
 the prior after rows that were given."""
-ORIGINS: tuple[Origin, ...] = get_args(Origin)
 
 
 def origin_of(search: Search, first: int) -> Origin:

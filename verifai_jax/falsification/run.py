@@ -6,7 +6,6 @@ run.replay(run.best)               the trace of a row
 run.save("runs/mine"); vj.load("runs/mine", problem)
 """
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,21 +15,9 @@ import numpy as np
 
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.locks import write_lock
 from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.seals import sealed
 from verifai_jax.core.sources import Change
-from verifai_jax.core.text import one_line
 from verifai_jax.evaluation.confirmations import describe_checks
-from verifai_jax.falsification.checkpoint import (
-    RECORD_CHECKSUM,
-    ROWS_CHECKSUM,
-    STATE,
-    CheckpointError,
-    read_checkpoint,
-    write_checkpoint,
-)
-from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.model_changes import (
     NEAR,
     ROUNDING,
@@ -40,17 +27,7 @@ from verifai_jax.falsification.model_changes import (
     model_changes,
     sources_of_row,
 )
-from verifai_jax.falsification.record import (
-    DECIDING,
-    FORMAT,
-    RECORD,
-    RECORDED,
-    numeric_features,
-    read_record,
-    record_checksum,
-)
-from verifai_jax.falsification.table import FINISHED, ErrorTable
-from verifai_jax.falsification.tail import TAIL
+from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Rulebook
@@ -82,7 +59,7 @@ class Run(InNotebook):
       into the table. What is left is that of callbacks and checkpoints.
     - `version`: of verifai_jax.
     - `prior`: whether the rows are independent samples of the feature space.
-    - `origin`: where the rows come from, one of `origin.ORIGINS`, which says why they are no such
+    - `origin`: where the rows come from, an `origin.Origin`, which says why they are no such
       samples: `"first"` (rows that were given came before the samples), `"given"` (all rows were),
       `"sequence"` (the points of a sequence that spreads them), `"coverage"` and `"learned"` (a
       search that goes where coverage grows, or where failures are); empty in a record that does
@@ -470,138 +447,10 @@ class Run(InNotebook):
         **Raises:** `FolderInUse` where another process writes there; `ValueError` where it is the
         run's own folder, and somebody has gone on with the run there.
         """
-        folder = Path(path)
-        folder.mkdir(parents=True, exist_ok=True)
-        with write_lock(folder):
-            check_not_continued(self, folder)
-            table = self.table.save(folder)
-            checksum = write_record(self, folder)
-            if self.checkpoint:
-                rows = table.digest(int(self.checkpoint["rows"]))
-                write_checkpoint(self.checkpoint, folder, rows, checksum)
-        return folder
+        return lazy_import("verifai_jax.falsification.run_folder", "save_run")(self, Path(path))
 
     def _notebook_parts(self) -> Iterator[str]:
         yield from self.table._notebook_parts()
 
     def __repr__(self) -> str:
         return self.summary()
-
-
-def write_record(run: Run, folder: Path) -> int:
-    """Write everything about a run but its table to `run.json`; return its checksum."""
-    record = {"format": FORMAT, "features": list(run.table.features)}
-    for name in RECORDED:
-        record[name] = getattr(run, name)
-    record = sealed(json.loads(json.dumps(record)))
-    partial = folder / f"{RECORD}.part"
-    partial.write_text(json.dumps(record, indent=2) + "\n")
-    partial.replace(folder / RECORD)
-    return record_checksum(record)
-
-
-def check_not_continued(run: Run, folder: Path) -> None:
-    """Refuse to write a run over its own folder where that has become longer, or another run's.
-
-    **Raises:** `ValueError`.
-    """
-    if run.folder is None or folder.absolute() != run.folder.absolute():
-        return
-    if not (folder / RECORD).exists():
-        return
-    record = read_record(folder)
-    own = {name: getattr(run, name) for name in DECIDING if name != "features"}
-    own["features"] = list(run.table.features)
-    remedy = "load it, vj.load(folder, problem), or save this one elsewhere, run.save(folder)"
-    if record_checksum(record) != record_checksum(json.loads(json.dumps(own))):
-        raise ValueError(f"{folder} holds another run by now, of {record['name']!r}; {remedy}")
-    rows = ErrorTable.count_rows(folder)
-    if rows > run.simulations:
-        raise ValueError(
-            f"somebody has gone on with the run in {folder}: it has {rows} simulations by now, "
-            f"this one {run.simulations}; {remedy}"
-        )
-
-
-ANEW = "begin anew, from what it has found: vj.falsify(problem, warm_start=run)"
-"""How to go on with a run that cannot be resumed."""
-
-
-def load(path: str | Path, problem: Problem | None = None) -> Run:
-    """Read a run back from its folder, also one that was cut off.
-
-    - `problem`: needed to replay rows; a file names no code to run.
-
-    Of a run whose checkpoint is damaged the table is there; its `damage` says what is not.
-
-    **Raises:** `FileNotFoundError` for a folder without a run; `ValueError` for a record or a table
-    that is damaged, a record of another format, or a problem whose name, formulas or features
-    differ from the recorded ones.
-    """
-    folder = Path(path)
-    record = read_record(folder)
-    features = tuple(record["features"])
-    if problem is not None:
-        problem = as_simulated(problem, record)
-        texts = {name: str(formula) for name, formula in problem.formulas.items()}
-        for what, recorded, given in (
-            ("name", record["name"], problem.name),
-            ("formulas", record["formulas"], texts),
-            ("features", features, tuple(problem.space.columns)),
-        ):
-            if recorded != given:
-                raise ValueError(
-                    f"the run in {folder} is of another problem: its {what} is "
-                    f"{one_line(repr(recorded))}, "
-                    f"the given one's {given!r}"
-                )
-        if record.get("backend") is not None:
-            problem = problem.on_backend(record["backend"])
-    begun = ErrorTable.exists(folder) or record["stopped"] != "running"
-    # A run that was cut off before its first batch came to the disk has no rows yet.
-    table = ErrorTable(features)
-    if begun:
-        table = ErrorTable.load(folder, features, numeric_features(record))
-    damage, checkpoint = [table.damage] if table.damage else [], None
-    try:
-        checkpoint = read_checkpoint(folder)
-    except CheckpointError as error:
-        damage.append(f"{error}; its rows are there all the same: {ANEW}")
-    seen = int(checkpoint["rows"]) if checkpoint else 0
-    if checkpoint and checkpoint[RECORD_CHECKSUM] != record_checksum(record):
-        damage.append(
-            f"{folder / RECORD} is not the one that {STATE} was written with: the run's search, "
-            f"seed, options or formulas have changed; {ANEW}"
-        )
-    if seen > len(table):
-        damage.append(
-            f"its search had seen {seen} simulations, of which its table has {len(table)}; files "
-            f"of {folder} are missing or damaged"
-        )
-    elif checkpoint and not table.missing and checkpoint[ROWS_CHECKSUM] != table.digest(seen):
-        changed = (
-            f"the first {seen} rows of the table in {folder} are not those that its search had "
-            f"seen: they have changed, or are of another run; {ANEW}"
-        )
-        table.distrust(changed)
-        damage.append(changed)
-    elif not len(table) and record["stopped"] != "running" and not (folder / FINISHED).exists():
-        damage = damage or [f"{folder / TAIL} is damaged: it has no row that can be read"]
-    elif checkpoint is None and not damage and len(table) and record["stopped"] != "running":
-        damage.append(f"{folder / STATE} is missing, which says what its rows are; {ANEW}")
-    run = Run(
-        table=table,
-        folder=folder,
-        problem=problem,
-        checkpoint=checkpoint,
-        damage="; ".join(damage),
-        **{name: record[name] for name in RECORDED},
-    )
-    return as_made(run)
-
-
-def as_made(run: Run) -> Run:
-    """Return a run as the verb that made it does: one of `fuzz` has its coverage."""
-    if run.derived is None:
-        return run
-    return lazy_import("verifai_jax.fuzzing.run", "as_fuzz_run")(run)

@@ -26,11 +26,13 @@ from verifai_jax.core.user_errors import explain_user_error, format_user_error
 from verifai_jax.evaluation.backends import Choice
 from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
 from verifai_jax.falsification.origin import origin_of
-from verifai_jax.falsification.run import Run, write_record
+from verifai_jax.falsification.run import Run
+from verifai_jax.falsification.run_folder import write_record
 from verifai_jax.falsification.silent_mistakes import cut_short_note, nominal_note, notes_after
 from verifai_jax.falsification.summary import first_message
-from verifai_jax.falsification.validation import space_as_data, writing
+from verifai_jax.falsification.validation import space_as_data
 from verifai_jax.search import Search
+from verifai_jax.store.locks import writing
 
 if TYPE_CHECKING:
     from verifai_jax.statistics.stopping import StoppingRule

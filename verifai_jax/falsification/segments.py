@@ -11,7 +11,6 @@ folder as one table.
 """
 
 import re
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from jaxtyping import Int
 
 from verifai_jax.core.text import format_error, printable
 from verifai_jax.falsification.columns import ROW, Columns, column_to_arrow
+from verifai_jax.store.files import DamagedError, checksum, write_complete
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,14 +34,16 @@ SEGMENTS = "table"
 FAILURES = "failures"
 """Name of the folder of the rows that stand out."""
 _NAME = re.compile(r"rows-(\d{12})-(\d{12})-([0-9a-f]{8})\.parquet")
-_BLOCK = 1 << 20
+MAX_ROWS = 10**12 - 1
+"""The greatest number that a row can have: names of segments have twelve digits."""
 
 
-class TableError(ValueError):
+class TableError(DamagedError):
     """An error for a table on disk that is damaged."""
 
 
-def _damaged(path: Path, error: Exception) -> TableError:
+def damaged(path: Path, error: Exception) -> TableError:
+    """Return the error for a file that a library cannot read, for whatever reason."""
     return TableError(f"{path} is damaged: {printable(format_error(error), 300)}")
 
 
@@ -60,13 +62,10 @@ class Segment:
     def damage(self) -> str:
         """Say what has become of the file; empty if it is as it was written."""
         try:
-            checksum = 0
-            with open(self.path, "rb") as file:
-                while block := file.read(_BLOCK):
-                    checksum = zlib.crc32(block, checksum)
+            own = checksum(self.path.read_bytes())
         except OSError as error:
             return printable(format_error(error), 300)
-        return "" if self._is_of(checksum) else "its bytes have changed"
+        return "" if self._is_of(own) else "its bytes have changed"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -79,9 +78,7 @@ class Segment:
         try:
             return tuple(name for name in pq.read_schema(self.path).names if name != ROW)
         except Exception as error:
-            raise TableError(
-                f"{self.path} is damaged: {printable(format_error(error), 300)}"
-            ) from error
+            raise damaged(self.path, error) from error
 
     def read(self, columns: Sequence[str] | None = None) -> "pd.DataFrame":
         """Return its rows, or some columns of them, indexed by row number.
@@ -93,7 +90,7 @@ class Segment:
 
         try:
             content = self.path.read_bytes()
-            if not self._is_of(zlib.crc32(content)):
+            if not self._is_of(checksum(content)):
                 raise TableError(f"{self.path} is damaged: its bytes have changed")
             names = None if columns is None else [ROW, *columns]
             return pq.read_table(pa.BufferReader(content), columns=names).to_pandas()
@@ -102,9 +99,7 @@ class Segment:
         except FileNotFoundError as error:
             raise TableError(f"{self.path} is gone; was the run's folder moved?") from error
         except Exception as error:  # Whoever wrote the file, it is none of ours.
-            raise TableError(
-                f"{self.path} is damaged: {printable(format_error(error), 300)}"
-            ) from error
+            raise damaged(self.path, error) from error
 
     def read_standing_out(self) -> "pd.DataFrame":
         """Return those of its rows that stand out, from their own file where it is whole."""
@@ -115,8 +110,8 @@ class Segment:
         frame = self.read()
         return frame.iloc[standing_out({str(name): frame[name].to_numpy() for name in frame})]
 
-    def _is_of(self, checksum: int) -> bool:
-        return self.path.name.endswith(f"-{checksum:08x}.parquet")
+    def _is_of(self, own: int) -> bool:
+        return self.path.name.endswith(f"-{own:08x}.parquet")
 
 
 def standing_out(columns: Columns) -> Int[np.ndarray, " k"]:
@@ -147,22 +142,8 @@ def write_segment(run: Path, first: int, columns: Columns) -> Segment:
 
 def _write(folder: Path, first: int, stop: int, content: "pa.Buffer") -> Path:
     folder.mkdir(exist_ok=True)
-    return write_complete(
-        folder / f"rows-{first:012d}-{stop:012d}-{zlib.crc32(content):08x}.parquet", content
-    )
-
-
-def write_complete(path: Path, content: "pa.Buffer | bytes") -> Path:
-    """Write a file such that a reader never meets a half of it; return its path."""
-    partial = path.with_name(f".{path.name}.part")  # Readers of a folder leave it out.
-    try:
-        with open(partial, "wb") as file:
-            file.write(content)
-        partial.replace(path)
-    except OSError:
-        partial.unlink(missing_ok=True)  # What little room there is, others need.
-        raise
-    return path
+    name = f"rows-{first:012d}-{stop:012d}-{checksum(content):08x}.parquet"
+    return write_complete(folder / name, content)
 
 
 def parquet(columns: Columns, rows: Int[np.ndarray, " n"]) -> "pa.Buffer":

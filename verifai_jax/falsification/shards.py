@@ -4,16 +4,13 @@
     merge(sorted(Path("parts").iterdir()), problem, folder="runs/merged")
 
 For searches that do not learn: their points depend on the seed and their number alone, so every
-job can tell its own. What it simulates lies in files of a few thousand rows, each with a checksum
-in its name; a job that was killed goes on where it was. Merging is the run itself, which takes from
-the files what it would have simulated: its table, its confirmations and its record are those of one
-machine.
+job can tell its own. What it simulates lies in a log, in blocks of a few thousand rows; a job that
+was killed goes on where it was. Merging is the run itself, which takes from the logs what it would
+have simulated: its table, its confirmations and its record are those of one machine.
 """
 
-import io
 import json
 import re
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -29,10 +26,8 @@ from verifai_jax import search as searches
 from verifai_jax.core.checks import check_count, check_options
 from verifai_jax.core.devices import describe_processor
 from verifai_jax.core.keys import run_keys
-from verifai_jax.core.locks import LOCK
 from verifai_jax.core.precision import reproducible_settings
 from verifai_jax.core.progress import SimulationProgress
-from verifai_jax.core.seals import is_intact, sealed
 from verifai_jax.core.sources import Sources, list_changes
 from verifai_jax.core.text import one_line
 from verifai_jax.evaluation.backends import resolved
@@ -43,21 +38,22 @@ from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.evaluation.worker import ARRAYS, evaluate_block
 from verifai_jax.falsification._falsify import falsify
 from verifai_jax.falsification.run import Run
-from verifai_jax.falsification.segments import write_complete
 from verifai_jax.falsification.validation import (
     adapt_search,
     check_search,
-    locked,
     usual_batch,
-    writing,
 )
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.search.proposals import Proposals
+from verifai_jax.store.files import DamagedError
+from verifai_jax.store.locks import LOCK, write_lock, writing
+from verifai_jax.store.log import Log
 
-RECORD = "shard.json"
-"""Name of the file that says which run, and which part of it."""
-_BLOCK = re.compile(r"block-(\d{12})-(\d{12})-([0-9a-f]{8})\.npz")
+SHARD = "shard.rows"
+"""Name of the log in the folder of a part: which run and which part of it, and blocks of rows."""
+_ABOUT = "about"
+"""Entry that says which run, and which part of it; others are blocks, named by their rows."""
 _OPTIONS = (
     "name", "formulas", "features", "search", "budget", "batch", "seed", "precision", "backend",
     "confirm", "target",
@@ -166,12 +162,11 @@ def simulate_shard(
         "shard": [shard.number, shard.of],
         "sources": problem.sources().to_json(),
     }
-    with writing(path):
-        path.mkdir(parents=True, exist_ok=True)
-    with locked(path):
-        _claim(path, record)
+    with write_lock(path):
+        log = Log(path / SHARD)
+        _claim(log, record)
         rows = shard.rows(budget, _unit(problem, batch))
-        _simulate(problem, search, rows, record, path, progress, str(shard))
+        _simulate(problem, search, rows, record, log, progress, str(shard))
     return len(rows)
 
 
@@ -186,21 +181,16 @@ def _simulate(
     search: Search,
     rows: range,
     record: Mapping[str, Any],
-    folder: Path,
+    log: Log,
     progress: bool | None,
     shard: str,
 ) -> None:
-    """Simulate these rows, but for those whose files are there already."""
+    """Simulate these rows, but for those that are in the log already."""
     batch, budget = record["batch"], record["budget"]
     evaluate = Evaluator(problem, batch, precision=record["precision"], seed=record["seed"])
     key, space = run_keys(record["seed"])[0], problem.space
     proposals = Proposals(search, space.cube, batch, key, space.constraint, 0)
-    done = set()
-    for block, path in list(_blocks(folder)):
-        if _is_complete(path):
-            done.add((block.start, block.stop))
-        else:
-            path.unlink()  # It is made anew.
+    done = {name for name, _ in log.entries()}
     first = simulated = found = 0
     best = float("nan")
     with SimulationProgress(f"{problem.name} {shard}", len(rows), progress) as bar:
@@ -208,10 +198,10 @@ def _simulate(
             points = proposals.next(min(batch, budget - first))
             begin, stop = max(first, rows.start), min(first + len(points), rows.stop)
             if begin < stop:
-                if (begin, stop) not in done:
+                if f"{begin}-{stop}" not in done:
                     u = np.asarray(points, np.float32)[begin - first : stop - first]
                     verdicts = evaluate(u, first=begin)
-                    _write(folder, begin, u, verdicts)
+                    _write(log, begin, u, verdicts)
                     found += int(verdicts.violated.sum())
                     best = float(np.fmin(best, np.fmin.reduce(verdicts.lowest)))
                 simulated += stop - begin
@@ -219,23 +209,25 @@ def _simulate(
             first += len(points)
 
 
-def _claim(folder: Path, record: Mapping[str, Any]) -> None:
+def _claim(log: Log, record: Mapping[str, Any]) -> None:
     """Write the record of a part, or refuse the folder of another one."""
-    if (folder / RECORD).exists():
-        known = read_shard(folder)
-        for name, value in json.loads(json.dumps(record)).items():
-            if name == "sources":
-                _check_same_model(folder, known, Sources.from_json(value))
-            elif known[name] != value:
-                raise ValueError(
-                    f"{folder} holds another part: its {name} is {one_line(str(known[name]))}, "
-                    f"here {one_line(str(value))}; give another folder"
-                )
+    assert log.path is not None
+    path = log.path.parent
+    if not log.names():
+        if {path.name for path in path.iterdir()} - {LOCK, SHARD}:
+            raise ValueError(f"folder {str(path)!r} is not empty; a part of a run needs a new one")
+        with writing(path):
+            log.put_json(_ABOUT, record)
         return
-    if {path.name for path in folder.iterdir()} - {LOCK}:
-        raise ValueError(f"folder {str(folder)!r} is not empty; a part of a run needs a new one")
-    with writing(folder):
-        write_complete(folder / RECORD, json.dumps(sealed(record), indent=2).encode())
+    known = read_shard(path)
+    for name, value in json.loads(json.dumps(record)).items():
+        if name == "sources":
+            _check_same_model(path, known, Sources.from_json(value))
+        elif known.get(name) != value:
+            raise ValueError(
+                f"{path} holds another part: its {name} is {one_line(str(known.get(name)))}, "
+                f"here {one_line(str(value))}; give another folder"
+            )
 
 
 def _check_same_model(folder: Path, record: Mapping[str, Any], now: Sources) -> None:
@@ -243,7 +235,7 @@ def _check_same_model(folder: Path, record: Mapping[str, Any], now: Sources) -> 
 
     **Raises:** `ValueError`.
     """
-    if "sources" in record and (changes := Sources.from_json(record["sources"]).changes(now)):
+    if changes := Sources.from_json(record["sources"]).changes(now):
         raise ValueError(
             f"the model has changed since the part in {folder} was simulated: "
             f"{list_changes(changes)}. Restore the files, or simulate the part again in a new "
@@ -254,24 +246,23 @@ def _check_same_model(folder: Path, record: Mapping[str, Any], now: Sources) -> 
 def read_shard(folder: Path) -> dict[str, Any]:
     """Read the record of a part of a run.
 
-    **Raises:** `FileNotFoundError` where there is none; `ValueError` for one that is damaged.
+    **Raises:** `FileNotFoundError` where there is none; `DamagedError` for one that is damaged.
     """
-    file = folder / RECORD
+    file = folder / SHARD
     if not file.is_file():
         raise FileNotFoundError(
-            f"no part of a run in {folder}: it has no {RECORD}; give folders that "
+            f"no part of a run in {folder}: it has no {SHARD}; give folders that "
             "verifai-jax falsify --shard has written"
         )
-    try:
-        record = json.loads(file.read_text())
-    except ValueError as error:
-        raise ValueError(f"{file} is damaged: it is not JSON") from error
-    if not isinstance(record, dict) or not is_intact(record):
-        raise ValueError(f"{file} is damaged: its content has changed since it was written")
-    return record
+    if (about := Log(file).get_json(_ABOUT)) is None:
+        raise DamagedError(
+            f"{file} is damaged: it does not say which part of a run it is; simulate the part "
+            "again in a new folder"
+        )
+    return about
 
 
-def _write(folder: Path, first: int, u: Float[np.ndarray, "n d"], verdicts: Verdicts) -> None:
+def _write(log: Log, first: int, u: Float[np.ndarray, "n d"], verdicts: Verdicts) -> None:
     arrays: dict[str, Any] = {"u": u, "processor": np.array(describe_processor())}
     for name in ARRAYS:
         if (value := getattr(verdicts, name)) is not None:
@@ -280,74 +271,55 @@ def _write(folder: Path, first: int, u: Float[np.ndarray, "n d"], verdicts: Verd
         arrays[f"leaf{i}"] = np.asarray(leaf)
     if verdicts.messages is not None:
         arrays["messages"] = np.array(verdicts.messages, dtype=str)
-    content = io.BytesIO()
-    np.savez(content, **arrays)
-    data = content.getvalue()
-    stop = first + len(u)
-    with writing(folder):
-        write_complete(folder / f"block-{first:012d}-{stop:012d}-{zlib.crc32(data):08x}.npz", data)
+    assert log.path is not None
+    with writing(log.path.parent):
+        log.put({f"{first}-{first + len(u)}": arrays})
 
 
-def _blocks(folder: Path) -> Iterator[tuple[range, Path]]:
-    for path in sorted(folder.iterdir()):
-        if (match := _BLOCK.fullmatch(path.name)) is not None:
-            yield range(int(match[1]), int(match[2])), path
-
-
-def _is_complete(path: Path) -> bool:
-    return path.name.endswith(f"-{zlib.crc32(path.read_bytes()):08x}.npz")
+def _blocks(log: Log) -> Iterator[tuple[range, Log, str]]:
+    """Yield the rows of each block, its log, and its name there."""
+    for name in log.names():
+        if match := re.fullmatch(r"(\d+)-(\d+)", name):
+            yield range(int(match[1]), int(match[2])), log, name
 
 
 @lru_cache(maxsize=4)
-def _read(path: Path) -> dict[str, np.ndarray]:
-    data = path.read_bytes()
-    if not path.name.endswith(f"-{zlib.crc32(data):08x}.npz"):
-        raise ValueError(
-            f"{path} is damaged: its bytes have changed; run its part again, which makes it anew"
-        )
-    with np.load(io.BytesIO(data), allow_pickle=False) as stored:
-        return {name: stored[name] for name in stored.files}
+def _read(log: Log, name: str) -> dict[str, np.ndarray] | None:
+    return log.get(name)
 
 
 class _StoredRows:
-    """An executor that has simulated already: what a run asks for is in the files of the parts."""
+    """An executor that has simulated already: what a run asks for is in the logs of the parts."""
 
     _max_workers = 1
 
-    def __init__(self, blocks: Sequence[tuple[range, Path]]) -> None:
+    def __init__(self, blocks: Sequence[tuple[range, Log, str]]) -> None:
         self._blocks = sorted(blocks, key=lambda block: (block[0].start, block[0].stop))
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any) -> "Future[dict[str, Any]]":
-        """Return a future with the stored rows in place of those that `function` would simulate.
+        """Return a future with the stored rows in path of those that `function` would simulate.
 
         Rows that are replayed before they are claimed are simulated here.
         """
         future: Future[dict[str, Any]] = Future()
-        if function is not evaluate_block:
-            try:
-                future.set_result(function(*arguments))
-            except Exception as error:
-                future.set_exception(error)
-            return future
-        first, u = arguments[3], arguments[4]
         try:
-            parts = list(self._parts(first, u))
-        except _OtherPointsError:
-            if len(u) > 1:
-                future.set_exception(
-                    ValueError(
-                        f"rows {first} to {first + len(u) - 1} of the parts are not at the points "
-                        "of this search: they are of another version of the problem or of "
-                        "verifai_jax"
-                    )
-                )
-                return future
-            # The nominal features, which are simulated in addition to the rows.
-            future.set_result(function(*arguments))
-            return future
+            stored = self._stored(*arguments[3:5]) if function is evaluate_block else None
+            future.set_result(function(*arguments) if stored is None else stored)
         except Exception as error:
             future.set_exception(error)
-            return future
+        return future
+
+    def _stored(self, first: int, u: np.ndarray) -> dict[str, Any] | None:
+        """Return stored rows as `evaluate_block` does; None for one at another point."""
+        try:
+            parts = list(self._parts(first, u))
+        except _OtherPointsError as error:
+            if len(u) == 1:
+                return None  # The nominal features, which are simulated in addition to the rows.
+            raise ValueError(
+                f"rows {first} to {first + len(u) - 1} of the parts are not at the points of this "
+                "search: they are of another version of the problem or of verifai_jax"
+            ) from error
         result: dict[str, Any] = {
             name: np.concatenate([part[name] for part in parts])
             for name in ARRAYS
@@ -361,15 +333,15 @@ class _StoredRows:
         result["messages"] = messages if "messages" in parts[0] else None
         others = {str(part["processor"]) for part in parts} - {describe_processor()}
         processor = min(others, default=describe_processor())
-        future.set_result(result | {"seconds": 0.0, "notes": (), "processor": processor})
-        return future
+        return result | {"seconds": 0.0, "notes": (), "processor": processor}
 
     def _parts(self, first: int, u: np.ndarray) -> Iterator[dict[str, np.ndarray]]:
         at = first
-        for rows, path in self._blocks:
+        for rows, log, name in self._blocks:
             if rows.stop <= at or rows.start > at or at >= first + len(u):
                 continue
-            stored = _read(path)
+            if (stored := _read(log, name)) is None:
+                continue
             stop = min(rows.stop, first + len(u))
             cut = slice(at - rows.start, stop - rows.start)
             if not np.array_equal(stored["u"][cut], u[at - first : stop - first]):
@@ -379,7 +351,9 @@ class _StoredRows:
             }
             at = stop
         if at < first + len(u):
-            raise ValueError(f"row {at} is in none of the parts: one is not finished")
+            raise ValueError(
+                f"row {at} is in none of the parts: one is not finished, or damaged; run it again"
+            )
 
 
 class _OtherPointsError(Exception):
@@ -437,7 +411,7 @@ def merge(
     now = problem.sources()
     for path, record in zip(paths, records, strict=True):
         _check_same_model(path, record, now)
-    stored = _StoredRows([block for path in paths for block in _blocks(path)])
+    stored = _StoredRows([block for path in paths for block in _blocks(Log(path / SHARD))])
     return falsify(
         problem,
         searches.from_json(first["search"]),

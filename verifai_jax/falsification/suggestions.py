@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.locks import returning_once
+from verifai_jax.core.forks import returning_once
 from verifai_jax.core.text import format_error, one_line
 from verifai_jax.features.given import given_features, given_rows
 from verifai_jax.problem.problem import Problem

@@ -1,7 +1,7 @@
 """Checks of the options of `falsify` and `resume`, before anything compiles."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -10,15 +10,16 @@ from jaxtyping import Float
 
 from verifai_jax import search as searches
 from verifai_jax.core.errors import check_names
-from verifai_jax.core.locks import LOCK, write_lock
 from verifai_jax.core.text import format_error, one_line
-from verifai_jax.falsification.run import RECORD, Run
+from verifai_jax.falsification.run import Run
+from verifai_jax.falsification.run_folder import RECORD
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.features.given import Rows, check_columns, given_features, given_rows
 from verifai_jax.problem.dependence import has_gradient, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.search.contract import check_contract
+from verifai_jax.store.locks import LOCK, write_lock
 from verifai_jax.systems.base import System
 
 if TYPE_CHECKING:
@@ -26,18 +27,6 @@ if TYPE_CHECKING:
 
     from verifai_jax.core.executors import Executor
     from verifai_jax.statistics.stopping import StoppingRule
-
-
-@contextmanager
-def writing(folder: Path | None) -> Iterator[None]:
-    """Turn what a file system refuses into one line that says what to do."""
-    try:
-        yield
-    except OSError as error:
-        raise ValueError(
-            f"folder {str(folder)!r} cannot be written ({error.strerror or error}); give one that "
-            "can be, or none to keep the run in memory"
-        ) from error
 
 
 MAX_AT_ONCE = 32_768
@@ -381,20 +370,6 @@ def earlier_rows(warm_start: object, problem: Problem) -> "pd.DataFrame | None":
 
 
 @contextmanager
-def locked(folder: Path | None) -> Iterator[None]:
-    """Be the only one who writes to the folder of a run.
-
-    **Raises:** `FolderInUse` where another process does, `ValueError` where it cannot be written.
-    """
-    with ExitStack() as held:
-        with writing(folder):
-            if folder is not None:
-                folder.mkdir(parents=True, exist_ok=True)
-            held.enter_context(write_lock(folder))
-        yield
-
-
-@contextmanager
 def new_folder(folder: str | Path | None) -> Iterator[Path | None]:
     """Make the folder for a new run, and be the only one who writes to it.
 
@@ -403,17 +378,17 @@ def new_folder(folder: str | Path | None) -> Iterator[Path | None]:
     if folder is None:
         yield None
         return
-    path = Path(folder)
-    if not (path / LOCK).exists():  # The lock says who writes there.
-        _check_empty(path)
-    with locked(path):
-        _check_empty(path)  # Another run may have begun in it, and ended, since.
-        yield path
+    folder = Path(folder)
+    if not (folder / LOCK).exists():  # The lock says who writes there.
+        _check_empty(folder)
+    with write_lock(folder):
+        _check_empty(folder)  # Another run may have begun in it, and ended, since.
+        yield folder
 
 
 def _check_empty(folder: Path) -> None:
     # A process that dies before its first record leaves a part of one.
-    leftover = {f"{RECORD}.part", LOCK}
+    leftover = {f".{RECORD}.part", LOCK}
     if folder.exists() and (not folder.is_dir() or {p.name for p in folder.iterdir()} - leftover):
         if (folder / RECORD).is_file():
             raise ValueError(

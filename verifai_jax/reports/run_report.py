@@ -5,8 +5,10 @@ from dataclasses import dataclass
 from verifai_jax.core.text import format_features
 from verifai_jax.evaluation.confirmations import UNDECIDED, describe_checks
 from verifai_jax.falsification.no_rate import why_no_rate
-from verifai_jax.falsification.record import RECORD
 from verifai_jax.falsification.run import Run
+from verifai_jax.falsification.run_folder import RECORD, STATE
+from verifai_jax.falsification.table import FINISHED
+from verifai_jax.falsification.tail import TAIL
 from verifai_jax.mtl import parse
 from verifai_jax.mtl.english import formula_words
 from verifai_jax.reports.claims import Claim, claims_json
@@ -44,10 +46,10 @@ from verifai_jax.reports.view import view_data
 
 FILES = (
     (RECORD, "the record of the run"),
-    ("table.parquet", "the table"),
+    (FINISHED, "the table"),
     ("table/*", "a part of the table"),
-    ("table.arrows", "the tail of the table"),
-    ("search.npz", "the state of the search"),
+    (TAIL, "the tail of the table"),
+    (STATE, "the state of the search"),
 )
 """Files of a run, and what they are."""
 ENDED = {

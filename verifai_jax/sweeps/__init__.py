@@ -4,7 +4,7 @@ sweep = vj.sweep(study, configurations=64, folder="sweeps/mine")
 sweep.best, sweep.safe, sweep.importance()
 """
 
-from verifai_jax.core.cache import CacheError as CacheError
+from verifai_jax.store.cache import CacheError as CacheError
 from verifai_jax.sweeps._sweep import sweep as sweep
 from verifai_jax.sweeps.curves import curve_robustness as curve_robustness
 from verifai_jax.sweeps.halving import Halving as Halving

@@ -19,13 +19,14 @@ from verifai_jax._version import __version__
 from verifai_jax.certification._certify import certify
 from verifai_jax.certification.attack import check_attack
 from verifai_jax.certification.result import Certificate, Certificates
-from verifai_jax.core.cache import Arrays, Cache, locked_cache
 from verifai_jax.core.callbacks import Callback, check_callbacks, notify
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.executors import Executor
 from verifai_jax.rl._evaluate import EPISODES, batched_mean_returns
 from verifai_jax.rl.policy import Policy
 from verifai_jax.search import Search
+from verifai_jax.store.cache import Cache, locked_cache
+from verifai_jax.store.log import Arrays
 from verifai_jax.sweeps.clock import CERTIFYING, TRAINING, Clock, OutOfTime
 from verifai_jax.sweeps.fingerprint import digest, fingerprint
 from verifai_jax.sweeps.halving import SAFETY, Halving
@@ -96,7 +97,7 @@ def sweep(
     - `halving`: stop all but the best configurations at each checkpoint.
     - `batch`: configurations in a round of a search that learns.
     - `episodes`: episodes whose mean is the nominal return.
-    - `folder`: a folder, or a `.sqlite` file, that caches finished work; the folder of an
+    - `folder`: caches finished work; the folder of an
       interrupted sweep resumes it.
     - `max_seconds`: wall-clock limit; no training begins after two thirds of it.
     - `progress`: True draws progress bars, False none; None draws them on a terminal and in a
@@ -152,8 +153,7 @@ def sweep(
         # Its proposals depend on both.
         options |= {"configurations": configurations, "batch": proposer.batch}
     with (
-        locked_cache(folder),
-        Cache(folder) as cache,
+        locked_cache(folder) as cache,
         Clock(study.name, max_seconds, progress) as clock,
     ):
         sources = cache.claim(fingerprint(study, options), study.sources(), even_if_changed)

@@ -13,19 +13,19 @@ caller.
 
 import json
 import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from verifai_jax.core.locks import write_lock
-from verifai_jax.core.seals import is_intact, sealed
 from verifai_jax.core.sources import Sources
 from verifai_jax.core.text import one_line
 from verifai_jax.features import FeatureSpace
 from verifai_jax.rl.policy import Policy, load_policy, save_policy
+from verifai_jax.store import files
+from verifai_jax.store.files import DamagedError, checksum, plain
+from verifai_jax.store.locks import write_lock
 from verifai_jax.sweeps.record import Curve, SweepRecord
 
 if TYPE_CHECKING:
@@ -41,8 +41,6 @@ CURVES = "curves.npz"
 """File of the learning curves."""
 POLICIES = "policies"
 """Folder of the policies."""
-FORMAT = 3
-"""Format of the files; another one is refused."""
 _PLAIN = ("study", "seed", "hyperparameters", "certified", "options", "version", "seconds")
 """Fields of the record that are plain data."""
 
@@ -79,7 +77,6 @@ def write_sweep(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> Pat
 
     **Raises:** `FolderInUse` where another process writes it.
     """
-    (folder / POLICIES).mkdir(parents=True, exist_ok=True)
     with write_lock(folder):
         _write_files(stored, table, folder)
     return folder
@@ -89,10 +86,11 @@ def _write_files(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> No
     record = stored.record
     # The record is written last: a folder without it holds no sweep.
     (folder / RECORD).unlink(missing_ok=True)
+    (folder / POLICIES).mkdir(exist_ok=True)
     for old in (folder / POLICIES).glob("*.npz"):
         old.unlink()
     mixed = _mixed_columns(table)
-    texts = {name: [json.dumps(_plain(v)) for v in table[name]] for name in mixed}
+    texts = {name: [json.dumps(plain(v)) for v in table[name]] for name in mixed}
     table.assign(**texts).to_parquet(folder / TABLE)
     for i, policy in enumerate(record.policies):
         if policy is not None:
@@ -105,24 +103,21 @@ def _write_files(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> No
         arrays[f"{configuration}/{seed}/steps"] = np.asarray(curve.steps)
         arrays[f"{configuration}/{seed}/mean_return"] = np.asarray(curve.mean_return)
     np.savez_compressed(folder / CURVES, **arrays)  # pyright: ignore[reportArgumentType]
-    data = {name: _plain(getattr(record, name)) for name in _PLAIN}
+    data = {name: getattr(record, name) for name in _PLAIN}
     data |= {
-        "format": FORMAT,
         "complete": record.complete,
         "rows": record.rows,
         "sources": list(record.sources),
-        "used": _plain(stored.used),
+        "used": stored.used,
         "mixed": mixed,
-        "worst": _plain(record.worst),
+        "worst": record.worst,
         "space": _space_to_json(stored.space),
         "checksums": {
-            file.relative_to(folder).as_posix(): zlib.crc32(file.read_bytes())
+            file.relative_to(folder).as_posix(): checksum(file.read_bytes())
             for file in _files(folder, record.rows)
         },
     }
-    partial = folder / f"{RECORD}.part"
-    partial.write_text(json.dumps(sealed(data), indent=2) + "\n")
-    partial.replace(folder / RECORD)
+    files.write_record(folder / RECORD, plain(data))
 
 
 def _files(folder: Path, rows: int) -> list[Path]:
@@ -135,24 +130,15 @@ def read_description(folder: Path) -> dict[str, Any]:
     """Read the record's file of a folder.
 
     **Raises:** `FileNotFoundError` for a folder without a sweep; `SweepFileError` for a damaged
-    file, or one of another format.
+    file.
     """
     file = folder / RECORD
     if not file.exists():
         raise FileNotFoundError(f"no sweep in {folder}: {RECORD} is missing")
     try:
-        data = json.loads(file.read_text())
-    except (ValueError, RecursionError, IsADirectoryError) as error:
-        raise SweepFileError(f"{file} is damaged: {one_line(str(error))}") from error
-    form = data.get("format") if isinstance(data, dict) else None
-    if form != FORMAT:
-        raise SweepFileError(
-            f"{file} has format {form!r}, and this verifai_jax reads format {FORMAT}; "
-            "read it with the version that wrote it"
-        )
-    if not is_intact(data):
-        raise SweepFileError(f"{file} is damaged: its content has changed since it was written")
-    return data
+        return files.read_record(file)
+    except DamagedError as error:
+        raise SweepFileError(str(error)) from error
 
 
 def check_study(
@@ -187,7 +173,7 @@ def read_sweep(description: Mapping[str, Any], folder: Path) -> StoredSweep:
 
     try:
         _check_files(folder, description["checksums"])
-        used = {name: tuple(names) for name, names in description.get("used", {}).items()}
+        used = {name: tuple(names) for name, names in description["used"].items()}
         record, space = _read_record(folder, description), _space_from_json(description["space"])
         return StoredSweep(record, space, used, pd.read_parquet(folder / FAILING))
     except FileNotFoundError as error:
@@ -199,10 +185,10 @@ def read_sweep(description: Mapping[str, Any], folder: Path) -> StoredSweep:
 
 def _check_files(folder: Path, checksums: Mapping[str, int]) -> None:
     """Check that the files are those that were written; a policy may have been removed."""
-    for name, checksum in checksums.items():
+    for name, own in checksums.items():
         file = folder / name
         optional = name.startswith(f"{POLICIES}/")
-        if not (optional and not file.exists()) and zlib.crc32(file.read_bytes()) != checksum:
+        if not (optional and not file.exists()) and checksum(file.read_bytes()) != own:
             hint = "; the rest can be read without this file" if optional else ""
             raise SweepFileError(f"{name} has changed since it was written{hint}")
 
@@ -216,7 +202,7 @@ def _read_record(folder: Path, description: Mapping[str, Any]) -> SweepRecord:
         raise SweepFileError(
             f"the sweep in {folder} is damaged: {len(table)} rows in {TABLE}, {rows} in {RECORD}"
         )
-    for name in description.get("mixed", ()):
+    for name in description["mixed"]:
         table[name] = pd.Series([json.loads(v) for v in table[name]], table.index, dtype=object)
     curves: dict[tuple[int, int], Curve] = {}
     with np.load(folder / CURVES, allow_pickle=False) as arrays:
@@ -238,7 +224,7 @@ def _read_record(folder: Path, description: Mapping[str, Any]) -> SweepRecord:
         complete=bool(description["complete"]),
         hyperparameters=tuple(description["hyperparameters"]),
         certified=tuple(description["certified"]),
-        sources=tuple(Sources.from_json(each).to_json() for each in description.get("sources", ())),
+        sources=tuple(Sources.from_json(each).to_json() for each in description["sources"]),
         **{name: description[name] for name in ("study", "seed", "options", "version", "seconds")},
     )
 
@@ -265,18 +251,3 @@ def _space_from_json(data: Mapping[str, Any] | None) -> FeatureSpace | None:
         return None if data is None else FeatureSpace.from_json({**data, "where": None})
     except ValueError:
         return None
-
-
-def _plain(value: object) -> Any:
-    """Convert NumPy numbers and tuples to what JSON has."""
-    if isinstance(value, Mapping):
-        return {str(name): _plain(entry) for name, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, np.generic):
-        return value.item()
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    return str(value)

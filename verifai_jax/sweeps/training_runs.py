@@ -18,10 +18,11 @@ import jax
 import numpy as np
 from jaxtyping import Array, Key
 
-from verifai_jax.core.cache import Arrays, Cache, CacheError
 from verifai_jax.core.executors import Executor, Shipment, check_executor, gather, ship
 from verifai_jax.rl.batched_training import BatchedTraining, Configuration, policy_structure
 from verifai_jax.rl.policy import Policy
+from verifai_jax.store.cache import Cache, CacheError
+from verifai_jax.store.log import Arrays
 from verifai_jax.sweeps.clock import Clock, OutOfTime
 from verifai_jax.sweeps.fingerprint import digest
 from verifai_jax.sweeps.hyperparameters import Hyperparameters

@@ -15,7 +15,7 @@ import jax
 from jaxtyping import Array, Int, Key, PyTree
 
 from verifai_jax.core.compilation import XlaOptimization
-from verifai_jax.core.locks import returning_once
+from verifai_jax.core.forks import returning_once
 from verifai_jax.core.notebook import ForUsers
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.user_errors import format_user_error

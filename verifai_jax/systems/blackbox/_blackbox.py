@@ -21,8 +21,8 @@ from jaxtyping import Array, Key
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.forks import returning_once
 from verifai_jax.core.gaps import with_gaps
-from verifai_jax.core.locks import returning_once
 from verifai_jax.core.trace import Status, Trace, check_code
 from verifai_jax.systems.base import (
     Features,

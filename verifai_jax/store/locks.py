@@ -23,12 +23,12 @@ except ImportError:
     fcntl = None
 
 LOCK = "writer.lock"
-"""Name of the file in a folder that is being written; `NAME.lock` next to a file NAME that is."""
+"""Name of the file in a folder that is being written."""
 _NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}
 
 
 class FolderInUse(ValueError):
-    """An error for a folder or file that another process is writing."""
+    """An error for a folder that another process is writing."""
 
 
 _held: "weakref.WeakSet[FileIO]" = weakref.WeakSet()
@@ -46,41 +46,35 @@ if hasattr(os, "register_at_fork"):
 
 
 @contextlib.contextmanager
-def returning_once() -> Iterator[None]:
-    """Run code of the user that may fork: only the process that entered continues after it.
+def write_lock(folder: Path | None) -> Iterator[None]:
+    """Be the only one who writes to a folder, which is made; with None, nothing is locked.
 
-    A copy of this process that comes back, as where an `exec` fails, ends without a word: it would
-    answer for its parent, and write into the folder of its parent's run.
+    **Raises:** `FolderInUse`, which names the process that has the lock; `ValueError` for a folder
+    that cannot be written.
     """
-    owner = os.getpid()
+    if folder is None:
+        yield
+        return
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        file, owner = _acquire(folder), os.getpid()
     try:
         yield
     finally:
-        if os.getpid() != owner:
-            os._exit(1)
+        if file is not None and os.getpid() == owner:
+            _release(file, folder / LOCK)
 
 
 @contextlib.contextmanager
-def write_lock(folder: Path | None) -> Iterator[None]:
-    """Be the only one who writes to a place; None is no place.
-
-    **Arguments:**
-
-    - `folder`: a folder that exists, or a file in one.
-
-    **Raises:** `FolderInUse`, which names the process that has the lock; `OSError` where the file
-    of the lock cannot be written.
-    """
-    if folder is None or fcntl is None:
-        yield
-        return
-    path = folder / LOCK if folder.is_dir() else folder.with_name(f"{folder.name}.lock")
-    file, owner = _acquire(path, folder), os.getpid()
+def writing(folder: Path | None) -> Iterator[None]:
+    """Turn what a file system refuses into one line that says what to do."""
     try:
         yield
-    finally:
-        if os.getpid() == owner:
-            _release(file, path)
+    except OSError as error:
+        raise ValueError(
+            f"folder {str(folder)!r} cannot be written ({error.strerror or error}); give one that "
+            "can be, or none to keep the results in memory"
+        ) from error
 
 
 def _release(file: FileIO, path: Path) -> None:
@@ -91,8 +85,10 @@ def _release(file: FileIO, path: Path) -> None:
     file.close()
 
 
-def _acquire(path: Path, folder: Path) -> FileIO:
-    assert fcntl is not None
+def _acquire(folder: Path) -> FileIO | None:
+    path = folder / LOCK
+    if fcntl is None:
+        return None
     while True:
         file = FileIO(path, "r+", opener=_open)
         try:
@@ -129,4 +125,6 @@ def _in_use(folder: Path, owner: str) -> str:
         who = f"this process ({process}) already"
     else:
         who = f"process {process} on {host}"
-    return f"{str(folder)!r} is being written by {who}; wait until that ends, or give another place"
+    return (
+        f"{str(folder)!r} is being written by {who}; wait until that ends, or give another folder"
+    )

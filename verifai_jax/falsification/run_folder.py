@@ -1,0 +1,310 @@
+"""The folder of a run: its record, `run.json`, its table, and the state of its search.
+
+    save_run(run, folder); load(folder, problem)
+    write_record(run, folder)                           # `run.json`, all but the other two
+    write_checkpoint(state, folder, rows, record)       # `search.state`, a log of one entry
+
+With the state stand a checksum of the rows of the table that the search has seen, and one of what
+the record says of the run: none of the three is exchanged for that of another run, or of another
+moment, unnoticed.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from verifai_jax.core.lazy import lazy_import
+from verifai_jax.core.sources import Sources
+from verifai_jax.core.text import one_line
+from verifai_jax.falsification.derived import as_simulated
+from verifai_jax.falsification.run import Run
+from verifai_jax.falsification.segments import SEGMENTS, list_segments
+from verifai_jax.falsification.table import FINISHED, ErrorTable
+from verifai_jax.falsification.tail import TAIL
+from verifai_jax.problem.problem import Problem
+from verifai_jax.store import files
+from verifai_jax.store.files import DamagedError
+from verifai_jax.store.locks import write_lock
+from verifai_jax.store.log import Log, write_log
+
+RECORD = "run.json"
+"""Name of the file with everything about a run but its table and its checkpoint."""
+STATE = "search.state"
+"""Name of the checkpoint in a run's folder."""
+ROWS_CHECKSUM = "rows.checksum"
+"""Array of it with the checksum of the rows that the search has seen, `ErrorTable.digest`."""
+RECORD_CHECKSUM = "record.checksum"
+"""Array of it with that of what the record says of the run, `deciding_checksum`."""
+_ENTRY = "search"
+RECORDED = tuple(
+    field.name
+    for field in fields(Run)
+    if field.name not in ("table", "folder", "problem", "checkpoint", "damage")
+)
+"""Attributes of a run that are entries of its record; `features`, those of its table, is another.
+"""
+DECIDING = (
+    "features",
+    "name",
+    "formulas",
+    "search_data",
+    "seed",
+    "batch",
+    "precision",
+    "backend",
+    "confirm",
+    "prior",
+    "guide",
+)
+"""Entries that decide what the rows of a run are; they stay what they are when it is resumed."""
+
+
+def save_run(run: Run, folder: Path) -> Path:
+    """Write a run to a folder; return the folder.
+
+    **Raises:** as `Run.save`.
+    """
+    with write_lock(folder):
+        check_not_continued(run, folder)
+        table = run.table.save(folder)
+        checksum = write_record(run, folder)
+        if run.checkpoint:
+            rows = table.digest(int(run.checkpoint["rows"]))
+            write_checkpoint(run.checkpoint, folder, rows, checksum)
+    return folder
+
+
+def load(path: str | Path, problem: Problem | None = None) -> Run:
+    """Read a run back from its folder, also one that was cut off.
+
+    - `problem`: needed to replay rows; a file names no code to run.
+
+    Of a run whose checkpoint is damaged the table is there; its `damage` says what is not.
+
+    **Raises:** `FileNotFoundError` for a folder without a run; `ValueError` for a record or a table
+    that is damaged, a record of another version, or a problem whose name, formulas or features
+    differ from the recorded ones.
+    """
+    folder = Path(path)
+    record = read_record(folder)
+    _check_entries(record, folder)
+    features = tuple(record["features"])
+    if problem is not None:
+        problem = as_simulated(problem, record)
+        texts = {name: str(formula) for name, formula in problem.formulas.items()}
+        for what, recorded, given in (
+            ("name", record["name"], problem.name),
+            ("formulas", record["formulas"], texts),
+            ("features", features, tuple(problem.space.columns)),
+        ):
+            if recorded != given:
+                raise ValueError(
+                    f"the run in {folder} is of another problem: its {what} is "
+                    f"{one_line(repr(recorded))}, "
+                    f"the given one's {given!r}"
+                )
+        if record.get("backend") is not None:
+            problem = problem.on_backend(record["backend"])
+    begun = ErrorTable.exists(folder) or record["stopped"] != "running"
+    # A run that was cut off before its first batch came to the disk has no rows yet.
+    table = ErrorTable(features)
+    if begun:
+        table = ErrorTable.load(folder, features, _numeric_features(record))
+    checkpoint, damage = _read_state(folder, record, table)
+    run = Run(
+        table=table,
+        folder=folder,
+        problem=problem,
+        checkpoint=checkpoint,
+        damage="; ".join(damage),
+        **{name: record[name] for name in RECORDED},
+    )
+    return as_made(run)
+
+
+def as_made(run: Run) -> Run:
+    """Return a run as the verb that made it does: one of `fuzz` has its coverage."""
+    return (
+        run if run.derived is None else lazy_import("verifai_jax.fuzzing.run", "as_fuzz_run")(run)
+    )
+
+
+ANEW = "begin anew, from what it has found: vj.falsify(problem, warm_start=run)"
+"""How to go on with a run that cannot be resumed."""
+
+
+def _read_state(
+    folder: Path, record: Mapping[str, Any], table: ErrorTable
+) -> tuple[dict[str, Any] | None, list[str]]:
+    """Return the checkpoint, and what speaks against going on from it."""
+    damage, checkpoint = [table.damage] if table.damage else [], None
+    try:
+        checkpoint = read_checkpoint(folder)
+    except DamagedError as error:
+        damage.append(f"{error}; its rows are there all the same: {ANEW}")
+    seen = int(checkpoint["rows"]) if checkpoint else 0
+    if checkpoint and checkpoint[RECORD_CHECKSUM] != deciding_checksum(record):
+        damage.append(
+            f"{folder / RECORD} is not the one that {STATE} was written with: the run's search, "
+            f"seed, options or formulas have changed; {ANEW}"
+        )
+    if seen > len(table):
+        damage.append(
+            f"its search had seen {seen} simulations, of which its table has {len(table)}; files "
+            f"of {folder} are missing or damaged"
+        )
+    elif checkpoint and not table.missing and checkpoint[ROWS_CHECKSUM] != table.digest(seen):
+        changed = (
+            f"the first {seen} rows of the table in {folder} are not those that its search had "
+            f"seen: they have changed, or are of another run; {ANEW}"
+        )
+        table.distrust(changed)
+        damage.append(changed)
+    elif not len(table) and record["stopped"] != "running" and not (folder / FINISHED).exists():
+        damage = damage or [f"{folder / TAIL} is damaged: it has no row that can be read"]
+    elif checkpoint is None and not damage and len(table) and record["stopped"] != "running":
+        damage.append(f"{folder / STATE} is missing, which says what its rows are; {ANEW}")
+    return checkpoint, damage
+
+
+def check_not_continued(run: Run, folder: Path) -> None:
+    """Refuse to write a run over its own folder where that has become longer, or another run's.
+
+    **Raises:** `ValueError`.
+    """
+    if run.folder is None or folder.absolute() != run.folder.absolute():
+        return
+    if not (folder / RECORD).exists():
+        return
+    record = read_record(folder)
+    remedy = "load it, vj.load(folder, problem), or save this one elsewhere, run.save(folder)"
+    if deciding_checksum(record) != deciding_checksum(_as_record(run)):
+        raise ValueError(f"{folder} holds another run by now, of {record.get('name')!r}; {remedy}")
+    rows = 0
+    if ErrorTable.exists(folder):
+        rows = len(ErrorTable.load(folder, run.table.features))
+    if rows > run.simulations:
+        raise ValueError(
+            f"somebody has gone on with the run in {folder}: it has {rows} simulations by now, "
+            f"this one {run.simulations}; {remedy}"
+        )
+
+
+def write_record(run: Run, folder: Path) -> int:
+    """Write everything about a run but its table to `run.json`; return its checksum."""
+    return deciding_checksum(files.write_record(folder / RECORD, _as_record(run)))
+
+
+def _as_record(run: Run) -> dict[str, Any]:
+    features = {"features": list(run.table.features)}
+    return features | {name: getattr(run, name) for name in RECORDED}
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """Read the record of a run.
+
+    **Raises:** `FileNotFoundError` where there is none; `DamagedError` for one that is damaged.
+    Both say where the rows are, which are none the worse for it.
+    """
+    file = folder / RECORD
+    if not file.is_file():
+        raise FileNotFoundError(f"no run in {folder}: {RECORD} is missing{_rows_alongside(folder)}")
+    try:
+        return files.read_record(file)
+    except DamagedError as error:
+        raise DamagedError(f"no run in {folder}: {error}{_rows_alongside(folder)}") from error
+
+
+def _check_entries(record: Mapping[str, Any], folder: Path) -> None:
+    """Refuse the record of a version of verifai_jax with other entries.
+
+    **Raises:** `DamagedError`.
+    """
+    if other := sorted(record.keys() ^ {"features", *RECORDED}):
+        version = one_line(str(record.get("version", "unknown")), 40)
+        names = one_line(", ".join(map(repr, other)), 80)
+        raise DamagedError(
+            f"{folder / RECORD} is of another version of verifai_jax, {version}, which can load "
+            f"it: {names} is not in both{_rows_alongside(folder)}"
+        )
+    for part in record["sources"]:
+        Sources.from_json(part)
+
+
+def deciding_checksum(record: Mapping[str, Any]) -> int:
+    """Return a checksum of the entries of a record that decide what the rows of its run are."""
+    return files.record_checksum({name: record.get(name) for name in DECIDING})
+
+
+def write_checkpoint(
+    checkpoint: Mapping[str, Any], folder: Path, rows_checksum: int, record_checksum: int
+) -> None:
+    """Write a checkpoint to `folder`, in place of an earlier one, never half.
+
+    **Arguments:**
+
+    - `checkpoint`: the state of the search, with the number of `rows` that it has seen.
+    - `folder`: of the run.
+    - `rows_checksum`: of these rows.
+    - `record_checksum`: of the record.
+    """
+    arrays = {name: _plain(value) for name, value in checkpoint.items()}
+    arrays[ROWS_CHECKSUM] = np.array(rows_checksum, np.uint32)
+    arrays[RECORD_CHECKSUM] = np.array(record_checksum, np.uint32)
+    write_log(folder / STATE, {_ENTRY: arrays})
+
+
+def read_checkpoint(folder: Path) -> dict[str, Any] | None:
+    """Return the checkpoint in `folder`; None if there is none.
+
+    **Raises:** `DamagedError` for one that cannot be read.
+    """
+    file = folder / STATE
+    if not file.exists():
+        return None
+    arrays = Log(file).get(_ENTRY)
+    if arrays is None:
+        raise DamagedError(f"{file} is damaged: it holds no state of a search")
+    rows = arrays.get("rows")
+    if rows is None or rows.shape != () or rows.dtype.kind not in "iu" or rows < 0:
+        raise DamagedError(f"{file} is damaged: it does not say how many rows its search saw")
+    return arrays
+
+
+def _plain(value: ArrayLike) -> np.ndarray:
+    if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+        return np.asarray(jax.random.key_data(value))
+    return np.asarray(value)
+
+
+def _numeric_features(record: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the feature columns that are numbers, as far as the recorded space says so."""
+    space = record.get("space_data") or {"features": []}
+    known = {name: domain.get("kind") for name, domain in space["features"]}
+    return tuple(
+        column
+        for column in record["features"]
+        if known.get(re.sub(r"(\[\d+\])+$", "", column)) in _NUMERIC
+    )
+
+
+_NUMERIC = ("Box", "DiscreteBox", "Normal", "TruncatedNormal", "LogUniform", "LogNormal", "Signal")
+"""Kinds of domains, the usual ones, whose columns are numbers."""
+
+
+def _rows_alongside(folder: Path) -> str:
+    """Say how the rows of a folder are read without its record."""
+    if (folder / FINISHED).is_file():
+        return f"; the rows are in {folder / FINISHED}, which pandas.read_parquet reads"
+    if list_segments(folder / SEGMENTS) and not (folder / TAIL).exists():
+        return f"; the rows are in {folder / SEGMENTS}, which pandas.read_parquet reads"
+    if list_segments(folder / SEGMENTS) or (folder / TAIL).is_file():
+        return f"; the rows are in {folder}: vj.ErrorTable.load(folder, features)"
+    return ""
