@@ -11,7 +11,7 @@ PACKAGE = ROOT / "verifai_jax"
 
 LAYERS = (
     {"core", "store", "statistics", "_version"},
-    {"features", "mtl", "systems", "search", "clusters"},
+    {"features", "mtl", "systems", "search", "clusters", "native_code"},
     {"rl", "problem", "perception", "events", "scenes", "blocks"},
     {"evaluation", "policies"},
     {"falsification"},

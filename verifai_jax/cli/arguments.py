@@ -102,6 +102,15 @@ BACKEND = click.option(
 )
 """Simulator of a system that has several."""
 
+ENGINE = click.option(
+    "--engine",
+    type=click.Choice(["auto", "xla", "native"]),
+    default="xla",
+    show_default=True,
+    help="native: code by this machine's C++ compiler, for many simulations.",
+)
+"""What a traced system is compiled by."""
+
 CLUSTER = click.option(
     "--cluster",
     metavar="ADDRESS",

@@ -4,14 +4,7 @@ from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import (
-    PROBLEM,
-    RUN,
-    TARGET,
-    load_judged_run,
-    load_problem,
-    split_pairs,
-)
+from verifai_jax.cli import arguments
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result
 
@@ -20,7 +13,7 @@ CORPUS = "counterexamples"
 
 
 @command("save-counterexamples")
-@RUN
+@arguments.RUN
 @click.option(
     "--into",
     type=click.Path(path_type=Path),
@@ -35,12 +28,12 @@ CORPUS = "counterexamples"
 @click.option(
     "--budget", type=int, default=1000, show_default=True, help="Simulations to shrink one with."
 )
-@PROBLEM
+@arguments.PROBLEM
 def save_counterexamples(
     folder: Path, into: Path, max_count: int, shrink: bool, budget: int, target: str | None
 ) -> None:
     """Write counterexamples of the run in RUN as small files that can be replayed for ever."""
-    run = load_judged_run(folder, target)
+    run = arguments.load_judged_run(folder, target)
     paths = run.save_counterexamples(into, max_count=max_count, shrink=shrink, budget=budget)
     give_result(problem=run.name, files=paths)
     for path in paths:
@@ -48,7 +41,7 @@ def save_counterexamples(
 
 
 @command("replay-counterexamples")
-@TARGET
+@arguments.TARGET
 @click.argument("folder", metavar="FOLDER", type=click.Path(path_type=Path), default=Path(CORPUS))
 @click.option("--rename", multiple=True, metavar="OLD=NEW", help="New name of a feature.")
 @fail_on(counterexample="unless every one is simulated and fixed")
@@ -59,8 +52,8 @@ def replay_counterexamples(
     from verifai_jax.core.text import printable
     from verifai_jax.counterexamples import replay_counterexamples as replay
 
-    names = dict(split_pairs("--rename", rename))
-    result = replay(load_problem(target), folder, rename=names)
+    names = dict(arguments.split_pairs("--rename", rename))
+    result = replay(arguments.load_problem(target), folder, rename=names)
     click.echo(printable(str(result)))
     give_result(problem=result.problem, passed=result.passed, counterexamples=result.table)
     check_gate(fail_on, {"counterexample": not result.passed})

@@ -5,20 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from verifai_jax.cli.arguments import (
-    BACKEND,
-    BATCH,
-    CLUSTER,
-    MAX_SECONDS,
-    ONLY,
-    PLOT,
-    PRECISION,
-    REPORT,
-    SEED,
-    TARGET,
-    load_problem,
-    on_cluster,
-)
+from verifai_jax.cli import arguments
 from verifai_jax.cli.exit_codes import BROKEN, INTERRUPTED, CommandError
 from verifai_jax.cli.gates import RATE, Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, show_result
@@ -28,20 +15,20 @@ if TYPE_CHECKING:
 
 
 @command()
-@TARGET
+@arguments.TARGET
 @click.option("--method", help="monte_carlo, importance or splitting  [default: chosen]")
 @click.option("--budget", type=int, default=50_000, show_default=True, help="Simulations at most.")
 @click.option("--p0", type=float, help="Probability that it should be below.")
 @click.option("--confidence", type=float, default=0.95, show_default=True)
-@SEED
-@ONLY
-@BATCH
-@MAX_SECONDS
-@PRECISION
-@BACKEND
-@CLUSTER
-@PLOT
-@REPORT
+@arguments.SEED
+@arguments.ONLY
+@arguments.BATCH
+@arguments.MAX_SECONDS
+@arguments.PRECISION
+@arguments.BACKEND
+@arguments.CLUSTER
+@arguments.PLOT
+@arguments.REPORT
 @fail_on(
     p0="unless the probability is shown to be below --p0",
     rate="unless it is shown to be at most P",
@@ -64,8 +51,8 @@ def estimate(
         raise click.UsageError("--fail-on p0 goes with --p0")
     if p0 is None and fail_on is not None:
         p0 = fail_on.bound
-    problem = load_problem(target, only)
-    with on_cluster(cluster) as executor:
+    problem = arguments.load_problem(target, only)
+    with arguments.on_cluster(cluster) as executor:
         found = run(problem, p0=p0, executor=executor, **options)
     show_result(found, plot)
     if report is not None:

@@ -4,26 +4,18 @@ from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import (
-    EVEN_IF_CHANGED,
-    FOLDER,
-    PICTURES,
-    PROBLEM,
-    ROW,
-    RUN,
-    load_judged_run,
-)
+from verifai_jax.cli import arguments
 from verifai_jax.cli.exit_codes import check_again
 from verifai_jax.cli.json_output import command, draw, give_result
 
 
 @command()
-@RUN
-@ROW
-@PROBLEM
-@EVEN_IF_CHANGED
-@FOLDER
-@PICTURES
+@arguments.RUN
+@arguments.ROW
+@arguments.PROBLEM
+@arguments.EVEN_IF_CHANGED
+@arguments.FOLDER
+@arguments.PICTURES
 def explain(
     folder: Path,
     row: int | None,
@@ -38,7 +30,7 @@ def explain(
     from verifai_jax import counterexamples
     from verifai_jax.core.text import printable
 
-    run = load_judged_run(folder, target)
+    run = arguments.load_judged_run(folder, target)
     why = counterexamples.explain(run, row)
     for line in printable(str(why)).splitlines():
         click.echo(textwrap.fill(line, 88, break_on_hyphens=False))

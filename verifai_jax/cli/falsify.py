@@ -8,31 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from verifai_jax.cli.arguments import (
-    BACKEND,
-    BATCH,
-    CLUSTER,
-    EVEN_IF_CHANGED,
-    KEEP_GOING,
-    MAX_SECONDS,
-    ONLY,
-    PICTURES,
-    PRECISION,
-    PROGRESS,
-    RUN_FOLDER,
-    SEED,
-    SET,
-    STOP_AFTER,
-    given_or_next,
-    load_problem,
-    on_cluster,
-    plain_values,
-    read_run,
-    recorded_target,
-    refuse_others,
-    resuming,
-    target_apart,
-)
+from verifai_jax.cli import arguments
 from verifai_jax.cli.exit_codes import BROKEN, INTERRUPTED, CommandError
 from verifai_jax.cli.gates import RATE, Gate, check_gate, exceeds, fail_on
 from verifai_jax.cli.json_output import command, describe_run, give_result
@@ -59,13 +35,13 @@ _PARTS = (
 @command()
 @click.argument("target", required=False)
 @click.option("--search", help="Name of the search  [default: auto]")
-@SET
+@arguments.SET
 @click.option("--budget", type=int, help="Simulations at most  [default: 10000]")
-@BATCH
-@SEED
-@ONLY
-@MAX_SECONDS
-@STOP_AFTER
+@arguments.BATCH
+@arguments.SEED
+@arguments.ONLY
+@arguments.MAX_SECONDS
+@arguments.STOP_AFTER
 @click.option("--within", type=float, help="Stop when the failure rate is known as closely.")
 @click.option("--decide", type=float, help="Stop when the rate is clearly above or below this.")
 @click.option("--warm-start", type=click.Path(path_type=Path), help="Run to learn from first.")
@@ -74,10 +50,11 @@ _PARTS = (
     type=click.Path(path_type=Path),
     help="Run folder to go on with; with a larger --budget the run of that budget and this batch.",
 )
-@EVEN_IF_CHANGED
-@PRECISION
-@BACKEND
-@CLUSTER
+@arguments.EVEN_IF_CHANGED
+@arguments.PRECISION
+@arguments.BACKEND
+@arguments.ENGINE
+@arguments.CLUSTER
 @click.option(
     "--shard",
     metavar="I/N",
@@ -94,10 +71,10 @@ _PARTS = (
     type=click.Choice(["inputs", "behaviour"]),
     help="Of kinds that differ in this  [default: inputs]",
 )
-@RUN_FOLDER
-@KEEP_GOING
-@PICTURES
-@PROGRESS
+@arguments.RUN_FOLDER
+@arguments.KEEP_GOING
+@arguments.PICTURES
+@arguments.PROGRESS
 @fail_on(
     counterexample="if a counterexample was found",
     rate="unless the failure rate is shown to be at most P; needs --search uniform",
@@ -133,27 +110,27 @@ def falsify(
 
     stop_when = _stopping_rule(within, decide)
     if shard is not None:
-        refuse_others(_PARTS, "needs all rows of a run; --shard has a part")
+        arguments.refuse_others(_PARTS, "needs all rows of a run; --shard has a part")
     elif resume is not None:
-        refuse_others(_RESUMES, "is fixed in the run that --resume goes on with")
+        arguments.refuse_others(_RESUMES, "is fixed in the run that --resume goes on with")
         target = target or _resumed_target(resume)
     if target is None:
         raise click.UsageError("Missing argument 'TARGET', such as specs/cartpole.py:balance.")
     if shard is not None:
-        chosen = named(search or "uniform", **plain_values("--set", options))
+        chosen = named(search or "uniform", **arguments.plain_values("--set", options))
         asked = {
             name: given[name]
             for name in ("batch", "seed", "precision", "backend", "confirm", "progress")
         }
-        problem = load_problem(target, only)
+        problem = arguments.load_problem(target, only)
         _simulate_shard(problem, shard, chosen, budget or 10_000, folder, target=target, **asked)
         return
     if resume is not None:
-        problem = load_problem(target, only)
+        problem = arguments.load_problem(target, only)
         asked = {
             name: given[name] for name in ("max_seconds", "stop_after", "progress", "keep_going")
         }
-        with on_cluster(cluster) as executor:
+        with arguments.on_cluster(cluster) as executor:
             run = falsification.resume(
                 resume,
                 problem,
@@ -164,16 +141,16 @@ def falsify(
                 **asked,
             )
     else:
-        chosen = named(search or "portfolio", **plain_values("--set", options))
+        chosen = named(search or "portfolio", **arguments.plain_values("--set", options))
         if fail_on is not None and fail_on.name == RATE and not chosen.samples_prior:
             raise click.UsageError(
                 f"--fail-on {fail_on} needs independent samples of the space; give --search uniform"
             )
-        problem = load_problem(target, only)
-        earlier = None if warm_start is None else read_run(warm_start)
+        problem = arguments.load_problem(target, only)
+        earlier = None if warm_start is None else arguments.read_run(warm_start)
         with (
-            given_or_next(folder, "runs", problem.name) as path,
-            on_cluster(cluster) as executor,
+            arguments.given_or_next(folder, "runs", problem.name) as path,
+            arguments.on_cluster(cluster) as executor,
         ):
             run = falsification.falsify(
                 problem,
@@ -218,7 +195,7 @@ def _simulate_shard(
 
 
 def _resumed_target(folder: Path) -> str:
-    return recorded_target(folder, remedy=f"specs/FILE.py:NAME --resume {folder}")
+    return arguments.recorded_target(folder, remedy=f"specs/FILE.py:NAME --resume {folder}")
 
 
 def _stopping_rule(within: float | None, decide: float | None) -> "Within | Decided | None":
@@ -256,7 +233,8 @@ def print_run(
     give_result(**describe_run(run))
     assert run.folder is not None
     if run.stopped == "interrupted":
-        click.echo(f"  resume       {resuming('falsify', run.folder, run.target, options)}")
+        again = arguments.resuming("falsify", run.folder, run.target, options)
+        click.echo(f"  resume       {again}")
     click.echo(f"  table        {run.table_path}")
     if pictures and run.simulations:
         from verifai_jax.plotting import write_run_pictures
@@ -266,7 +244,7 @@ def print_run(
     failed = run.table.failed
     if len(failed) < run.simulations:
         words = ["verifai-jax", "replay", str(run.folder), str(run.best.name)]
-        apart = target_apart(run.folder, run.target)
+        apart = arguments.target_apart(run.folder, run.target)
         words += [] if apart is None else ["--problem", apart]
         click.echo(f"  replay       {shlex.join(words)}")
         return

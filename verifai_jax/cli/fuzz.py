@@ -5,29 +5,14 @@ from typing import Any
 
 import click
 
-from verifai_jax.cli.arguments import (
-    BACKEND,
-    BATCH,
-    KEEP_GOING,
-    MAX_SECONDS,
-    PICTURES,
-    PRECISION,
-    PROGRESS,
-    RUN_FOLDER,
-    SEED,
-    STOP_AFTER,
-    TARGET,
-    given_or_next,
-    load_problem,
-    split_pairs,
-)
+from verifai_jax.cli import arguments
 from verifai_jax.cli.falsify import print_run
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result
 
 
 @command()
-@TARGET
+@arguments.TARGET
 @click.option("--budget", type=int, default=10_000, show_default=True, help="Simulations at most.")
 @click.option(
     "--cells",
@@ -35,16 +20,16 @@ from verifai_jax.cli.json_output import command, give_result
     metavar="SIGNAL=LOW:HIGH:COUNT",
     help="Cells of a signal to cover  [default: the problem's behaviour]",
 )
-@BATCH
-@SEED
-@MAX_SECONDS
-@STOP_AFTER
-@PRECISION
-@BACKEND
-@RUN_FOLDER
-@KEEP_GOING
-@PICTURES
-@PROGRESS
+@arguments.BATCH
+@arguments.SEED
+@arguments.MAX_SECONDS
+@arguments.STOP_AFTER
+@arguments.PRECISION
+@arguments.BACKEND
+@arguments.RUN_FOLDER
+@arguments.KEEP_GOING
+@arguments.PICTURES
+@arguments.PROGRESS
 @fail_on(counterexample="if a counterexample was found")
 def fuzz(
     target: str,
@@ -57,9 +42,9 @@ def fuzz(
     """Look for failures of TARGET (specs/FILE.py:NAME) by covering what can happen in it."""
     from verifai_jax.fuzzing import fuzz as run_fuzz
 
-    chosen = {name: _cells(name, text) for name, text in split_pairs("--cells", cells)}
-    problem = load_problem(target)
-    with given_or_next(folder, "runs", problem.name) as path:
+    chosen = {name: _cells(name, text) for name, text in arguments.split_pairs("--cells", cells)}
+    problem = arguments.load_problem(target)
+    with arguments.given_or_next(folder, "runs", problem.name) as path:
         run = run_fuzz(problem, cells=chosen or None, folder=path, target=target, **options)
     ends = {"--max-seconds": options["max_seconds"], "--stop-after": options["stop_after"]}
     print_run(run, pictures, ends)

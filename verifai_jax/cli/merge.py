@@ -4,15 +4,7 @@ from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import (
-    ONLY,
-    PICTURES,
-    PROBLEM,
-    PROGRESS,
-    RUN_FOLDER,
-    given_or_next,
-    load_problem,
-)
+from verifai_jax.cli import arguments
 from verifai_jax.cli.falsify import check_run, print_run
 from verifai_jax.cli.gates import Gate, fail_on
 from verifai_jax.cli.json_output import command
@@ -22,11 +14,11 @@ from verifai_jax.cli.json_output import command
 @click.argument(
     "folders", metavar="PARTS...", nargs=-1, required=True, type=click.Path(path_type=Path)
 )
-@PROBLEM
-@ONLY
-@RUN_FOLDER
-@PICTURES
-@PROGRESS
+@arguments.PROBLEM
+@arguments.ONLY
+@arguments.RUN_FOLDER
+@arguments.PICTURES
+@arguments.PROGRESS
 @fail_on(
     counterexample="if a counterexample was found",
     rate="unless the failure rate is shown to be at most P; needs parts of --search uniform",
@@ -52,8 +44,8 @@ def merge(
             kind="problem",
             remedy="--problem specs/FILE.py:NAME",
         )
-    problem = load_problem(target, only)
-    with given_or_next(folder, "runs", problem.name) as path:
+    problem = arguments.load_problem(target, only)
+    with arguments.given_or_next(folder, "runs", problem.name) as path:
         run = merge_parts(folders, problem, folder=path, progress=progress)
     print_run(run, pictures)
     check_run(run, fail_on)

@@ -5,22 +5,12 @@ from typing import Any
 
 import click
 
-from verifai_jax.cli.arguments import (
-    BACKEND,
-    BATCH,
-    MAX_SECONDS,
-    ONLY,
-    PLOT,
-    PRECISION,
-    SEED,
-    TARGET,
-    load_problem,
-)
+from verifai_jax.cli import arguments
 from verifai_jax.cli.json_output import command, show_result
 
 
 @command()
-@TARGET
+@arguments.TARGET
 @click.option("--budget", type=int, default=50_000, show_default=True, help="Simulations at most.")
 @click.option("--confidence", type=float, default=0.95, show_default=True)
 @click.option(
@@ -30,15 +20,15 @@ from verifai_jax.cli.json_output import command, show_result
     show_default=True,
     help="Part of the failure probability below which a mode is not listed.",
 )
-@SEED
-@ONLY
-@BATCH
-@MAX_SECONDS
-@PRECISION
-@BACKEND
-@PLOT
+@arguments.SEED
+@arguments.ONLY
+@arguments.BATCH
+@arguments.MAX_SECONDS
+@arguments.PRECISION
+@arguments.BACKEND
+@arguments.PLOT
 def modes(target: str, only: str | None, plot: Path | None, **options: Any) -> None:
     """List the modes of failure of TARGET (FILE.py:NAME), each with its probability."""
     from verifai_jax.failure_modes import modes as run
 
-    show_result(run(load_problem(target, only), **options), plot)
+    show_result(run(arguments.load_problem(target, only), **options), plot)

@@ -5,20 +5,13 @@ from typing import Any
 
 import click
 
-from verifai_jax.cli.arguments import (
-    PARAMETER_CHOICE,
-    PLOT,
-    TARGET,
-    load_problem,
-    plain_values,
-    read_run,
-)
+from verifai_jax.cli import arguments
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, draw, give_result, show_result
 
 
 @command()
-@TARGET
+@arguments.TARGET
 @click.option(
     "--parameters", required=True, metavar="NAMES", help="Features to change, comma-separated."
 )
@@ -36,8 +29,8 @@ from verifai_jax.cli.json_output import command, draw, give_result, show_result
     type=int,
     help="Simulations for each of the failure probabilities before and after  [default: none]",
 )
-@PARAMETER_CHOICE
-@PLOT
+@arguments.PARAMETER_CHOICE
+@arguments.PLOT
 @fail_on(unsafe="unless the repair held in the check")
 def repair(
     target: str,
@@ -54,12 +47,12 @@ def repair(
     from verifai_jax.core.text import printable
     from verifai_jax.synthesis import repair as run_repair
 
-    problem = load_problem(target)
+    problem = arguments.load_problem(target)
     result = run_repair(
-        problem if folder is None else read_run(folder, problem),
+        problem if folder is None else arguments.read_run(folder, problem),
         parameters,
         budget,
-        nominal=plain_values("--nominal", nominal) or None,
+        nominal=arguments.plain_values("--nominal", nominal) or None,
         **keywords,
     )
     show_result(

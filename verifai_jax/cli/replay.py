@@ -4,33 +4,24 @@ from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import (
-    EVEN_IF_CHANGED,
-    FOLDER,
-    PICTURES,
-    PROBLEM,
-    ROW,
-    RUN,
-    load_judged_run,
-    load_run,
-)
+from verifai_jax.cli import arguments
 from verifai_jax.cli.exit_codes import check_again
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result
 
 
 @command()
-@RUN
-@ROW
-@PROBLEM
+@arguments.RUN
+@arguments.ROW
+@arguments.PROBLEM
 @click.option(
     "--precision",
     type=click.Choice(["float32", "float64"]),
     help="[default: float64, and that of the run for a system that draws random numbers]",
 )
-@EVEN_IF_CHANGED
-@FOLDER
-@PICTURES
+@arguments.EVEN_IF_CHANGED
+@arguments.FOLDER
+@arguments.PICTURES
 @fail_on(counterexample="if it violates the property, or has no verdict")
 def replay(
     folder: Path,
@@ -46,7 +37,7 @@ def replay(
     from verifai_jax.core.text import one_line, printable
     from verifai_jax.plotting import write_replay_pictures
 
-    run = (load_judged_run if row is None else load_run)(folder, target)
+    run = (arguments.load_judged_run if row is None else arguments.load_run)(folder, target)
     number = int(run.best.name) if row is None else row  # pyright: ignore[reportArgumentType]
     if precision is None:
         assert run.problem is not None

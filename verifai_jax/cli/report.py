@@ -4,20 +4,13 @@ from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import (
-    PROBLEM,
-    is_sweep,
-    load_problem,
-    load_run,
-    read_run,
-    split_pairs,
-)
+from verifai_jax.cli import arguments
 from verifai_jax.cli.json_output import command, give_result
 
 
 @command()
 @click.argument("folder", metavar="FOLDER", type=click.Path(path_type=Path))
-@PROBLEM
+@arguments.PROBLEM
 @click.option(
     "--output",
     type=click.Path(path_type=Path),
@@ -64,20 +57,22 @@ def report(
     if folder.is_file():
         from verifai_jax.reports.stored import read_result
 
-        problem = None if target is None else load_problem(target)
+        problem = None if target is None else arguments.load_problem(target)
         result = read_result(folder, None if problem is None else problem.space)
         output = folder.with_suffix(".html") if output == folder / "report.html" else output
-    elif is_sweep(folder):
+    elif arguments.is_sweep(folder):
         from verifai_jax.sweeps.result import load_sweep
 
         result = load_sweep(folder)
     else:
-        result = read_run(folder) if without_problem else load_run(folder, target)
+        result = (
+            arguments.read_run(folder) if without_problem else arguments.load_run(folder, target)
+        )
     path = write_report(
         result,
         output,
-        units=dict(split_pairs("--unit", units)),
-        reasons=dict(split_pairs("--reason", reasons)),
+        units=dict(arguments.split_pairs("--unit", units)),
+        reasons=dict(arguments.split_pairs("--reason", reasons)),
         traces=traces,
         studies=studies,
         modes=modes,

@@ -5,24 +5,15 @@ from typing import Any
 
 import click
 
-from verifai_jax.cli.arguments import (
-    EVEN_IF_CHANGED,
-    FOLDER,
-    PICTURES,
-    PROBLEM,
-    ROW,
-    RUN,
-    SEED,
-    load_judged_run,
-)
+from verifai_jax.cli import arguments
 from verifai_jax.cli.exit_codes import check_again
 from verifai_jax.cli.json_output import command, give_result, show_result
 
 
 @command()
-@RUN
-@ROW
-@PROBLEM
+@arguments.RUN
+@arguments.ROW
+@arguments.PROBLEM
 @click.option(
     "--by",
     type=click.Choice(["count", "distance"]),
@@ -31,16 +22,16 @@ from verifai_jax.cli.json_output import command, give_result, show_result
     help="Fewest features first, or least distance first.",
 )
 @click.option("--budget", type=int, default=2000, show_default=True, help="Simulations at most.")
-@SEED
+@arguments.SEED
 @click.option(
     "--others/--no-others",
     default=True,
     show_default=True,
     help="Start from other counterexamples of the run too.",
 )
-@EVEN_IF_CHANGED
-@FOLDER
-@PICTURES
+@arguments.EVEN_IF_CHANGED
+@arguments.FOLDER
+@arguments.PICTURES
 def shrink(
     folder: Path,
     row: int | None,
@@ -53,7 +44,7 @@ def shrink(
     """Make a ROW (by default the worst) of the run in RUN small: few features, near nominal."""
     from verifai_jax import counterexamples
 
-    run = load_judged_run(folder, target)
+    run = arguments.load_judged_run(folder, target)
     small = counterexamples.shrink(run, row, **options)
     give_result(robustness=small.rho)
     show_result(

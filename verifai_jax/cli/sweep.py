@@ -7,20 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from verifai_jax.cli.arguments import (
-    CLUSTER,
-    EVEN_IF_CHANGED,
-    MAX_SECONDS,
-    PICTURES,
-    SET,
-    given_or_next,
-    is_sweep,
-    on_cluster,
-    plain_values,
-    refuse_others,
-    resuming,
-    split_names,
-)
+from verifai_jax.cli import arguments
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, draw, give_result
@@ -43,7 +30,7 @@ _MAX_ROWS = 12
 @click.argument("target", required=False)
 @click.option("--configurations", type=int, help="Configurations at most  [default: 32]")
 @click.option("--search", help="Name of the search, or optuna:tpe  [default: halton]")
-@SET
+@arguments.SET
 @click.option("--seed", type=int, help="Seed of the search and the samples  [default: 0]")
 @click.option("--samples", type=int, help="Samples of each policy, at least  [default: 512]")
 @click.option("--confidence", type=float, help="Of all verdicts together  [default: 0.95]")
@@ -61,21 +48,21 @@ _MAX_ROWS = 12
 @click.option(
     "--nominal", multiple=True, metavar="NAME=VALUE", help="Value of one that --only fixes."
 )
-@MAX_SECONDS
+@arguments.MAX_SECONDS
 @click.option(
     "--cache",
     type=click.Path(path_type=Path),
     help="Folder of finished work  [default: the sweep's folder]",
 )
 @click.option("--resume", type=click.Path(path_type=Path), help="Folder of a sweep to resume.")
-@EVEN_IF_CHANGED
+@arguments.EVEN_IF_CHANGED
 @click.option(
     "--folder",
     type=click.Path(path_type=Path),
     help="Folder to write  [default: sweeps/NAME-1, -2, ...]",
 )
-@CLUSTER
-@PICTURES
+@arguments.CLUSTER
+@arguments.PICTURES
 @fail_on(unsafe="unless a policy is shown to be safe")
 def sweep(
     target: str | None,
@@ -99,7 +86,7 @@ def sweep(
     from verifai_jax.sweeps.study import Study
 
     if resume is not None:
-        refuse_others(_RESUMES, "is fixed in the sweep that --resume goes on with")
+        arguments.refuse_others(_RESUMES, "is fixed in the sweep that --resume goes on with")
         folder, cache = resume, resume if cache is None else cache
         before = _read_command(cache)
         target = target or target_of_project(
@@ -115,7 +102,10 @@ def sweep(
     configurations = 32 if configurations is None else configurations
     study = load_target(target, Study)
     if given["only"] is not None:
-        study = study.only(*split_names(given["only"]), nominal=plain_values("--nominal", nominal))
+        study = study.only(
+            *arguments.split_names(given["only"]),
+            nominal=arguments.plain_values("--nominal", nominal),
+        )
     # Read by a later --resume.
     note = {
         "target": target,
@@ -126,8 +116,8 @@ def sweep(
     }
     keywords = _keywords(given, options)
     with (
-        given_or_next(folder, "sweeps", study.name) as path,
-        on_cluster(cluster) as executor,
+        arguments.given_or_next(folder, "sweeps", study.name) as path,
+        arguments.on_cluster(cluster) as executor,
     ):
         folder = path
         result = run_sweep(
@@ -161,7 +151,7 @@ def sweep(
     if not record.complete:
         apart = None if cache == folder else cache
         more = {"--cache": apart, "--max-seconds": max_seconds, "--cluster": cluster}
-        click.echo(f"  resume       {resuming('sweep', folder, target, more)}")
+        click.echo(f"  resume       {arguments.resuming('sweep', folder, target, more)}")
     elif all(status not in ("trained", "stopped") for status in result.table["status"]):
         raise CommandError("no configuration was trained, so nothing is known of any", BROKEN)
     check_gate(fail_on, {"unsafe": not len(result.safe)})
@@ -177,7 +167,7 @@ def _keywords(given: Mapping[str, Any], options: tuple[str, ...]) -> dict[str, A
         for name in ("seed", "samples", "confidence", "budget", "attack", "attack_simulations")
         if given[name] is not None
     }
-    search, values = given["search"] or "halton", plain_values("--set", options)
+    search, values = given["search"] or "halton", arguments.plain_values("--set", options)
     if search.startswith("optuna:"):
         from verifai_jax.sweeps.optuna import OptunaSampler
 
@@ -215,9 +205,9 @@ def _read_command(folder: Path) -> dict[str, Any]:
 def _describe_folder(folder: Path) -> str:
     """Say what a place without finished work is."""
     if (folder / "run.json").is_file():
-        goes_on = resuming("falsify", folder, None, {})
+        goes_on = arguments.resuming("falsify", folder, None, {})
         return f": it is the folder of a run; {goes_on} goes on with it"
-    if is_sweep(folder):
+    if arguments.is_sweep(folder):
         return ": its finished work is elsewhere; name it, --cache FOLDER, as when it began"
     if not folder.exists():
         return ": there is no such folder"

@@ -22,7 +22,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
 
 from verifai_jax.core.compilation import Compilation, XlaOptimization, compile_soon, tracing
 from verifai_jax.core.devices import spread_over_devices
-from verifai_jax.core.fingerprint import as_traced, fingerprint
+from verifai_jax.core.fingerprint import as_traced, fingerprint, identity
 from verifai_jax.core.keys import IMPLEMENTATION, as_key, simulation_key
 from verifai_jax.core.lifting import CAPACITY, LiftedNumbers
 from verifai_jax.core.precision import in_precision
@@ -37,6 +37,9 @@ from verifai_jax.problem.problem import Problem
 
 Mode = Literal["evaluate", "holds"]
 """Programs of an engine: robustness and derivatives, or the Boolean semantics of the same rows."""
+Wanted = Literal["auto", "xla", "native"]
+"""What compiles the simulations of a run, as a person asks for it; see `NativeEngine`."""
+WANTED: tuple[Wanted, ...] = ("auto", "xla", "native")
 _TEMPERATURE = jax.ShapeDtypeStruct((), jnp.float32)
 """Form of the temperature of one row."""
 
@@ -177,8 +180,56 @@ class Engine:
         """Evaluate one row under `jax.vmap`, in a program that a caller compiles."""
         return self._function(row, key, temperature, shared, self._derivative)
 
+    def with_batch(self, batch: int) -> "Engine":
+        """Return an engine of other batches, which has traced what this one has."""
+        other = Engine(
+            self.problem, batch, self.gradient, self.devices, self.precision,
+            self.goals is not None, self.inputs, self.own_keys, self.alone, guidance=self.guidance,
+        )  # fmt: skip
+        other._packing, other._numbers = self._packing, self._numbers
+        other._traced, other._derivative = self._traced, self._derivative
+        if "_derivatives" in self.__dict__:
+            other.__dict__["_derivatives"] = self._derivatives
+        return other
+
+    def traced_row(self) -> Callable[..., Any]:
+        """Return the function of one row, which is traced already.
+
+        It takes the row, its random key, a temperature, what all rows share, and `numbers`, and
+        returns what `unpack` takes apart.
+        """
+        with tracing(self.inputs.purpose), in_precision(self.precision):
+            return self._derivatives[1] if self.gradient else as_traced(self._trace("evaluate"))
+
+    @property
+    def row_identity(self) -> str | None:
+        """A hash of all that the function of one row computes; None where it has none."""
+        if not self.gradient:
+            return fingerprint(self._trace("evaluate").jaxpr, derivatives=False)
+        computes, *_ = self._derivatives
+        return None if computes is None else identity(computes, self._derivative)
+
+    @property
+    def work(self) -> int:
+        """Operations on single numbers in a simulation, with its derivative, about."""
+        from verifai_jax.native_code.work import work_of
+
+        with tracing(self.inputs.purpose), in_precision(self.precision):
+            if not self.gradient:
+                return work_of(self._trace("evaluate").jaxpr.jaxpr)
+            return GRADIENT_WORK * work_of(self._derivatives[2])
+
+    @property
+    def numbers(self) -> Float[np.ndarray, " numbers"]:
+        """The numbers that a traced program reads, once it is traced."""
+        return self._numbers["evaluate"].vector(self.precision)
+
+    def unpack(self, packed: dict[str, Any], count: int) -> Row:
+        """Return the first rows of what a program computed."""
+        return self._packing["evaluate"].unpack(packed, count)
+
     def draws(self) -> bool:
-        """Return whether the system uses its random key; needs `own_keys` and `alone`.
+        """Return whether the system uses its random key, in an engine without derivatives.
 
         Traces the program, and raises what that raises.
         """
@@ -298,8 +349,8 @@ class Engine:
         return packing.pack(result)
 
     @cached_property
-    def _derivatives(self) -> tuple[str | None, Callable[..., Any]]:
-        """The fingerprint of simulation and monitor, and the program of derivatives made of these.
+    def _derivatives(self) -> tuple[str | None, Callable[..., Any], Any]:
+        """The fingerprint of simulation and monitor, the derivatives of one row, and the program.
 
         Only these are traced here. All else follows from them.
         """
@@ -334,8 +385,7 @@ class Engine:
             derivative = self._derivative if self.goals is None else self._derivative.of_several
             return packed(*derivative(objective, function.coordinates(row, shared)))
 
-        program = packed_row if self.alone else self._batched(packed_row)
-        return fingerprint(traced.jaxpr), program
+        return fingerprint(traced.jaxpr), packed_row, traced.jaxpr.jaxpr
 
     def _kept_as(self, kind: str, computes: str | None, *values: object) -> str | None:
         """Return the name under which a program of batches is kept on disk, if it can be."""
@@ -351,7 +401,8 @@ class Engine:
 
     def _lower_gradient(self) -> jax.stages.Lowered:
         """Lower the program of derivatives, or recall it; see `core.remembered`."""
-        _, program = self._derivatives
+        one_row = self._derivatives[1]
+        program = one_row if self.alone else self._batched(one_row)
         return self.differentiable(
             lambda: lower_or_recall(self._gradient_kept_as, partial(program), self._arguments)
         )
@@ -429,6 +480,9 @@ def _key_form() -> Any:
     return jax.eval_shape(lambda: jax.random.key(0, impl=IMPLEMENTATION))
 
 
+GRADIENT_WORK = 6
+"""Work of a simulation with its reverse sweep, in simulations: 5 to 10 as measured on eight
+problems."""
 ACCELERATOR_FACTOR = 128
 """How many times as many rows a chunk has on an accelerator as on a core, whose cache traces fit.
 On an H200 chunks of 65,536 rows were 9 to 91 times as fast as those of 512 (RESULTS.md)."""

@@ -8,7 +8,7 @@ evaluator takes the engine that suits the problem, compiled or on the host, or s
 workers of an executor. Each simulation has a random key of its own, by its number.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Array, Float, Key
@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Key
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.programs import power_of_two
 from verifai_jax.core.progress import count_done
-from verifai_jax.evaluation.engine import Engine, engine_for
+from verifai_jax.evaluation.engine import Engine, Wanted, engine_for
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.raising import ALIKE, Raising
 from verifai_jax.evaluation.verdicts import Verdicts
@@ -27,6 +27,14 @@ if TYPE_CHECKING:
     from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
     from verifai_jax.evaluation.host_engine import HostEngine
     from verifai_jax.evaluation.journal import Journal
+    from verifai_jax.evaluation.native_engine import NativeEngine
+
+
+NOT_NATIVE = (
+    "simulated without native code, which is made of systems that JAX traces, in single precision "
+    "and in this process"
+)
+"""Note of a run for which native code was asked for in vain."""
 
 
 class Evaluator:
@@ -47,6 +55,8 @@ class Evaluator:
     - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
     - `keep_traces`: whether verdicts come with traces; in this process.
     - `given`: whether rows of features that somebody gave (`given_rows`) may be among the points.
+    - `engine`: `"native"`, or `"auto"` where it decides by `budget`, the simulations of the run,
+      whether rows are simulated by native code; see `evaluation.native_engine`.
     - `ends_raising`: whether a call raises `AlwaysRaises` where all of the first simulations raise.
     """
 
@@ -66,15 +76,18 @@ class Evaluator:
         keep_traces: bool = False,
         given: bool = False,
         ends_raising: bool = False,
+        engine: Wanted = "xla",
+        budget: int = 0,
     ) -> None:
         self._raising = Raising() if ends_raising else None
         self.problem, self.batch = problem, batch
         self.given = given and problem.space.width > 0
         # Points are float32 whatever the precision; what a person gives is not.
         self._dtype = np.dtype(precision if self.given else "float32")
-        self.engine: Engine | HostEngine | ExecutorEngine
+        self.engine: Engine | NativeEngine | HostEngine | ExecutorEngine
         self._host: HostEngine | None = None
         self._sender: ExecutorEngine | None = None
+        self._native: NativeEngine | None = None
         if executor is not None:
             from verifai_jax.evaluation import executor_engine
 
@@ -92,9 +105,16 @@ class Evaluator:
             )  # fmt: skip
         else:
             guidance = guidance._replace(trace=keep_traces)
-            self.engine = engine_for(
+            self.engine = compiled = engine_for(
                 problem, batch, gradient, precision, clauses, guidance, self.given
             )
+            if engine != "xla" and precision == "float32" and not keep_traces:
+                from verifai_jax.evaluation import native_engine
+
+                self.engine = self._native = native_engine.NativeEngine(compiled, engine, budget)
+        self._not_native = ()
+        if engine == "native" and self._native is None:
+            self._not_native = (NOT_NATIVE,)
         # Features of few points are those of a whole batch, bit for bit.
         self._padded_to = power_of_two(batch) if ends_raising else 1
         self.key: Key[Array, ""] = run_keys(seed)[1]
@@ -106,9 +126,16 @@ class Evaluator:
         return self.engine.compile_seconds
 
     @property
+    def simulated_by(self) -> Literal["auto", "xla", "native", "host"]:
+        """The engine of the rows, `"auto"` before it is decided; `"host"` for black boxes."""
+        if self._native is not None:
+            return self._native.chosen
+        return "host" if self.problem.black_box else "xla"
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """Decisions of the engine that a user may not expect."""
-        return self.engine.notes
+        return (*self.engine.notes, *self._not_native)
 
     def begin_compiling(self) -> None:
         """Trace now and compile in the background."""

@@ -1,6 +1,6 @@
 """The guide's term, the outcome and the trace of a simulation, for a search.
 
-    guidance = Steering(guide=True, outcome=True)
+    guidance = Guidance(guide=True, outcome=True)
     guidance.values(problem, trace, features)           # [size], traced by JAX
 
 Nothing of it decides a verdict. It is computed with the traces of a search that wants it, and

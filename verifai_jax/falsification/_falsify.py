@@ -32,8 +32,10 @@ from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.falsification.validation import (
     AUTO,
     adapt_search,
+    as_wanted,
     batch_size,
     can_be_slow,
+    check_engine,
     check_first,
     check_gradient,
     check_guide,
@@ -86,6 +88,7 @@ def falsify(
     target: str | None = None,
     executor: "Executor | None" = None,
     keep_going: bool = False,
+    engine: str = "xla",
 ) -> Run:
     """Search the feature space for inputs under which the system breaks its property.
 
@@ -134,6 +137,11 @@ def falsify(
     - `keep_going`: whether to simulate on where all of the first simulations raise. When left out
       the run ends there with an error, after 16 that raise the same, or a first round of a system
       that simulates many at once: an error of the problem would cost the whole budget.
+    - `engine`: `"xla"`, or `"native"`: rows from the 513th on are simulated by vector code that
+      the machine's own C++ compiler makes of the problem, several times as fast. It agrees with
+      XLA up to rounding, and XLA decides what is near to zero. `"auto"` takes it where the budget
+      is worth the compilation, which the run records. What cannot be translated (other precisions,
+      unusual operations) is simulated by XLA, and the notes say why.
 
     Ctrl-C ends the run and returns what is finished. What is likely a mistake of the problem is in
     the run's `notes`, and above the progress bar.
@@ -148,6 +156,7 @@ def falsify(
     """
     started = time.perf_counter()
     check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
+    check_engine(engine)
     asking, search = without_suggestions(search)
     default = search == AUTO
     search = check_search(problem, "portfolio" if default else search)
@@ -182,7 +191,7 @@ def falsify(
         table = ErrorTable(tuple(problem.space.columns), path)
         rounds = Rounds(
             problem, search, size, seed, table, precision, path, confirm, executor, target, given,
-            suggests=asking is not None,
+            suggests=asking is not None, engine=as_wanted(engine), budget=budget,
         )  # fmt: skip
         if asking is not None:
             rounds.ask(replace(asking, search=search))
@@ -225,6 +234,7 @@ def simulate(
     progress: bool | None = None,
     target: str | None = None,
     executor: "Executor | None" = None,
+    engine: str = "xla",
 ) -> Run:
     """Simulate given features, in their order: no search, a row of the table for each.
 
@@ -251,6 +261,7 @@ def simulate(
         problem, searches.PointList(points), len(points), first=given,
         batch=batch, seed=seed, folder=folder, precision=precision, backend=backend,
         confirm=False, progress=progress, target=target, executor=executor, keep_going=True,
+        engine=engine,
     )  # fmt: skip
 
 
@@ -370,6 +381,7 @@ def _resume(
     rounds = Rounds(
         problem, search, run.batch, run.seed, table, run.precision, run.folder, run.confirm,
         executor, run.target, rows_of_first(run.first, problem), suggests=asking is not None,
+        engine=as_wanted(run.engine), budget=run.budget,
     )  # fmt: skip
 
     if asking is not None:

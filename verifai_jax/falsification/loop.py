@@ -22,6 +22,7 @@ from verifai_jax.core.compilation import while_compiling
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.stopwatch import Stopwatch
 from verifai_jax.evaluation.confirmer import Confirmer
+from verifai_jax.evaluation.engine import Wanted
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.verdicts import Verdicts
@@ -74,6 +75,8 @@ class Rounds:
         target: str | None = None,
         first: Float[np.ndarray, "n row"] | None = None,
         suggests: bool = False,
+        engine: Wanted = "xla",
+        budget: int = 0,
     ) -> None:
         self.problem, self.batch, self.table = problem, batch, table
         self.precision, self.folder = precision, folder
@@ -98,6 +101,8 @@ class Rounds:
             guidance=self.learning.guidance,
             keep_traces=self.learning.surrogate is not None,
             given=suggests or self.first.shape[1] > problem.space.dim,
+            engine=engine,
+            budget=budget,
         )
         self._confirmer = None
         if confirm:
@@ -368,6 +373,11 @@ class Rounds:
     def evaluate(self) -> Evaluator:
         """The evaluator of rounds without derivatives."""
         return self._simulations.evaluate
+
+    @property
+    def simulated_by(self) -> str:
+        """The engine of the rows, as far as it is decided."""
+        return self.evaluate.simulated_by
 
     @property
     def confirms(self) -> bool:

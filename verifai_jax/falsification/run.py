@@ -72,6 +72,8 @@ class Run(InNotebook):
     - `checkpoint`: the checkpoint that `resume` goes on from.
     - `precision`: `"float32"` or `"float64"`, of the simulations.
     - `backend`: the engine that simulated; None for a system that has one only.
+    - `engine`: `"xla"`, `"native"` for rows from the 513th on, or `"host"` for a black box;
+      `"auto"` before it is decided.
     - `notes`: decisions that were made without the user.
     - `lasting_notes`: those of `notes` that are still true when the run goes on.
     - `confirm`: whether violations were replayed more finely before they were claimed.
@@ -113,6 +115,7 @@ class Run(InNotebook):
     checkpoint: Mapping[str, Any] | None = None
     precision: str = "float32"
     backend: str | None = None
+    engine: str = "xla"
     notes: Sequence[str] = ()
     lasting_notes: Sequence[str] = ()
     confirm: bool = False

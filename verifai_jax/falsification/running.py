@@ -278,6 +278,7 @@ class Running:
             checkpoint=rounds.checkpoint,
             precision=rounds.precision,
             backend=self.choice.backend,
+            engine=rounds.simulated_by,
             confirm=rounds.confirms,
             guide=None if problem.guide is None else problem.guide.to_json(),
             sources=self._models,

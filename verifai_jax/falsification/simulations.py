@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax.core.programs import power_of_two
+from verifai_jax.evaluation.engine import Wanted
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.guidance import Guidance
 from verifai_jax.evaluation.raising import ALIKE, ALWAYS, Raising
@@ -45,8 +46,8 @@ class Simulations:
     - `search`: what it wants decides what is computed in addition to the robustness.
     - `batch`: simulations of a round at most.
     - `seed`: of the run.
-    - `precision`, `journal`, `executor`, `target`, `guidance`, `keep_traces`, `given`: as for
-      `Evaluator`.
+    - `precision`, `journal`, `executor`, `target`, `guidance`, `keep_traces`, `given`,
+      `engine`, `budget`: as for `Evaluator`.
 
     `hopeless` is what all of the rows that were timed raised; None if one did not.
     """
@@ -65,6 +66,8 @@ class Simulations:
         guidance: Guidance,
         keep_traces: bool,
         given: bool = False,
+        engine: Wanted = "xla",
+        budget: int = 0,
     ) -> None:
         self.batch, self.keep_traces, self._journals = batch, keep_traces, True
         evaluator = partial(
@@ -75,6 +78,8 @@ class Simulations:
             executor=executor,
             target=target,
             guidance=guidance,
+            engine=engine,
+            budget=budget,
         )
         self.evaluate = evaluator(
             batch,
@@ -88,7 +93,9 @@ class Simulations:
         self._differentiate: Evaluator | None = None
         if search.wants.clauses:
             maximum = min(batch, MAX_DIFFERENTIATED)
-            self._differentiate = evaluator(maximum, gradient=True, clauses=True)
+            # Of few rows, which are not worth a native program unless it is asked for.
+            wanted = "native" if engine == "native" else "xla"
+            self._differentiate = evaluator(maximum, gradient=True, clauses=True, engine=wanted)
         self._measured: Verdicts | None = None
         self.hopeless: str | None = None
 

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax import search as searches
-from verifai_jax.core.errors import check_names
+from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.core.text import format_error, one_line
+from verifai_jax.evaluation.engine import WANTED, Wanted
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.run_folder import RECORD
 from verifai_jax.falsification.table import ErrorTable
@@ -85,6 +86,20 @@ def batch_size(
     """
     usual = 16 if diverse else usual_batch(search, budget, stop_after, whole)
     return min(usual if asked is None else asked, budget)
+
+
+def check_engine(engine: object) -> None:
+    """Refuse an unknown engine.
+
+    **Raises:** `UnknownNameError`.
+    """
+    if engine not in WANTED:
+        raise unknown_name("engine", str(engine), WANTED)
+
+
+def as_wanted(engine: str) -> Wanted:
+    """Return an engine that was checked, with its type."""
+    return cast(Wanted, engine)
 
 
 def check_search(problem: object, search: object) -> Search:

@@ -157,7 +157,14 @@ def _end_with(monitor: Online, state: State, unknown: float | None) -> Array:
         machine.value_at_start("", monitor.formula, 1)
         return machine.fresh
 
-    cells = jax.lax.fori_loop(0, settling, more, state.cells)
+    def settled() -> Cells:
+        return jax.lax.fori_loop(0, settling, more, state.cells)
+
+    if settling and machine.ends(monitor.formula):
+        # Once every window is past nothing changes any more: all that came is enough.
+        cells = jax.lax.cond(state.count > settling, lambda: state.cells, settled)
+    else:
+        cells = settled()
     final = _Machine(monitor.dt, leaf, state.count + settling, cells)
     return final.value_at_start("", monitor.formula, 1)
 
@@ -241,6 +248,11 @@ class _Machine:
             case ast.Leaf() | ast.Not() | ast.Join():
                 return below
         raise missing_case("the online monitor", f)
+
+    def ends(self, f: Formula) -> bool:
+        """Return whether no operator looks ahead without end."""
+        ahead = (g for g in f.subformulas() if isinstance(g, ast.Window | ast.Witness))
+        return all(math.isfinite(self.span(g.interval)[1]) for g in ahead if g.side == "ahead")
 
     def stream(self, path: str, f: Formula, sign: int) -> Array:
         """Return the value of `f` at the instant `now - delay(f)`; anything before time 0.

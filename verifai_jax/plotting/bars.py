@@ -9,15 +9,7 @@ import pandas as pd
 from verifai_jax.analysis._importance import NAMES, Importance
 from verifai_jax.analysis.sensitivity.sensitivity import Sensitivity
 from verifai_jax.core.figure import Axes, Figure
-from verifai_jax.plotting.style import (
-    BOUND,
-    FAILING,
-    name_points,
-    new_figure,
-    show_or_save,
-    tidy,
-    wrap_name,
-)
+from verifai_jax.plotting import style
 
 SECOND = "#8d99ae"
 """Colour of what is shown next to failures and to total influence."""
@@ -92,12 +84,12 @@ def plot_bars(
 
     **Returns:** the figure.
     """
-    figure = new_figure(figsize=(6.4, 1.3 + 0.38 * len(table) + 0.2 * (len(columns) > 1)))
+    figure = style.new_figure(figsize=(6.4, 1.3 + 0.38 * len(table) + 0.2 * (len(columns) > 1)))
     axes = figure.subplots()
     draw_bars(axes, table, columns)
     axes.set_xlabel(label)
     figure.suptitle(title, fontsize=10)
-    return show_or_save(figure, path)
+    return style.show_or_save(figure, path)
 
 
 def draw_bars(axes: Axes, table: pd.DataFrame, columns: Mapping[str, str]) -> None:
@@ -116,15 +108,15 @@ def draw_bars(axes: Axes, table: pd.DataFrame, columns: Mapping[str, str]) -> No
             position + (j - (len(columns) - 1) / 2) * height,
             np.nan_to_num(values),
             height * 0.92,
-            color=SECOND if column in ("first", "rho") else FAILING,
+            color=SECOND if column in ("first", "rho") else style.FAILING,
             label=name,
             xerr=reach,
-            error_kw={"ecolor": BOUND, "elinewidth": 1, "capsize": 2},
+            error_kw={"ecolor": style.BOUND, "elinewidth": 1, "capsize": 2},
         )
-    axes.set_yticks(position, [wrap_name(str(name)) for name in table.index])
+    axes.set_yticks(position, [style.wrap_name(str(name)) for name in table.index])
     axes.invert_yaxis()
-    axes.axvline(0, color=BOUND, linewidth=0.8)
-    tidy(axes)
+    axes.axvline(0, color=style.BOUND, linewidth=0.8)
+    style.tidy(axes)
     axes.grid(visible=False, axis="y")
     if any(columns.values()):
         axes.legend(frameon=False, fontsize=8, loc="lower right")
@@ -141,26 +133,26 @@ def plot_effects(table: pd.DataFrame, title: str, path: str | Path | None = None
 
     **Returns:** the figure.
     """
-    figure = new_figure(figsize=(5.6, 4.4))
+    figure = style.new_figure(figsize=(5.6, 4.4))
     axes = figure.subplots()
     across, up = table["mu_star"].to_numpy(float), table["sigma"].to_numpy(float)
     maximum = 1.12 * max(np.max(across, initial=0), np.max(up, initial=0)) or 1.0
-    axes.plot([0, maximum], [0, maximum], color=BOUND, linewidth=0.8, linestyle=":")
+    axes.plot([0, maximum], [0, maximum], color=style.BOUND, linewidth=0.8, linestyle=":")
     axes.errorbar(
         across,
         up,
         xerr=[np.maximum(across - table["low"], 0), np.maximum(table["high"] - across, 0)],
         fmt="o",
-        color=FAILING,
-        ecolor=BOUND,
+        color=style.FAILING,
+        ecolor=style.BOUND,
         elinewidth=0.8,
     )
     axes.set_xlim(0, maximum)
     axes.set_ylim(-0.03 * maximum, maximum)
     axes.set_xlabel("mean size of the effect on the robustness")
     axes.set_ylabel("standard deviation of the effect\n(interaction or curvature)")
-    tidy(axes)
+    style.tidy(axes)
     figure.suptitle(title, fontsize=10)
     ends = (table[end].to_numpy(float) for end in ("low", "high"))
-    name_points(axes, [str(name) for name in table.index], across, up, *ends)
-    return show_or_save(figure, path)
+    style.name_points(axes, [str(name) for name in table.index], across, up, *ends)
+    return style.show_or_save(figure, path)

@@ -8,15 +8,7 @@ from verifai_jax.compositional.region import FAILS_ANYWAY, NO_VERDICT, SAFE, UNC
 from verifai_jax.compositional.result import Compositional
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.figure import Figure
-from verifai_jax.plotting.style import (
-    BOUND,
-    FAILING,
-    WITHOUT_VERDICT,
-    new_figure,
-    show_or_save,
-    tidy,
-)
-from verifai_jax.plotting.style import SAFE as GREEN
+from verifai_jax.plotting import style
 
 
 def plot_region(
@@ -41,12 +33,12 @@ def plot_region(
         features = _decisive_features(result)
     check_names("feature", features, columns)
     across, up = features
-    figure = new_figure(figsize=(6.4, 4.2))
+    figure = style.new_figure(figsize=(6.4, 4.2))
     axes = figure.subplots()
     for kind, color, marker in (
-        (SAFE, GREEN, "o"),
-        (FAILS_ANYWAY, FAILING, "x"),
-        (NO_VERDICT, WITHOUT_VERDICT, "x"),
+        (SAFE, style.SAFE, "o"),
+        (FAILS_ANYWAY, style.FAILING, "x"),
+        (NO_VERDICT, style.WITHOUT_VERDICT, "x"),
     ):
         part = region.loc[region["kind"] == kind]
         if len(part):
@@ -62,15 +54,15 @@ def plot_region(
     confirmed = result.confirmed
     if len(confirmed):
         axes.scatter(
-            confirmed[across], confirmed[up], s=90, c=BOUND, marker="*", edgecolors="white",
+            confirmed[across], confirmed[up], s=90, c=style.BOUND, marker="*", edgecolors="white",
             label=f"{len(confirmed):,} confirmed", zorder=3, clip_on=False,
         )  # fmt: skip
     axes.set_xlabel(across)
     axes.set_ylabel(up)
-    tidy(axes)
+    style.tidy(axes)
     figure.legend(loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     axes.set_title(f"{result.name}: where an error of the perception can decide", fontsize=10)
-    return show_or_save(figure, path)
+    return style.show_or_save(figure, path)
 
 
 def _decisive_features(result: Compositional) -> tuple[str, str]:

@@ -20,15 +20,7 @@ from verifai_jax.counterexamples.shrunk import Shrunk
 from verifai_jax.mtl import Explanation, robustness_signal
 from verifai_jax.mtl.bounds import constant_bounds
 from verifai_jax.mtl.formula import formula
-from verifai_jax.plotting.style import (
-    BOUND,
-    FAILING,
-    SAFE,
-    new_figure,
-    show_or_save,
-    tidy,
-    wrap_name,
-)
+from verifai_jax.plotting import style
 
 QUIET = "#8d99ae"
 MAX_BARS = 12
@@ -49,7 +41,7 @@ def plot_explanation(explained: Explained, path: str | Path | None = None) -> Fi
     """
     features = explained.replay.features
     inputs = [i for i in explained.influences if is_waveform(features.get(i.name))][:MAX_SIGNALS]
-    figure = new_figure(figsize=(10.5, 3.4 + 1.3 * len(inputs)))
+    figure = style.new_figure(figsize=(10.5, 3.4 + 1.3 * len(inputs)))
     halves: Any = figure.subfigures(1, 2, width_ratios=(1.6, 1))
     left, right = halves
     heights = [2.2] + [1.0] * len(inputs)
@@ -65,7 +57,7 @@ def plot_explanation(explained: Explained, path: str | Path | None = None) -> Fi
         _short(f"{explained.replay.problem.name}, row {explained.row}: {explained.why.formula}"),
         fontsize=10,
     )
-    return show_or_save(figure, path)
+    return style.show_or_save(figure, path)
 
 
 def draw_decision(axes: Axes, why: Explanation) -> None:
@@ -85,7 +77,7 @@ def draw_decision(axes: Axes, why: Explanation) -> None:
         values = np.asarray(robustness_signal(formula(expression), trace))
         label = str(expression)
     values, margin = values[: len(clock)], np.asarray(robustness_signal(predicate, trace))
-    axes.plot(clock, values, color=BOUND, linewidth=1.7)
+    axes.plot(clock, values, color=style.BOUND, linewidth=1.7)
     if predicate.compared and not bounds:
         _, _, right = predicate.compared
         other = np.asarray(robustness_signal(formula(right), trace))[: len(clock)]
@@ -94,26 +86,26 @@ def draw_decision(axes: Axes, why: Explanation) -> None:
     reach = max(float(np.nanmax(np.abs(values))), 1e-9)
     for bound in bounds:
         if abs(bound) <= 4 * reach:
-            axes.axhline(bound, color=BOUND, linewidth=0.9, linestyle="--", alpha=0.8)
+            axes.axhline(bound, color=style.BOUND, linewidth=0.9, linestyle="--", alpha=0.8)
     axes.fill_between(
         clock, 0, 1, where=margin[: len(clock)] < 0, transform=axes.get_xaxis_transform(),
-        color=FAILING, alpha=0.13, linewidth=0, step="mid",
+        color=style.FAILING, alpha=0.13, linewidth=0, step="mid",
     )  # fmt: skip
     decided = ""
     if np.isfinite(why.time):
         index = int(np.argmin(np.abs(clock - why.time)))
-        axes.axvline(clock[index], color=FAILING, linewidth=1, linestyle=":")
-        axes.plot([clock[index]], [values[index]], "o", color=FAILING, markersize=6)
+        axes.axvline(clock[index], color=style.FAILING, linewidth=1, linestyle=":")
+        axes.plot([clock[index]], [values[index]], "o", color=style.FAILING, markersize=6)
         shown = format_number(float(values[index]))
         if bounds:
             nearest = min(bounds, key=lambda b: abs(b - values[index]))
             shown = format_apart(float(values[index]), nearest)[0]
         decided = f"\n{shown} at {format_seconds(clock[index], 4)}"
-    axes.set_ylabel(wrap_name(label, 28))
+    axes.set_ylabel(style.wrap_name(label, 28))
     # Above the axes, where no curve runs through it.
     title = f"decides: {_short(str(predicate), 100)}{decided}"
-    axes.set_title(title, fontsize=9, color=FAILING, loc="left")
-    tidy(axes)
+    axes.set_title(title, fontsize=9, color=style.FAILING, loc="left")
+    style.tidy(axes)
 
 
 def _draw_input(axes: Axes, influence: Influence, explained: Explained) -> None:
@@ -124,22 +116,22 @@ def _draw_input(axes: Axes, influence: Influence, explained: Explained) -> None:
     knots = knots.reshape(len(knots), -1)
     known = wave.duration is not None or wave.times is not None
     wave = wave if known else wave.over(length)
-    axes.plot(*_course(wave, knots[:, 0], length), color=BOUND, linewidth=1.5)
+    axes.plot(*_course(wave, knots[:, 0], length), color=style.BOUND, linewidth=1.5)
     if wave.hold not in HELD:
         times = control_times(len(knots), wave.hold, wave.times, length)
-        axes.plot(times, knots[:, 0], ".", color=BOUND)
+        axes.plot(times, knots[:, 0], ".", color=style.BOUND)
     if influence.nominal and knots.shape[1] == 1:
         usual = _course(wave, np.array(influence.nominal, float), length)
-        axes.plot(*usual, "--", color=SAFE, linewidth=1, label="nominal")
+        axes.plot(*usual, "--", color=style.SAFE, linewidth=1, label="nominal")
         axes.legend(fontsize=7, frameon=False, loc="upper right")
     gain = np.nan_to_num(influence.each - explained.rho)
     every = [np.nan_to_num(i.each - explained.rho) for i in explained.influences]
     maximum = max((float(g.max(initial=0.0)) for g in every), default=0.0)
     for span, one in zip(influence.spans or (), gain, strict=False):
         if maximum > 0 and one > 0.02 * maximum:
-            axes.axvspan(*span, color=FAILING, alpha=0.25 * one / maximum, linewidth=0)
-    axes.set_ylabel(wrap_name(influence.name, 14))
-    tidy(axes)
+            axes.axvspan(*span, color=style.FAILING, alpha=0.25 * one / maximum, linewidth=0)
+    axes.set_ylabel(style.wrap_name(influence.name, 14))
+    style.tidy(axes)
 
 
 def _course(
@@ -172,10 +164,10 @@ def _draw_bars(axes: Axes, explained: Explained) -> None:
     where = np.arange(len(shown))
     if any(np.isfinite(i.reverted) for i in shown):
         ends = np.array([i.reverted for i in shown])
-        colors = [SAFE if i.gone else FAILING for i in shown]
+        colors = [style.SAFE if i.gone else style.FAILING for i in shown]
         axes.barh(where, ends - explained.rho, left=explained.rho, color=colors, height=0.6)
-        axes.axvline(0, color=BOUND, linewidth=0.9, linestyle="--")
-        axes.axvline(explained.rho, color=FAILING, linewidth=1, linestyle=":")
+        axes.axvline(0, color=style.BOUND, linewidth=0.9, linestyle="--")
+        axes.axvline(explained.rho, color=style.FAILING, linewidth=1, linestyle=":")
         for y, end in zip(where, ends, strict=True):
             # Beside the axes, where no bar and no line is.
             said = format_number(float(end), 3) if np.isfinite(end) else "no verdict"
@@ -190,9 +182,9 @@ def _draw_bars(axes: Axes, explained: Explained) -> None:
         axes.barh(where, sizes, color=QUIET, height=0.6)
         axes.set_xlabel("change of robustness over the feature's range")
         axes.set_title("steepest features", fontsize=9, loc="left")
-    axes.set_yticks(where, [wrap_name(name) for name in names])
+    axes.set_yticks(where, [style.wrap_name(name) for name in names])
     axes.set_ylim(max(len(shown), 4) - 0.4, -0.6)
-    tidy(axes)
+    style.tidy(axes)
     axes.grid(visible=False, axis="y")
 
 
@@ -209,7 +201,7 @@ def plot_shrunk(shrunk: Shrunk, path: str | Path | None = None) -> Figure:
     replay = shrunk.replay()
     names = list(shrunk.changed) or ["nothing departs"]
     shown = names[:24]
-    figure = new_figure(figsize=(10.5, max(3.2, 1.2 + 0.32 * len(shown))))
+    figure = style.new_figure(figsize=(10.5, max(3.2, 1.2 + 0.32 * len(shown))))
     right, left = figure.subplots(1, 2, width_ratios=(1.3, 1))
     draw_decision(right, replay.explain())
     right.set_xlabel("time [s]")
@@ -219,25 +211,25 @@ def plot_shrunk(shrunk: Shrunk, path: str | Path | None = None) -> Figure:
         was, now = shrunk.changed[name]
         left.plot([0, 1], [y, y], color=QUIET, linewidth=3, alpha=0.25, solid_capstyle="round")
         if was is not None:
-            left.plot([shrunk.nominal[i], shrunk.u[i]], [y, y], color=FAILING, linewidth=2)
-            left.plot([shrunk.nominal[i]], [y], "o", color=SAFE, markersize=6)
-        left.plot([shrunk.u[i]], [y], "o", color=FAILING, markersize=7)
+            left.plot([shrunk.nominal[i], shrunk.u[i]], [y, y], color=style.FAILING, linewidth=2)
+            left.plot([shrunk.nominal[i]], [y], "o", color=style.SAFE, markersize=6)
+        left.plot([shrunk.u[i]], [y], "o", color=style.FAILING, markersize=7)
         left.annotate(
             f"{'absent' if was is None else format_number(was)} to {format_number(now)}",
             (0.5, y), xytext=(0, 5), ha="center",
-            textcoords="offset points", fontsize=7, color=BOUND,
+            textcoords="offset points", fontsize=7, color=style.BOUND,
         )  # fmt: skip
-    labels = [wrap_name(label, 24) for label in shrunk.labels[: len(indices)]]
+    labels = [style.wrap_name(label, 24) for label in shrunk.labels[: len(indices)]]
     left.set_yticks(range(len(indices)), labels)
     left.set_ylim(max(len(indices), 1) - 0.4, -0.8)
     left.set_xlim(-0.03, 1.03)
     left.set_xlabel("share of the range: green nominal, red failing")
     title = f"{shrunk.count} of {len(shrunk.u)} depart, by {shrunk.distance:z.3g}"
     left.set_title(title, fontsize=9, loc="left")
-    tidy(left)
+    style.tidy(left)
     left.grid(visible=False, axis="y")
     figure.suptitle(_short(f"{shrunk.problem.name}: the least departure that fails"), fontsize=10)
-    return show_or_save(figure, path)
+    return style.show_or_save(figure, path)
 
 
 def _short(text: str, maximum: int = 110) -> str:

@@ -6,16 +6,8 @@ import numpy as np
 
 from verifai_jax.analysis._coverage import Coverage
 from verifai_jax.core.figure import Figure
+from verifai_jax.plotting import style
 from verifai_jax.plotting.panels import draw_samples, two_features
-from verifai_jax.plotting.style import (
-    BOUND,
-    FAILING,
-    SAFE,
-    new_figure,
-    show_or_save,
-    tidy,
-    wrap_name,
-)
 
 MAX_SHOWN = 12
 """Features drawn, the least covered first."""
@@ -33,26 +25,26 @@ def plot_coverage(coverage: Coverage, path: str | Path | None = None) -> Figure:
     """
     samples = coverage.samples
     worst = coverage.table.sort_values("occupied", kind="stable")
-    figure = new_figure(figsize=(9.6, 4.2))
+    figure = style.new_figure(figsize=(9.6, 4.2))
     left, right = figure.subplots(1, 2)
     shown = worst.head(MAX_SHOWN)
     position = np.arange(len(shown))
     several = len(coverage.table) > 1
     for k, (column, label, color) in enumerate(
-        [("occupied", "its cells", SAFE), ("pairs", "pairs of cells with others", "#8d99ae")]
+        [("occupied", "its cells", style.SAFE), ("pairs", "pairs of cells with others", "#8d99ae")]
     ):
         if column == "pairs" and not several:
             continue
         at = position + (0.38 * k - 0.19) * several
         left.barh(at, np.nan_to_num(shown[column]), 0.34, color=color, label=label)
         expected = shown["expected_pairs" if k else "expected"]
-        left.plot(expected, at, "|", color=BOUND, markersize=10, markeredgewidth=1.5)
-    left.plot([], [], "|", color=BOUND, label="of as many uniform samples")
-    left.set_yticks(position, [wrap_name(str(name)) for name in shown.index])
+        left.plot(expected, at, "|", color=style.BOUND, markersize=10, markeredgewidth=1.5)
+    left.plot([], [], "|", color=style.BOUND, label="of as many uniform samples")
+    left.set_yticks(position, [style.wrap_name(str(name)) for name in shown.index])
     left.invert_yaxis()
     left.set_xlim(0, 1.02)
     left.set_xlabel("share occupied")
-    tidy(left)
+    style.tidy(left)
     left.grid(visible=False, axis="y")
     left.legend(frameon=False, fontsize=7, loc="upper center", bbox_to_anchor=(0.5, 1.14), ncols=3)
     ordered = [column.name for column in samples.ordered]
@@ -64,7 +56,9 @@ def plot_coverage(coverage: Coverage, path: str | Path | None = None) -> Figure:
         and (up in coverage.hole or across == up)
     ):
         y = coverage.hole[up] if across != up else float(np.nanmean(right.get_ylim()))
-        right.plot(coverage.hole[across], y, "X", color=FAILING, markeredgecolor="white", ms=12)
+        right.plot(
+            coverage.hole[across], y, "X", color=style.FAILING, markeredgecolor="white", ms=12
+        )
         right.set_title("cross: middle of the largest hole", fontsize=8)
     figure.suptitle(str(coverage).splitlines()[0][:160], fontsize=9, wrap=True)
-    return show_or_save(figure, path)
+    return style.show_or_save(figure, path)

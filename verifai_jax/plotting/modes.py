@@ -9,20 +9,18 @@ from matplotlib.figure import Figure
 
 from verifai_jax.core.text import format_percent
 from verifai_jax.failure_modes.result import Modes
-from verifai_jax.plotting.style import (
-    BOUND,
-    FAILING,
-    INPUT,
-    NOT_CLAIMED,
-    SAFE,
-    log_ticks,
-    new_figure,
-    show_or_save,
-    tidy,
-    wrap_name,
-)
+from verifai_jax.plotting import style
 
-COLORS = (FAILING, INPUT, SAFE, NOT_CLAIMED, "#8e6c8a", "#7f4f24", "#4ea8de", "#90a955")
+COLORS = (
+    style.FAILING,
+    style.INPUT,
+    style.SAFE,
+    style.NOT_CLAIMED,
+    "#8e6c8a",
+    "#7f4f24",
+    "#4ea8de",
+    "#90a955",
+)
 """Colours of the modes, in turn."""
 WIDEST = 30
 """Characters of a line of a name next to its bar."""
@@ -40,12 +38,12 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
     differ most, next to their likeliest ones.
     """
     numeric = _apart(modes)
-    figure = new_figure(figsize=(10.4 if numeric else 6.2, 0.6 * max(len(modes), 4) + 1.6))
+    figure = style.new_figure(figsize=(10.4 if numeric else 6.2, 0.6 * max(len(modes), 4) + 1.6))
     axes = list(np.atleast_1d(figure.subplots(1, 2 if numeric else 1)))
     _draw_bars(axes[0], modes)
     if numeric:
         _draw_failures(axes[1], modes, numeric)
-    return show_or_save(figure, path)
+    return style.show_or_save(figure, path)
 
 
 def _draw_bars(axes: Axes, modes: Modes) -> None:
@@ -53,15 +51,15 @@ def _draw_bars(axes: Axes, modes: Modes) -> None:
         color = COLORS[mode.number % len(COLORS)]
         axes.plot([mode.low, mode.high], [mode.number] * 2, color=color, linewidth=4, alpha=0.6)
         axes.plot(mode.probability, mode.number, "o", color=color)
-    names = [wrap_name(f"{mode.number}: {mode.name}", WIDEST, 3) for mode in modes]
+    names = [style.wrap_name(f"{mode.number}: {mode.name}", WIDEST, 3) for mode in modes]
     axes.set_yticks(range(len(modes)), names)
     axes.set_ylim(len(modes) - 0.4, -0.6)
     if len(modes):
         axes.set_xscale("log")
-        log_ticks(axes.xaxis)
+        style.log_ticks(axes.xaxis)
     axes.set_xlabel(f"failure probability ({format_percent(modes.confidence)})")
     axes.set_title(f"modes of failure of {modes.name}", fontsize=10)
-    tidy(axes)
+    style.tidy(axes)
 
 
 def _draw_failures(axes: Axes, modes: Modes, names: tuple[str, str]) -> None:
@@ -75,12 +73,12 @@ def _draw_failures(axes: Axes, modes: Modes, names: tuple[str, str]) -> None:
     for mode in modes:
         axes.plot(
             mode.features[first], mode.features[second], "*", markersize=11,
-            markerfacecolor=COLORS[mode.number % len(COLORS)], markeredgecolor=BOUND,
+            markerfacecolor=COLORS[mode.number % len(COLORS)], markeredgecolor=style.BOUND,
         )  # fmt: skip
     axes.set_xlabel(first)
     axes.set_ylabel(second)
     axes.set_title("failures; stars: the likeliest", fontsize=10)
-    tidy(axes)
+    style.tidy(axes)
 
 
 def _apart(modes: Modes) -> tuple[str, str] | None:

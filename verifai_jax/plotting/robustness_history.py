@@ -9,15 +9,7 @@ from jaxtyping import Float, Int
 
 from verifai_jax.core.figure import Axes, Figure
 from verifai_jax.falsification.run import Run
-from verifai_jax.plotting.style import (
-    BOUND,
-    FAILING,
-    NOT_CLAIMED,
-    SAFE,
-    new_figure,
-    show_or_save,
-    tidy,
-)
+from verifai_jax.plotting import style
 
 DOTS = 4000
 """Simulations drawn as dots at most; the lines are exact."""
@@ -38,7 +30,7 @@ def plot_robustness_history(
     """
     runs = {"": run} if isinstance(run, Run) else run
     given: Any = axes
-    figure = new_figure(figsize=(7.5, 4)) if given is None else given.figure
+    figure = style.new_figure(figsize=(7.5, 4)) if given is None else given.figure
     panel = figure.subplots() if given is None else given
     if len(runs) == 1:
         _one(panel, next(iter(runs.values())))
@@ -54,11 +46,11 @@ def plot_robustness_history(
                 panel.plot(failing[0] + 1, rho[failing[0]], "o", color=line.get_color())
         panel.set_xscale("log")
         panel.legend(frameon=False)
-    panel.axhline(0, color=BOUND, linewidth=1, linestyle="--")
+    panel.axhline(0, color=style.BOUND, linewidth=1, linestyle="--")
     panel.set_xlabel("simulations")
     panel.set_ylabel("robustness (negative: violated)")
-    tidy(panel)
-    return show_or_save(figure, path)
+    style.tidy(panel)
+    return style.show_or_save(figure, path)
 
 
 def _one(axes: Axes, run: Run) -> None:
@@ -68,16 +60,18 @@ def _one(axes: Axes, run: Run) -> None:
     # The counterexamples are what one looks for: they are never thinned out.
     failing = _failing(run)
     shown = np.union1d(shown, failing[:DOTS])
-    colors = np.where(np.isin(shown, failing), FAILING, SAFE)
+    colors = np.where(np.isin(shown, failing), style.FAILING, style.SAFE)
     axes.scatter(number[shown], rho[shown], c=colors, s=5, alpha=0.5, linewidths=0)
-    axes.plot(number, np.fmin.accumulate(rho), color=BOUND, linewidth=1.6, label="best so far")
+    axes.plot(
+        number, np.fmin.accumulate(rho), color=style.BOUND, linewidth=1.6, label="best so far"
+    )
     _mark_first(axes, rho, failing)
     doubtful = run.table.unconfirmed.index.to_numpy()
     violating = len(run.table.violating)
     title = f"{run.name}: {violating:,} of {len(rho):,} simulations violate the property"
     if len(doubtful):
         axes.scatter(
-            number[doubtful[:DOTS]], rho[doubtful[:DOTS]], c=NOT_CLAIMED, s=12, marker="^",
+            number[doubtful[:DOTS]], rho[doubtful[:DOTS]], c=style.NOT_CLAIMED, s=12, marker="^",
             linewidths=0, label=f"{len(doubtful):,} not claimed",
         )  # fmt: skip
     axes.set_title(title)
@@ -93,9 +87,9 @@ def _mark_first(axes: Axes, rho: Float[np.ndarray, " n"], failing: Int[np.ndarra
             textcoords="offset points",
             xytext=(24, 48),
             fontsize=8,
-            color=FAILING,
+            color=style.FAILING,
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5},
-            arrowprops={"arrowstyle": "-", "color": FAILING, "linewidth": 0.8},
+            arrowprops={"arrowstyle": "-", "color": style.FAILING, "linewidth": 0.8},
         )
 
 

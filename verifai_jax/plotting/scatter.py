@@ -9,15 +9,7 @@ import pandas as pd
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.figure import Figure
 from verifai_jax.falsification.run import Run
-from verifai_jax.plotting.style import (
-    FAILING,
-    NOT_CLAIMED,
-    SAFE,
-    WITHOUT_VERDICT,
-    new_figure,
-    show_or_save,
-    tidy,
-)
+from verifai_jax.plotting import style
 
 DOTS = 3000
 """Rows drawn of each verdict."""
@@ -55,28 +47,34 @@ def plot_features(
     else:
         check_names("feature", features, run.table.features)
     if not features:
-        figure = new_figure(figsize=(4, 1))
+        figure = style.new_figure(figsize=(4, 1))
         figure.text(0.5, 0.5, f"{run.name}: no feature varies", ha="center", va="center")
-        return show_or_save(figure, path)
+        return style.show_or_save(figure, path)
     if len(features) == 1:
         features = [features[0], features[0]]
     pairs = list(combinations(features, 2))
     columns = min(3, len(pairs))
     rows = -(-len(pairs) // columns)
-    figure = new_figure(figsize=(3.6 * columns + 0.4, 3.2 * rows + 0.5))
+    figure = style.new_figure(figsize=(3.6 * columns + 0.4, 3.2 * rows + 0.5))
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     groups = [
         (f"{len(part):,} {name}", part, color, size, marker)
         for name, part, color, size, marker in (
-            ("safe", run.table.safe, SAFE, 5, "o"),
-            ("without a verdict", run.table.failed, WITHOUT_VERDICT, 12, "x"),
-            ("not claimed", run.table.unconfirmed, NOT_CLAIMED, 12, "^"),
-            ("failing", run.table.counterexamples, FAILING, 9, "o"),
+            ("safe", run.table.safe, style.SAFE, 5, "o"),
+            ("without a verdict", run.table.failed, style.WITHOUT_VERDICT, 12, "x"),
+            ("not claimed", run.table.unconfirmed, style.NOT_CLAIMED, 12, "^"),
+            ("failing", run.table.counterexamples, style.FAILING, 9, "o"),
         )
         if len(part)
     ]
     groups = [
-        (label, part, color, size if color == SAFE else _visible_size(size, len(part)), marker)
+        (
+            label,
+            part,
+            color,
+            size if color == style.SAFE else _visible_size(size, len(part)),
+            marker,
+        )
         for label, part, color, size, marker in groups
     ]
     for axes, (across, up) in zip(panels, pairs, strict=False):
@@ -95,7 +93,7 @@ def plot_features(
             )
         axes.set_xlabel(across)
         axes.set_ylabel("" if across == up else up)
-        tidy(axes)
+        style.tidy(axes)
     for axes in panels[len(pairs) :]:
         axes.set_visible(False)
     rate = run.failure_rate
@@ -114,7 +112,7 @@ def plot_features(
             handles, labels, loc="outside lower center", ncols=len(handles), fontsize=8,
             frameon=False, markerscale=2,
         )  # fmt: skip
-    return show_or_save(figure, path)
+    return style.show_or_save(figure, path)
 
 
 def distinguishing_features(run: Run) -> list[str]:

@@ -10,16 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from verifai_jax.core.text import format_percent, shorten
-from verifai_jax.plotting.style import (
-    BOUND,
-    FAILING,
-    SAFE,
-    WITHOUT_VERDICT,
-    new_figure,
-    show_or_save,
-    tidy,
-    wrap_name,
-)
+from verifai_jax.plotting import style
 from verifai_jax.statistics.confidence_sequences import verdict_kind
 from verifai_jax.sweeps.importance import HyperparameterImportance
 from verifai_jax.sweeps.ranking import (
@@ -34,11 +25,15 @@ from verifai_jax.sweeps.summary import format_failures
 if TYPE_CHECKING:
     import pandas as pd
 
-LOOKS = {"safe": (SAFE, "o"), "undecided": (WITHOUT_VERDICT, "D"), "unsafe": (FAILING, "X")}
+LOOKS = {
+    "safe": (style.SAFE, "o"),
+    "undecided": (style.WITHOUT_VERDICT, "D"),
+    "unsafe": (style.FAILING, "X"),
+}
 """Colour and marker of each verdict."""
 RETURN = "#31688e"
 """Colour of the return."""
-BARS = {"failure_rate": (FAILING, "failing", ""), "nominal_return": (RETURN, "return", "//")}
+BARS = {"failure_rate": (style.FAILING, "failing", ""), "nominal_return": (RETURN, "return", "//")}
 """Colour, name and hatching of the targets of an importance."""
 MAX_BARS = 8
 """Hyper-parameters in a panel, at most."""
@@ -58,7 +53,7 @@ def plot_sweep(sweep: Sweep, path: str | Path | None = None) -> Figure:
     importance = sweep.importance()
     bars = bool(importance.scores)
     widths = [1.5] + [1.0] * bool(curves) + [0.95] * bars
-    figure = new_figure(figsize=(4.2 * sum(widths) - 0.8 * (len(widths) == 3), 4.9))
+    figure = style.new_figure(figsize=(4.2 * sum(widths) - 0.8 * (len(widths) == 3), 4.9))
     panels = list(np.ravel(figure.subplots(1, len(widths), width_ratios=widths)))
     _draw_safety(panels.pop(0), sweep)
     if curves:
@@ -69,7 +64,7 @@ def plot_sweep(sweep: Sweep, path: str | Path | None = None) -> Figure:
     if len(title) > 10 * figure.get_figwidth():
         title = title.replace("; ", "\n", 1)
     figure.suptitle(title, fontsize=11)
-    return show_or_save(figure, path)
+    return style.show_or_save(figure, path)
 
 
 def plot_importance(importance: HyperparameterImportance, path: str | Path | None = None) -> Figure:
@@ -82,9 +77,9 @@ def plot_importance(importance: HyperparameterImportance, path: str | Path | Non
 
     **Returns:** the figure.
     """
-    figure = new_figure(figsize=(6.4, 1.6 + 0.42 * len(importance.table)))
+    figure = style.new_figure(figsize=(6.4, 1.6 + 0.42 * len(importance.table)))
     _draw_importance(figure.subplots(), importance)
-    return show_or_save(figure, path)
+    return style.show_or_save(figure, path)
 
 
 def _draw_importance(axes: Axes, importance: HyperparameterImportance) -> None:
@@ -129,7 +124,7 @@ def _draw_safety(axes: Axes, sweep: Sweep) -> None:
         front["nominal_return"],
         front["failure_rate"],
         facecolors="none",
-        edgecolors=BOUND,
+        edgecolors=style.BOUND,
         s=110 if crowded else 130,
         linewidths=1.1,
         label=f"Pareto front ({len(front)})",
@@ -143,11 +138,13 @@ def _draw_safety(axes: Axes, sweep: Sweep) -> None:
     axes.set_yticks([], minor=True)
     if sweep.p is not None:
         label = f"wanted: below {format_percent(sweep.p)}"
-        axes.axhline(sweep.p, color=BOUND, linewidth=0.9, linestyle="--", zorder=0, label=label)
+        axes.axhline(
+            sweep.p, color=style.BOUND, linewidth=0.9, linestyle="--", zorder=0, label=label
+        )
     axes.set_xlabel("nominal return of the policy")
     axes.set_ylabel("failure probability")
     axes.set_title("Return is not safety", fontsize=10)
-    tidy(axes)
+    style.tidy(axes)
     _legend_below(axes, 3)
 
 
@@ -259,14 +256,14 @@ def _draw_curves(axes: Axes, sweep: Sweep, rows: list[int]) -> None:
                 color=colour,
                 marker="*",
                 markersize=12,
-                markeredgecolor=BOUND,
+                markeredgecolor=style.BOUND,
                 linestyle="none",
                 label=f"row {row}: checkpoint at {steps:,} steps",
             )
     axes.set_xlabel("environment steps in thousands")
     axes.set_ylabel("mean return of training episodes")
     axes.set_title("Learning curves", fontsize=10)
-    tidy(axes)
+    style.tidy(axes)
     _legend_below(axes, 1)
 
 
@@ -300,17 +297,17 @@ def _draw_shares(axes: Axes, importance: HyperparameterImportance) -> None:
             alone,
             at - 0.45 * height,
             at + 0.45 * height,
-            color=BOUND,
+            color=style.BOUND,
             linewidth=1.6,
             label="without interactions" if k == len(targets) - 1 else "",
         )
-    axes.set_yticks(position, [wrap_name(str(name), 18) for name in shown.index])
+    axes.set_yticks(position, [style.wrap_name(str(name), 18) for name in shown.index])
     axes.invert_yaxis()
     axes.set_xlim(0, 1.02)
     axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0", "25 %", "50 %", "75 %", "100 %"])
     axes.set_xlabel("share of the variance, with interactions")
     axes.set_title("Importance", fontsize=10)
-    tidy(axes)
+    style.tidy(axes)
     axes.grid(visible=False, axis="y")
     _legend_below(axes, 1)
 
@@ -323,7 +320,9 @@ def _draw_trends(axes: Axes, importance: HyperparameterImportance) -> None:
     shown = shown.loc[order[:MAX_BARS]]
     height, position = 0.76 / len(names), np.arange(len(shown))
     chance = max(importance.chance.values())
-    axes.axvspan(-chance, chance, color=WITHOUT_VERDICT, alpha=0.18, linewidth=0, label="by chance")
+    axes.axvspan(
+        -chance, chance, color=style.WITHOUT_VERDICT, alpha=0.18, linewidth=0, label="by chance"
+    )
     for k, target in enumerate(importance.scores):
         colour, what, hatch = BARS[target]
         axes.barh(
@@ -336,12 +335,12 @@ def _draw_trends(axes: Axes, importance: HyperparameterImportance) -> None:
             linewidth=0,
             label=what,
         )
-    axes.axvline(0, color=BOUND, linewidth=0.8)
-    axes.set_yticks(position, [wrap_name(str(name), 18) for name in shown.index])
+    axes.axvline(0, color=style.BOUND, linewidth=0.8)
+    axes.set_yticks(position, [style.wrap_name(str(name), 18) for name in shown.index])
     axes.invert_yaxis()
     axes.set_xlim(-1, 1)
     axes.set_xlabel("rank correlation with each alone")
     axes.set_title("Correlations (no model predicts)", fontsize=10)
-    tidy(axes)
+    style.tidy(axes)
     axes.grid(visible=False, axis="y")
     _legend_below(axes, 3)

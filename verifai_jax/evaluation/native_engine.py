@@ -1,0 +1,346 @@
+"""Simulations by native code, where that is worth its compilation, and by XLA otherwise.
+
+    engine = NativeEngine(engine_for(problem, 32768), wanted="auto", budget=100_000)
+    engine.evaluate(u, key, first=0)                    # Verdicts, as of an `Engine`
+
+Which rows are native follows from the problem, the budget and the number of the row: those from
+`FIRST` on, where the budget is worth it. XLA simulates the rows before, while the native program is
+compiled, and all rows whose robustness is so near to zero that rounding may decide the verdict. A
+native program is used once it agreed with XLA on the rows that it met first.
+"""
+
+import re
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache, cached_property
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from verifai_jax.core.keys import IMPLEMENTATION, simulation_key
+from verifai_jax.core.precision import in_precision
+from verifai_jax.core.programs import Slot
+from verifai_jax.core.trace import Status
+from verifai_jax.evaluation.engine import Engine, Wanted
+from verifai_jax.evaluation.verdicts import Verdicts, violations
+from verifai_jax.native_code.library import (
+    Library,
+    Unavailable,
+    approve,
+    is_approved,
+    library_name,
+    load,
+)
+from verifai_jax.native_code.source import translate
+from verifai_jax.native_code.values import Untranslatable
+
+Rows: TypeAlias = Float[np.ndarray, "n row"]
+RunKey: TypeAlias = Key[Array, ""]
+Temperature: TypeAlias = Float[np.ndarray, " n"] | float
+"""Temperatures of the smooth robustness, or one for all."""
+WORTH = 3e9
+"""Operations of a run from which on a native program is worth it by default. XLA's programs do 1.3
+to 4.5e10 a second on two cores (seven problems), and translator and compiler take 1.3 s, once for
+all runs of a machine: a dozen such runs, of a tenth of a second each, pay for it."""
+FIRST = 512
+"""Rows of a run that XLA simulates, so that the first result waits for no second compiler; and rows
+that it simulates at a time where it only decides what is near to zero."""
+SLACK = 4e-7
+"""Robustness below which rounding may decide a verdict, relative to the greatest number of the
+formula: three units in the last place of single precision."""
+AGREES = 1e-3
+"""Relative difference of two robustness values from which on they differ by more than rounding."""
+
+
+class NativeEngine:
+    """Evaluates batches of a problem like the engine that it is given.
+
+    **Arguments:**
+
+    - `engine`: of XLA, in single precision, over points of the unit cube.
+    - `wanted`: `"native"`, or `"auto"` for the rule of the module's docstring.
+    - `budget`: simulations of the run.
+    """
+
+    def __init__(self, engine: Engine, wanted: Wanted, budget: int) -> None:
+        self.engine, self._budget = engine, budget
+        self._wanted: Wanted = wanted
+        self._why = ""
+        self._waited = 0.0
+        self._met: list[tuple[Any, Verdicts]] = []
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Decisions of the engine that a user may not expect."""
+        why = (f"simulated by XLA, not natively: {self._why}",) if self._why else ()
+        return (*self._begun.notes, *why)
+
+    @property
+    def precision(self) -> str:
+        """Precision of the simulations."""
+        return self.engine.precision
+
+    @property
+    def padded(self) -> int:
+        """Rows of the program of XLA."""
+        return self._begun.padded
+
+    @property
+    def compile_seconds(self) -> float:
+        """Seconds spent compiling."""
+        return self._begun.compile_seconds + self._waited
+
+    @property
+    def _begun(self) -> Engine:
+        """The engine of XLA that is being compiled, or would be: nothing is traced to know."""
+        return self.__dict__.get("_xla", self.engine)
+
+    @property
+    def chosen(self) -> Wanted:
+        """The engine that simulates the rows from `FIRST` on, as far as it is known by now."""
+        if "_is_worth" not in self.__dict__:
+            return self._wanted
+        return "native" if self._is_worth and not self._why else "xla"
+
+    def begin_compiling(self) -> None:
+        """Trace now and compile in the background."""
+        self._xla.begin_compiling()
+
+    def compile(self) -> None:
+        """Compile now what the first rows need."""
+        self._xla.compile()
+
+    def evaluate(
+        self,
+        rows: Float[np.ndarray, "n d"],
+        key: Key[Array, ""],
+        first: int = 0,
+        temperature: Float[np.ndarray, " n"] | float = 1.0,
+    ) -> Verdicts:
+        """Simulate rows; see `Engine.evaluate`."""
+        if not self._is_worth:
+            return self.engine.evaluate(rows, key, first, temperature)
+        before = min(max(FIRST - first, 0), len(rows))
+        parts = []
+        if before:
+            some = rows[:before], key, first, _cut(temperature, slice(before))
+            parts.append(self._by_xla(*some))
+            if not self._program.approved:
+                self._met.append((some, parts[0]))
+        self._program.begin()
+        if before < len(rows):
+            rest = _cut(temperature, slice(before, None))
+            parts.append(self._by_native(rows[before:], key, first + before, rest))
+        return Verdicts.concatenate(parts)
+
+    @cached_property
+    def _is_worth(self) -> bool:
+        """True where the work of the run is worth a native program."""
+        if jax.default_backend() != "cpu":
+            self._why = f"runs on the {jax.default_backend()}"
+            return False
+        if self._wanted == "native":
+            return True
+        return self._budget * self.engine.work >= WORTH
+
+    @cached_property
+    def _xla(self) -> Engine:
+        """The engine of XLA: of the whole batch where it does all, or of few rows."""
+        if not self._is_worth or self.engine.batch <= FIRST:
+            return self.engine
+        return self.engine.problem.programs.get(SMALL, self.engine, self._small)
+
+    def _small(self) -> Engine:
+        return self.engine.with_batch(FIRST)
+
+    @cached_property
+    def _program(self) -> "_Program":
+        return self.engine.problem.programs.get(
+            PROGRAMS, self.engine, lambda: _Program(self.engine)
+        )
+
+    def _by_xla(self, rows: Rows, key: RunKey, first: int, temperature: Temperature) -> Verdicts:
+        size, parts = self._xla.batch, []
+        for begin in range(0, len(rows), size):
+            some = slice(begin, begin + size)
+            warm = _cut(temperature, some)
+            parts.append(self._xla.evaluate(rows[some], key, first + begin, warm))
+        return Verdicts.concatenate(parts)
+
+    def _by_native(self, rows: Rows, key: RunKey, first: int, temperature: Temperature) -> Verdicts:
+        started = time.perf_counter()
+        try:
+            self._program.ready()
+        except Unavailable as error:
+            self._why = str(error)
+        self._waited += time.perf_counter() - started
+        if not self._why and not self._program.approved:
+            if not self._met:
+                some = rows[:FIRST], key, first, _cut(temperature, slice(FIRST))
+                self._met.append((some, self._by_xla(*some)))
+            ours = Verdicts.concatenate([self._program(*some) for some, _ in self._met])
+            theirs = Verdicts.concatenate([verdicts for _, verdicts in self._met])
+            self._program.compare(ours, theirs, self._slack)
+            self._why, self._met = self._program.refused, []
+        if self._why:
+            return self._by_xla(rows, key, first, temperature)
+        result = self._program(rows, key, first, temperature)
+        near = np.any(np.abs(result.rho) <= self._slack, axis=1)
+        if not np.any(near):
+            return result
+        # Rows of a system that draws keep their numbers, and so their random keys.
+        size = FIRST if self._program.draws else len(rows)
+        for begin in range(0, len(rows), size):
+            at = begin + np.flatnonzero(near[begin : begin + size])
+            if not len(at):
+                continue
+            some = slice(begin, begin + size) if self._program.draws else at
+            theirs = self._by_xla(rows[some], key, first + begin, _cut(temperature, some))
+            here = at - begin if self._program.draws else slice(None)
+            for mine, other in zip(jax.tree.leaves(result), jax.tree.leaves(theirs), strict=True):
+                mine[at] = other[here]
+        return result
+
+    @cached_property
+    def _slack(self) -> Float[np.ndarray, " formulas"]:
+        """Robustness of each formula below which rounding may decide the verdict."""
+        return np.array(
+            [
+                SLACK * max([1.0, *map(float, re.findall(r"\d+\.?\d*(?:[eE][-+]?\d+)?", str(f)))])
+                for f in self.engine.problem.formulas.values()
+            ]
+        )
+
+
+def _cut(temperature: Temperature, which: slice | np.ndarray) -> Temperature:
+    """Return the temperatures of some rows, or the one of all."""
+    return temperature[which] if isinstance(temperature, np.ndarray) else temperature
+
+
+def _alike(ours: np.ndarray, theirs: np.ndarray) -> bool:
+    """Return whether derivatives agree, but for those of few chaotic simulations."""
+    ours, theirs = ours.reshape(len(ours), -1), theirs.reshape(len(theirs), -1)
+    size = np.max(np.abs(theirs), axis=1, keepdims=True) + 1e-6
+    same = np.isclose(ours, theirs, rtol=0, atol=10 * AGREES * size, equal_nan=True)
+    return bool(np.mean(np.all(same, axis=1)) >= 0.98)
+
+
+class _Program:
+    """The native program of an engine, which is compiled once for the problem."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self.approved = False
+        self.refused = ""
+        self._future: Future[tuple[str, Library]] | None = None
+
+    @cached_property
+    def draws(self) -> bool:
+        """True where the system uses its random key, or may do so."""
+        return self.engine.gradient or self.engine.draws()
+
+    @cached_property
+    def traced(self) -> tuple[Any, str | None]:
+        """The program of a row, its random key by its number; and its identity."""
+        function = self.engine.traced_row()
+        *_, numbers = self.engine._arguments
+
+        def of_row(
+            row: Array, words: Array, number: Array, temperature: Array, numbers: Array
+        ) -> Array:
+            key = simulation_key(jax.random.wrap_key_data(words, impl=IMPLEMENTATION), number)
+            packed = function(row, key, temperature, (), numbers)
+            if set(packed) != {"uint32"}:
+                raise Unavailable("it returns numbers of eight bytes")
+            return packed["uint32"]
+
+        with in_precision(self.engine.precision):
+            forms = (
+                self.engine.inputs.row_form,
+                jax.ShapeDtypeStruct((2,), jnp.uint32),
+                jax.ShapeDtypeStruct((), jnp.int32),
+                jax.ShapeDtypeStruct((), jnp.float32),
+                numbers,
+            )
+            program = self.engine.differentiable(lambda: jax.make_jaxpr(of_row)(*forms))
+            return program, self.engine.row_identity
+
+    def begin(self) -> None:
+        """Begin to compile, where that has not begun."""
+        if self._future is None:
+            self._future = _pool().submit(self._load)
+
+    def ready(self) -> Library:
+        """Return the library, once it is compiled.
+
+        **Raises:** `Unavailable` where there is none.
+        """
+        if self.refused:
+            raise Unavailable(self.refused)
+        self.begin()
+        assert self._future is not None
+        return self._future.result()[1]
+
+    def _load(self) -> tuple[str, Library]:
+        try:
+            program, computes = self.traced
+            name = library_name(computes)
+            agrees = is_approved(name)
+            if agrees is False:
+                raise Unavailable("its results differ from those of XLA by more than rounding")
+            (form,) = program.out_avals
+            with in_precision(self.engine.precision):
+                source = lambda: translate(program)  # noqa: E731
+                library = load(name, form.shape[0], source, quickly=self.engine.gradient)
+            self.approved = bool(agrees)
+            return name, library
+        except Untranslatable as error:
+            raise Unavailable(f"it has {error}, which is not translated") from error
+
+    def __call__(self, rows: Rows, key: RunKey, first: int, temperature: Temperature) -> Verdicts:
+        """Simulate rows."""
+        library = self.ready()
+        temperatures = np.broadcast_to(np.asarray(temperature, np.float32), (len(rows),))
+        words = np.asarray(jax.random.key_data(key))
+        threads = len(self.engine.devices)
+        packed = library(rows, words, first, temperatures, self.engine.numbers, threads)
+        unpacked: Any = self.engine.unpack({"uint32": packed}, len(rows))
+        rho, status, features, more = unpacked
+        # What is exactly zero is decided by XLA.
+        broken = violations(rho, status, lambda: np.ones(rho.shape, bool))
+        return Verdicts(rho, status, broken, features, **more)
+
+    def compare(self, ours: Verdicts, theirs: Verdicts, slack: np.ndarray) -> None:
+        """Compare rows with those of XLA, and note whether they agree."""
+        assert self._future is not None
+        name, _ = self._future.result()
+        mine = ours.rho
+        proper = np.repeat((theirs.status == Status.OK)[:, None], mine.shape[1], axis=1)
+        clear = proper & (np.abs(theirs.rho) > slack)
+        far = np.abs(mine - theirs.rho) > AGREES * (1 + np.abs(theirs.rho))
+        pairs = ((ours.gradient, theirs.gradient), (ours.clause_gradients, theirs.clause_gradients))
+        agrees = bool(
+            np.array_equal(ours.status, theirs.status)
+            and all(_alike(a, b) for a, b in pairs if a is not None and b is not None)
+            and np.array_equal((mine < 0) & clear, (theirs.rho < 0) & clear)
+            # A simulation may be chaotic, and a few of them go their own ways.
+            and np.sum(far & proper & (theirs.rho >= 0)) <= 0.02 * max(np.sum(proper), 1)
+        )
+        approve(name, agrees)
+        self.approved = agrees
+        if not agrees:
+            self.refused = "its results differ from those of XLA by more than rounding"
+
+
+PROGRAMS: Slot[Engine, _Program] = Slot("native programs")
+"""Native programs by the engine of XLA that they stand for."""
+SMALL: Slot[Engine, Engine] = Slot("engines of few rows")
+"""Engines that decide what is near to zero, by the engine of whole batches."""
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, "native compiler")

@@ -1,0 +1,1 @@
+"""Programs that JAX traced, translated to vector code for the machine's own compiler."""

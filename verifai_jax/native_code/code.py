@@ -1,0 +1,214 @@
+"""The text of a translated program: pieces of straight code, with loops and branches around them.
+
+A block of simulations is `K` vectors. A piece runs for one vector after another, with its values in
+registers; what a later piece needs lies in memory. What is the same for all simulations is computed
+once, in front of the piece.
+"""
+
+import re
+from collections import Counter
+
+import numpy as np
+
+from verifai_jax.native_code.values import TYPES, Element, Memory, Untranslatable, constant
+
+MAX_LINES = 30_000
+"""The maximum number of lines of a program; a compiler takes seconds for that many."""
+STACK = 4096
+"""Numbers of a simulation in arrays on the stack at most; others are in the thread's memory."""
+_DIVISION = re.compile(r"F (v\d+) = (\S+) / (v\d+);")
+_NAME = re.compile(r"\bv\d+\b")
+
+
+class Piece:
+    """Straight code: lines for all simulations together, for each vector, and after these."""
+
+    def __init__(self) -> None:
+        self.together: list[str] = []
+        self.each: list[str] = []
+        self.after: list[str] = []
+        self.defined: list[str] = []
+        self.known: dict[str, Element] = {}
+
+
+class Code:
+    """A program that grows line by line."""
+
+    def __init__(self) -> None:
+        self.items: list[Piece | str] = []
+        self.globals: list[str] = []
+        self.declared: list[str] = []
+        self.kinds: dict[str, str] = {}
+        self.kept: set[str] = set()
+        self._arrays: dict[str, tuple[str, int]] = {}
+        self._count = 0
+        self._lines = 0
+        self._constants: dict[tuple[str, bytes], str] = {}
+
+    @property
+    def piece(self) -> Piece:
+        """The piece to which lines are added."""
+        if not self.items or isinstance(self.items[-1], str):
+            self.items.append(Piece())
+        last = self.items[-1]
+        assert isinstance(last, Piece)
+        return last
+
+    def control(self, text: str) -> None:
+        """Add a line between pieces, such as the head of a loop."""
+        self.items.append(text)
+
+    def name(self, prefix: str) -> str:
+        """Return a name that nothing has."""
+        self._count += 1
+        return f"{prefix}{self._count}"
+
+    def define(self, text: str, kind: str, uniform: bool) -> Element:
+        """Add a line that computes a number, and return it."""
+        known = self.piece.known.get(text)
+        if known is not None and known.kind == kind and known.uniform == uniform:
+            return known
+        self._count_line()
+        if uniform:
+            name = self.name("u")
+            self.declared.append(f"{TYPES[kind][1]} {name};")
+            self.piece.together.append(f"{name} = {text};")
+        else:
+            name = self.name("v")
+            self.kinds[name] = kind
+            self.piece.defined.append(name)
+            self.piece.each.append(f"{TYPES[kind][0]} {name} = {text};")
+        return self.piece.known.setdefault(text, Element(name, kind, uniform))
+
+    def fresh(self, kind: str, uniform: bool) -> Element:
+        """Return a number that the next line computes."""
+        name = self.name("w")
+        text = f"{TYPES[kind][1]}()" if uniform else f"{TYPES[kind][0]}()"
+        # With its own name, so that it is no number that is known already.
+        return self.define(f"{text} /* {name} */", kind, uniform)
+
+    def keep(self, kind: str, uniform: bool) -> Element:
+        """Return a number that `assign` changes."""
+        if uniform:
+            name = self.name("u")
+            self.declared.append(f"{TYPES[kind][1]} {name};")
+        else:
+            name = self.name("v")
+            self.kinds[name] = kind
+            self.kept.add(name)
+        return Element(name, kind, uniform)
+
+    def assign(self, changed: list[Element], values: list[Element]) -> None:
+        """Give several numbers of `keep` their values, all at once, at the end of a piece."""
+        last: list[str] = []
+        for name, value in zip(changed, values, strict=True):
+            self._count_line()
+            if name.text == value.text:
+                continue
+            if not name.uniform:
+                self.piece.each.append(f"{name.text}_[k] = {widened(value)};")
+            else:
+                copy = self.fresh(value.kind, True)
+                self.piece.after.append(f"{copy.text} = {value.text};")
+                last.append(f"{name.text} = {copy.text};")
+        self.piece.after += last
+
+    def memory(self, shape: tuple[int, ...], kind: str, uniform: bool = False) -> Memory:
+        """Return a new array in memory."""
+        memory = Memory(self.name("m"), kind, uniform, shape)
+        self._arrays[memory.name] = (TYPES[kind][uniform], 0 if uniform else memory.size)
+        if uniform:
+            self.declared.append(f"{TYPES[kind][1]} {memory.name}[{max(memory.size, 1)}];")
+        return memory
+
+    def table(self, values: np.ndarray, kind: str) -> str:
+        """Return the name of an array of constants."""
+        array = np.ascontiguousarray(values)
+        key = (kind, array.tobytes())
+        if key not in self._constants:
+            name = self._constants[key] = self.name("t")
+            texts = ", ".join(constant(each, kind).text for each in array.ravel())
+            self._count_line(1 + array.size // 16)
+            self.globals.append(
+                f"static const {TYPES[kind][1]} {name}[{max(array.size, 1)}] = {{{texts or 0}}};"
+            )
+        return self._constants[key]
+
+    def store(self, target: str, value: Element, uniform: bool = False) -> None:
+        """Add a line that writes an element of an array."""
+        self._count_line()
+        if uniform:
+            self.piece.together.append(f"{target} = {value.text};")
+        else:
+            self.piece.each.append(f"{target} = {widened(value)};")
+
+    def _count_line(self, lines: int = 1) -> None:
+        self._lines += lines
+        if self._lines > MAX_LINES:
+            raise Untranslatable(f"a program of more than {MAX_LINES:,} lines")
+
+    def body(self) -> tuple[list[str], int]:
+        """Return the lines of the function, and the vectors of memory that a thread needs."""
+        crossing = set(self.kept)
+        used = {}
+        for item in self.items:
+            if isinstance(item, Piece):
+                names = {name for line in item.each for name in _NAME.findall(line)}
+                used[id(item)] = names - set(item.defined)
+                crossing |= used[id(item)]
+        lines = list(self.declared)
+        text = "\n".join("\n".join(i.each) if isinstance(i, Piece) else i for i in self.items)
+        arena, stack = 0, 0
+        written = set(re.findall(r"\bm\d+\b", text))
+        for name, (form, size) in self._arrays.items():
+            if name not in written or not size:
+                continue
+            if stack + size > STACK:
+                lines.append(f"{form} (*{name})[K] = ({form} (*)[K])(arena + {arena} * (long)K);")
+                arena += size
+            else:
+                stack += size
+                lines.append(f"{form} {name}[{size}][K];")
+        lines += [f"{TYPES[self.kinds[n]][0]} {n}_[K];" for n in sorted(crossing)]
+        for item in self.items:
+            if isinstance(item, str):
+                lines.append(item)
+                continue
+            lines += item.together
+            if not item.each:
+                lines += item.after
+                continue
+            loads = [
+                f"{TYPES[self.kinds[name]][0]} {name} = {name}_[k];"
+                for name in sorted(used[id(item)])
+            ]
+            each = shared_divisions(item.each)
+            stores = [f"{name}_[k] = {name};" for name in item.defined if name in crossing]
+            lines += ["REPEAT {", *loads, *each, *stores]
+            lines += ["}", *item.after]
+        return lines, arena
+
+
+def shared_divisions(lines: list[str]) -> list[str]:
+    """Divide by what is divided by more than once through its reciprocal, corrected by a remainder.
+
+    A division takes as long as a dozen multiplications.
+    """
+    found = [_DIVISION.match(line) for line in lines]
+    counts = Counter(each[3] for each in found if each)
+    done, known = [], set[str]()
+    for line, each in zip(lines, found, strict=True):
+        if each is None or counts[each[3]] < 2:
+            done.append(line)
+            continue
+        name, number, divisor = each.groups()
+        if divisor not in known:
+            known.add(divisor)
+            done.append(f"F r{divisor} = 1.f / {divisor};")
+        done.append(f"F {name} = divided(wide({number}), {divisor}, r{divisor});")
+    return done
+
+
+def widened(value: Element) -> str:
+    """Return the expression of an element as a vector."""
+    return f"wide({value.text})" if value.uniform else value.text

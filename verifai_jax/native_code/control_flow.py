@@ -1,0 +1,278 @@
+"""Loops and branches of a translated program."""
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import numpy as np
+
+from verifai_jax.core.fingerprint import programs_in
+from verifai_jax.native_code.translation import SINGLE, Translator, pairs, rule, words_of
+from verifai_jax.native_code.values import (
+    KEY,
+    Element,
+    Equation,
+    Form,
+    Memory,
+    Program,
+    Untranslatable,
+    Value,
+    constant,
+    elements,
+    kind_of,
+)
+
+Forms: TypeAlias = list[Form]
+"""Shapes and types of the values of a loop."""
+CHOSEN = 6
+"""Steps of the branches up to which all of them are taken, and one is chosen."""
+
+
+class Carry:
+    """The values that a loop or a branch changes: variables, or arrays in memory."""
+
+    def __init__(self, t: Translator, forms: Forms, uniform: list[bool]) -> None:
+        self.t, self.forms, self.uniform = t, forms, uniform
+        self.values: list[Value] = []
+        self._next: list[Memory | None] = []
+        for form, same in zip(forms, uniform, strict=True):
+            kind, next_one = kind_of(form.dtype), None
+            if kind == KEY:
+                words = [self._variables(form.shape, "u", same) for _ in range(2)]
+                self.values.append(pairs(*words))
+            elif form.size <= SINGLE:
+                self.values.append(self._variables(form.shape, kind, same))
+            else:
+                self.values.append(t.code.memory(form.shape, kind, same))
+                next_one = t.code.memory(form.shape, kind, same)
+            self._next.append(next_one)
+
+    def _variables(self, shape: tuple[int, ...], kind: str, uniform: bool) -> np.ndarray:
+        out = np.empty(shape, object)
+        for cell in np.ndindex(shape):
+            out[cell] = self.t.code.keep(kind, uniform)
+        return out
+
+    def assign(self, values: list[Value]) -> None:
+        """Give all of them new values, at once."""
+        code = self.t.code
+        changed: list[Element] = []
+        given: list[Element] = []
+        moved: list[tuple[Memory, Memory]] = []
+        for mine, other, memory in zip(self.values, values, self._next, strict=True):
+            if memory is None:
+                changed += single_numbers(mine)
+                given += single_numbers(other)
+                continue
+            assert isinstance(mine, Memory)
+            if isinstance(other, Memory) and other.name == mine.name and not other.offset:
+                continue
+            if isinstance(other, Memory) and not memory.uniform:
+                _store(self.t, memory, other)
+                moved.append((mine, memory))
+                continue
+            for i, each in enumerate(elements(other).ravel()):
+                if memory.uniform:
+                    code.piece.after.append(f"{memory.at(i)} = {each.text};")
+                else:
+                    code.store(memory.at(i), each)
+            moved.append((mine, memory))
+        code.assign(changed, given)
+        for mine, memory in moved:
+            i = code.name("i")
+            line = f"for (int {i} = 0; {i} < {mine.size}; {i}++) {mine.at(i)} = {memory.at(i)};"
+            (code.piece.after if mine.uniform else code.piece.each).append(line)
+
+    def varies(self, values: list[Value]) -> bool:
+        """Note which of them were taken for uniform and are not; return whether any."""
+        found = False
+        for i, value in enumerate(values):
+            if self.uniform[i] and not is_uniform(value):
+                self.uniform[i], found = False, True
+        return found
+
+
+def single_numbers(value: Value) -> list[Element]:
+    """Return the numbers of a value, of random keys their words."""
+    numbers: list[Element] = []
+    for each in elements(value).ravel():
+        numbers += [each] if isinstance(each, Element) else list(each)
+    return numbers
+
+
+def is_uniform(value: Value) -> bool:
+    """Return whether a value is the same for all simulations."""
+    if isinstance(value, Memory):
+        return value.uniform
+    return all(each.uniform for each in single_numbers(value))
+
+
+def until_settled(
+    t: Translator,
+    forms: Forms,
+    uniform: list[bool],
+    emit: Callable[[Carry], list[Value] | None],
+) -> list[Value]:
+    """Write a loop or branch, again as long as more of its values turn out to differ."""
+    t.code.control("")
+    begin = len(t.code.items)
+    while True:
+        carry = Carry(t, forms, uniform)
+        results = emit(carry)
+        if results is not None:
+            return results
+        del t.code.items[begin:]
+
+
+@rule("scan")
+def _scan(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
+    params = step.params
+    consts, count, length = params["num_consts"], params["num_carry"], params["length"]
+    program = params["jaxpr"]
+    shared, start = inputs[:consts], inputs[consts : consts + count]
+    forms = [each.aval for each in step.outvars]
+    if length == 0:
+        return [*start, *(np.empty(form.shape, object) for form in forms[count:])]
+    stacked = [_stacked(t, value) for value in inputs[consts + count :]]
+    wanted = [type(each).__name__ != "DropVar" for each in step.outvars[count:]]
+
+    def emit(carry: Carry) -> list[Value] | None:
+        carry.assign(start)
+        i = t.code.name("i")
+        head = f"{i} = 0; {i} < {length}; {i}++"
+        if params["reverse"]:
+            head = f"{i} = {length - 1}; {i} >= 0; {i}--"
+        outs = [
+            t.code.memory(form.shape, kind_of(form.dtype)) if some else np.empty(0, object)
+            for form, some in zip(forms[count:], wanted, strict=True)
+        ]
+        t.code.control(f"for (int {head}) {{")
+        now = [each(i) for each in stacked]
+        results = t.closed(program, [*shared, *carry.values, *now])
+        if carry.varies(results[:count]):
+            return None
+        for out, value, some in zip(outs, results[count:], wanted, strict=True):
+            if some:
+                assert isinstance(out, Memory)
+                _store(t, out._replace(offset=f"{i} * {out.size // length}"), value)
+        carry.assign(results[:count])
+        t.code.control("}")
+        return [*carry.values, *outs]
+
+    return until_settled(t, forms[:count], [is_uniform(v) for v in start], emit)
+
+
+def _store(t: Translator, out: Memory, value: Value) -> None:
+    if isinstance(value, Memory):
+        i, size = t.code.name("i"), value.size
+        each = f"wide({value.at(i)})" if value.uniform else value.at(i)
+        t.line(f"for (int {i} = 0; {i} < {size}; {i}++) {out.at(i)} = {each};")
+        return
+    for i, each in enumerate(value.ravel()):
+        if not isinstance(each, Element):
+            raise Untranslatable("random keys that a loop collects")
+        t.code.store(out.at(i), each)
+
+
+def _stacked(t: Translator, value: Value) -> Callable[[str], Value]:
+    """Return the function of a loop's counter that gives one row of an array."""
+    if isinstance(value, np.ndarray) and value.size and not isinstance(value.flat[0], Element):
+        high, low = (_stacked(t, words_of(value, word)) for word in (0, 1))
+        return lambda i: pairs(elements(high(i)), elements(low(i)))
+    if len(value.shape) == 1:
+        first = elements(value)[0]
+        numbers = [each.value for each in elements(value)]
+        if first.kind == "i" and None not in numbers:
+            by = int(numbers[1] - numbers[0]) if len(numbers) > 1 else 1
+            if numbers == [numbers[0] + by * i for i in range(len(numbers))]:
+                text = lambda i: f"{int(numbers[0])} + {by} * {i}"  # noqa: E731
+                return lambda i: _single(t.code.define(text(i), "i", True))
+    memory, shape = t.in_memory(value), value.shape[1:]
+    size = int(np.prod(shape, dtype=np.int64))
+
+    def row(i: str) -> Value:
+        offset = " + ".join(filter(None, (memory.offset, f"{i} * {size}")))
+        one = memory._replace(shape=shape, offset=offset, values=None)
+        return one if size > SINGLE else elements(one)
+
+    return row
+
+
+def _single(element: Element) -> np.ndarray:
+    out = np.empty((), object)
+    out[()] = element
+    return out
+
+
+@rule("while")
+def _while(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
+    params = step.params
+    before, inside = params["cond_nconsts"], params["body_nconsts"]
+    asked, shared = inputs[:before], inputs[before : before + inside]
+    start = inputs[before + inside :]
+    forms = [each.aval for each in step.outvars]
+
+    def emit(carry: Carry) -> list[Value] | None:
+        carry.assign(start)
+        t.code.control("for (;;) {")
+        (goes_on,) = t.closed(params["cond_jaxpr"], [*asked, *carry.values])
+        on = elements(goes_on).item()
+        if on.uniform:
+            t.code.control(f"if (!{on.text}) break;")
+            results = t.closed(params["body_jaxpr"], [*shared, *carry.values])
+        else:
+            mask = t.code.keep("b", False)
+            t.code.assign([mask], [on])
+            t.code.control(f"{{ I on = I(); REPEAT on |= {mask.text}_[k]; if (!any(on)) break; }}")
+            results = t.closed(params["body_jaxpr"], [*shared, *carry.values])
+            results = [
+                t.elementwise("select_n", {}, [_single(mask), old, new], kind_of(f.dtype), f.shape)
+                for old, new, f in zip(carry.values, results, forms, strict=True)
+            ]
+        if carry.varies(results):
+            return None
+        carry.assign(results)
+        t.code.control("}")
+        return carry.values
+
+    return until_settled(t, forms, [is_uniform(value) for value in start], emit)
+
+
+@rule("cond")
+def _cond(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
+    branches, (which, *operands) = step.params["branches"], inputs
+    forms = [each.aval for each in step.outvars]
+    index = elements(which).item()
+    if index.value is not None:
+        chosen = min(max(int(index.value), 0), len(branches) - 1)
+        return t.closed(branches[chosen], operands)
+    if index.kind == "b":
+        index = t.compute("convert_element_type", {}, [index], "i")
+    limits = [constant(0, "i"), index, constant(len(branches) - 1, "i")]
+    index = t.compute("clamp", {}, limits, "i")
+    if not index.uniform or sum(map(_steps, branches)) <= CHOSEN:
+        results = [t.closed(branch, operands) for branch in branches]
+        which = _single(index)
+        if len(branches) == 2:
+            which = _single(t.compute("ne", {}, [index, constant(0, "i")], "b"))
+        return [
+            t.elementwise("select_n", {}, [which, *each], kind_of(form.dtype), form.shape)
+            for form, each in zip(forms, zip(*results, strict=True), strict=True)
+        ]
+
+    def emit(carry: Carry) -> list[Value] | None:
+        for number, branch in enumerate(branches):
+            t.code.control(f"{'else ' if number else ''}if ({index.text} == {number}) {{")
+            results = t.closed(branch, operands)
+            if carry.varies(results):
+                return None
+            carry.assign(results)
+            t.code.control("}")
+        return carry.values
+
+    return until_settled(t, forms, [True] * len(forms), emit)
+
+
+def _steps(branch: Program) -> int:
+    """Count the steps of a program, those in it included."""
+    program = getattr(branch, "jaxpr", branch)
+    return sum(1 + sum(4 * _steps(inner) for inner in programs_in(step)) for step in program.eqns)

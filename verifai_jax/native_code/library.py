@@ -1,0 +1,235 @@
+"""Translated programs as libraries of machine code, compiled once and kept on disk.
+
+    name = library_name(fingerprint)                    # None where there is no compiler
+    library = load(name, lambda: translate(program))    # or `Unavailable`, which says why
+    library(rows, key, first, temperatures, numbers)    # [n, count] of bits
+
+The machine's own C++ compiler makes them. A file is only loaded if its content has the checksum
+that its name says, from a folder that nobody else can write to.
+"""
+
+import ctypes
+import hashlib
+import os
+import platform
+import shutil
+import stat
+import subprocess
+import tempfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from verifai_jax.core.cores import available_cores
+from verifai_jax.core.devices import cache_folder
+from verifai_jax.core.remembered import remembered_as
+from verifai_jax.native_code.source import PRELUDE
+
+COMPILERS = ("c++", "g++", "clang++")
+"""Names under which a compiler is looked for."""
+FLAGS = (
+    "-std=c++11", "-shared", "-fPIC", "-march=native", "-ffp-contract=fast", "-w",
+    "-fno-math-errno", "-fno-trapping-math", "-fno-exceptions", "-fno-rtti",
+)  # fmt: skip
+"""Not `-ffast-math`, which takes NaN for a number. XLA contracts to fused operations, too."""
+LONG = 8000
+"""Lines of a program from which on it is compiled with -O1: in half the time, and slower by a
+twentieth (a reverse sweep) to a third (a rollout)."""
+MAX_SECONDS = 60.0
+"""Seconds that a compiler may take; the programs of the shipped problems take up to two."""
+PARTS = 4
+"""Parts of a batch for each thread, so that a core that is busy delays the others less."""
+
+
+class Unavailable(Exception):
+    """There is no library; the text says why."""
+
+
+class Library:
+    """A loaded program of a batch of simulations.
+
+    - `count`: numbers that a simulation returns.
+    """
+
+    def __init__(self, path: Path, count: int) -> None:
+        try:
+            loaded = ctypes.CDLL(str(path))
+        except OSError as error:
+            raise Unavailable(f"{path.name} cannot be loaded: {error}") from error
+        self.count = count
+        self._width = int(loaded.width())
+        self._run = loaded.run
+        pointer, whole = ctypes.c_void_p, ctypes.c_long
+        self._run.argtypes = [
+            pointer, pointer, ctypes.c_int, pointer, pointer, whole, whole, whole, pointer,
+        ]  # fmt: skip
+
+    def __call__(
+        self,
+        rows: Float[np.ndarray, "n d"],
+        key: UInt32[np.ndarray, "2"],
+        first: int,
+        temperatures: Float[np.ndarray, " n"],
+        numbers: Float[np.ndarray, " numbers"],
+        threads: int,
+    ) -> UInt32[np.ndarray, "n count"]:
+        """Simulate rows whose first one has this number, on several threads."""
+        rows = np.ascontiguousarray(rows, np.float32)
+        key, numbers = np.ascontiguousarray(key, np.uint32), np.ascontiguousarray(numbers)
+        temperatures = np.ascontiguousarray(temperatures, np.float32)
+        out = np.empty((self.count, len(rows)), np.uint32)
+        pointers = [a.ctypes.data for a in (rows, key, temperatures, numbers, out)]
+
+        def run(begin: int) -> int:
+            end = min(begin + size, len(rows))
+            given, inputs = pointers[:2], pointers[2:4]
+            return self._run(*given, first, *inputs, begin, end, len(rows), pointers[4])
+
+        blocks = -(-len(rows) // self._width)
+        size = -(-blocks // (threads * PARTS if threads > 1 else 1)) * self._width
+        begins = range(0, len(rows), size) if len(rows) else range(0)
+        each = map(run, begins) if len(begins) < 2 else _threads().map(run, begins)
+        if any(each):
+            raise MemoryError("there is no memory for the arrays of a native program")
+        return out.T
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(available_cores(), "native")
+
+
+def library_name(fingerprint: str | None) -> str:
+    """Return the name of the library of a program, by all that it depends on.
+
+    **Arguments:**
+
+    - `fingerprint`: of the program; None where it has none.
+
+    **Raises:** `Unavailable` where there is no compiler, no cache folder, or no fingerprint.
+    """
+    compiler = _compiler() if os.name == "posix" else None
+    if compiler is None:
+        raise Unavailable("there is no C++ compiler: none of c++, g++, clang++ is in PATH")
+    if cache_folder() is None:
+        raise Unavailable("the cache of compiled programs is switched off")
+    about = compiler.stat()
+    which = (str(compiler), about.st_size, about.st_mtime_ns, _processor(), FLAGS, PRELUDE)
+    name = remembered_as("native", fingerprint, which)
+    if name is None:
+        raise Unavailable("a part of the program cannot be identified")
+    return name
+
+
+def load(name: str, count: int, translate: Callable[[], str], quickly: bool = False) -> Library:
+    """Return the library of this name, compiled where there is none.
+
+    **Arguments:**
+
+    - `name`: as `library_name` gives it.
+    - `count`: numbers that a simulation returns.
+    - `translate`: makes the source.
+    - `quickly`: whether to compile in half the time, for reverse sweeps.
+
+    **Raises:** `Unavailable` where it cannot be compiled, kept or loaded.
+    """
+    try:
+        folder = _folder()
+        path = next(filter(_is_whole, sorted(folder.glob(f"{name}-*.so"))), None)
+        if path is None:
+            path = _compile(folder, name, translate(), quickly)
+        return Library(path, count)
+    except OSError as error:
+        raise Unavailable(f"the cache of compiled programs cannot be used: {error}") from error
+
+
+def is_approved(name: str) -> bool | None:
+    """Return whether a library computes what XLA does, as `approve` noted; None where unknown."""
+    try:
+        return {"yes": True, "no": False}.get((_folder() / f"{name}.agrees").read_text())
+    except (OSError, Unavailable):
+        return None
+
+
+def approve(name: str, agrees: bool) -> None:
+    """Note whether a library computes what XLA does, for later processes."""
+    try:
+        _write(_folder() / f"{name}.agrees", (b"no", b"yes")[agrees])
+    except (OSError, Unavailable):
+        return  # It is compared again.
+
+
+def _folder() -> Path:
+    """Return the folder of libraries, which only this user may write to."""
+    base = cache_folder()
+    assert base is not None
+    folder = base / "native"
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    about = os.lstat(folder)
+    if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid() or about.st_mode & 0o022:
+        raise Unavailable(f"others can write to {folder}, so no program of it is loaded")
+    return folder
+
+
+def _is_whole(path: Path) -> bool:
+    """Return whether a library has the content that its name says."""
+    try:
+        return path.stem.endswith(f"-{_checksum(path.read_bytes())}")
+    except OSError:
+        return False
+
+
+def _checksum(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:32]
+
+
+def _compile(folder: Path, name: str, source: str, quickly: bool) -> Path:
+    compiler = _compiler()
+    assert compiler is not None
+    with tempfile.TemporaryDirectory(dir=folder) as cell:
+        code, made = Path(cell) / "program.cpp", Path(cell) / "program.so"
+        code.write_text(source)
+        effort = "-O1" if quickly or source.count("\n") > LONG else "-O2"
+        command = [str(compiler), effort, *FLAGS, str(code), "-o", str(made), "-lm"]
+        try:
+            done = subprocess.run(
+                command, capture_output=True, timeout=MAX_SECONDS, check=False, cwd=cell,
+                stdin=subprocess.DEVNULL,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired:
+            raise Unavailable(f"{compiler} took more than {MAX_SECONDS:z.0f} s") from None
+        if done.returncode != 0 or not made.is_file():
+            said = done.stderr.decode(errors="replace").strip().splitlines() or ["it said nothing"]
+            raise Unavailable(f"{compiler} failed: {said[0][:200]}")
+        path = folder / f"{name}-{_checksum(made.read_bytes())}.so"
+        # At once, or not at all: another process may be compiling the same.
+        os.replace(made, path)
+        return path
+
+
+def _write(path: Path, data: bytes) -> None:
+    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+        file.write(data)
+    os.replace(file.name, path)
+
+
+def _compiler() -> Path | None:
+    found = filter(None, map(shutil.which, COMPILERS))
+    first = next(found, None)
+    return None if first is None else Path(first).resolve()
+
+
+@cache
+def _processor() -> str:
+    """Return what decides which instructions a compiler may use."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    wanted = ("model name", "flags", "Features", "CPU part")
+    known = sorted({line for line in lines if line.startswith(wanted)})
+    return "\n".join([platform.system(), platform.machine(), platform.processor(), *known])
