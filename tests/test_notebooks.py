@@ -45,7 +45,7 @@ def notebook(*outputs, tags=()):
         ("a\n-----\n1.5", "a\n------\n1.5001"),
     ],
 )
-def test_agree(stored, new):
+def test_outputs_that_differ_in_digits_alone_agree(stored, new):
     assert agree(stored, new)
 
 
@@ -64,7 +64,7 @@ def test_agree(stored, new):
         ("stopped by budget", "stopped by time"),
     ],
 )
-def test_disagree(stored, new):
+def test_outputs_that_say_something_else_disagree(stored, new):
     assert not agree(stored, new)
 
 

@@ -166,7 +166,7 @@ def serve(
 
     **Raises:** `Refused` for a wrong token, another protocol or certificate, or something that is
     no run of verifai_jax; `ConnectionError` when no run could be reached at all and `reconnect`
-    allows no more tries; `ValueError` for a file that is no certificate.
+    allows no more tries; `ValueError` for a file that is not a certificate.
     """
     certificate = certificate or os.environ.get("VERIFAI_JAX_CERTIFICATE") or None
     tls = None if certificate is None else _trusting(certificate)
@@ -455,7 +455,7 @@ def _with_gaps(value: object) -> np.ndarray:
 def encoded(number: int, result: object) -> bytes:
     """Return a result as a frame whose arrays are raw bytes.
 
-    **Raises:** `TypeError` for something that is no result.
+    **Raises:** `TypeError` for something that is not a result.
     """
     if isinstance(result, Mapping):
         signals = result.get("signals")

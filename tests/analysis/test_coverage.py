@@ -126,7 +126,7 @@ def test_absent_entries_and_only_unordered_features():
     assert found.table.loc["c", "occupied"] == 1
 
 
-def test_refusals():
+def test_what_cannot_work_is_refused_with_the_reason():
     table = judged(x=[1.0, 1.0])
     with pytest.raises(ValueError, match="nothing varies among 2 rows of 'table': x has one value"):
         coverage(table)
@@ -134,7 +134,7 @@ def test_refusals():
         coverage(judged(x=[1.0, 2.0]), cells=1)
 
 
-def test_pictures(tmp_path):
+def test_pictures_are_drawn_and_written(tmp_path):
     from PIL import Image
 
     g = np.random.default_rng(0)

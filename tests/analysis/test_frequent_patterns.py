@@ -158,7 +158,7 @@ def test_size_beyond_the_columns_is_all_of_them():
     assert wide.table.equals(frequent_patterns(frame, size=3, minimum=0.01, space=SPACE).table)
 
 
-def test_refused(monkeypatch):
+def test_what_is_wrong_is_refused_where_it_is_made(monkeypatch):
     frame = driving(60)
     with pytest.raises(ValueError, match=r"without bins=\.\.\. needs an unordered column"):
         frequent_patterns(frame, columns=["speed"])

@@ -81,7 +81,7 @@ def test_the_same_seed_gives_the_same_table(found):
     assert not importance(failing_table(3000), seed=1).table.equals(found.table)
 
 
-def test_refusals():
+def test_what_cannot_work_is_refused_with_the_reason():
     with pytest.raises(
         ValueError,
         match="no importance can be learned from 'table': failing: no failing row, too few to "
@@ -92,7 +92,7 @@ def test_refusals():
         importance(failing_table(100), repeats=1)
 
 
-def test_picture(found, tmp_path):
+def test_the_picture_is_drawn_and_written(found, tmp_path):
     from PIL import Image
 
     found.plot(tmp_path / "it.png")

@@ -105,7 +105,7 @@ def test_random_rows():
     assert len(random_rows(frame, 500, 0)) == 80
 
 
-def test_refused():
+def test_what_is_wrong_is_refused_where_it_is_made():
     frame = table("mixed")
     with pytest.raises(ValueError, match="k must be an integer of at least 1; got 0"):
         k_closest(frame, 0)

@@ -171,7 +171,7 @@ def test_generated_samples_keep_lengths_and_constraints():
     assert all(row in known for row in taken.fillna(-1).to_numpy().tolist())
 
 
-def test_refused():
+def test_what_is_wrong_is_refused_where_it_is_made():
     frame = failures_on_a_line(3)
     with pytest.raises(ValueError, match=r"needs an ordered column.*alg is unordered"):
         pca(frame, columns=["alg"])

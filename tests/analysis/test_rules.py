@@ -233,7 +233,7 @@ def test_what_precision_means_depends_on_the_search():
     assert str(rules(run)) == str(rules(run))
 
 
-def test_refusals():
+def test_what_cannot_work_is_refused_with_the_reason():
     table = frame(100)
     table["violated"] = False
     with pytest.raises(ValueError, match="no row of 100 fails; search longer"):
@@ -249,7 +249,7 @@ def test_refusals():
         rules(table.iloc[:0])
 
 
-def test_pictures(tmp_path):
+def test_pictures_are_drawn_and_written(tmp_path):
     from PIL import Image
 
     table = frame(500)

@@ -169,7 +169,7 @@ def test_a_search_that_is_interrupted_leaves_no_table(tmp_path, monkeypatch):
     assert len(result.error_tables[0]) == SMALL["budget"]
 
 
-def test_pictures(whole, tmp_path):
+def test_pictures_are_drawn_and_written(whole, tmp_path):
     result, _ = whole
     for metric in ("error", "offset"):
         result.plot(tmp_path / f"{metric}.png", metric)

@@ -326,7 +326,7 @@ def test_it_reads_well(certificates):
         ({"tie": 2}, "tie must be in \\[0, 1\\); got 2"),
     ],
 )
-def test_refuses(options, told):
+def test_what_cannot_be_certified_is_refused(options, told):
     with pytest.raises(ValueError, match=told):
         certify(problem_of, POLICIES, **options)
 

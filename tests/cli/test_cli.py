@@ -126,7 +126,7 @@ def test_ends_and_warm_start(call):
 
 
 @pytest.mark.slow
-def test_analyze(call, tmp_path):
+def test_analyze_writes_its_findings(call, tmp_path):
     call("falsify", "specs/ramp.py:ramp", "--search", "uniform", "--budget", 400, "--no-pictures")
     output = call("analyze", "runs/ramp-1")
     assert "Where it fails" in output
@@ -135,7 +135,7 @@ def test_analyze(call, tmp_path):
     assert (tmp_path / "runs/ramp-1/analysis/overview.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_list(call):
+def test_list_shows_the_targets(call):
     output = call("list")
     assert "specs/ramp.py:ramp  a ramp that should stay below one" in output
     assert "specs/ramp.py:flat" in output
@@ -511,7 +511,7 @@ def test_doctor_knows_the_defect_of_one_package():
     assert bad_pairs({"mujoco": "3.17.0", "jax": "0.12.0.1"}) == []
 
 
-def test_doctor(call):
+def test_doctor_checks_the_installation(call):
     output = call("doctor")
     assert "jax " in output
     assert "devices" in output
@@ -557,7 +557,7 @@ class TestMonitor:
             "--define", "slow=speed < limit", "--const", "limit=3",
         )  # fmt: skip
 
-    def test_why(self, call, tmp_path):
+    def test_monitor_explains_what_decided(self, call, tmp_path):
         output = call(
             "monitor", "always[0, 1] dist >= 2", "drive.csv", "--explain", "--plot", "why.png"
         )
@@ -596,7 +596,7 @@ class TestMonitor:
             ),
         ],
     )
-    def test_mistakes(self, arguments, message):
+    def test_mistakes_are_reported_in_a_line_without_a_traceback(self, arguments, message):
         result = CliRunner().invoke(main, ["monitor", *arguments])
         assert result.exit_code == 2
         assert message in result.output

@@ -161,7 +161,7 @@ def test_eight_discordant_pairs_of_eight_decide_however_many_others():
 
 
 @pytest.mark.thorough
-def test_command(tmp_path, monkeypatch):
+def test_the_command_compares_two_targets(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "spec.py").write_text(
         "import jax.numpy as jnp\nimport verifai_jax as vj\n"

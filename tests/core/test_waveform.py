@@ -63,7 +63,7 @@ def test_vectors_and_batches():
 
 
 @pytest.mark.thorough
-def test_gradients():
+def test_gradients_are_those_of_the_interpolation():
     slopes = jax.grad(lambda wave: wave(0.625))(LINEAR)
     np.testing.assert_allclose(slopes.knots, [0, 0.75, 0.25, 0, 0], atol=1e-6)
     assert float(jax.grad(LINEAR)(0.2)) == pytest.approx(-6)
@@ -104,7 +104,7 @@ def test_a_duration_is_needed_and_can_be_given():
         (lambda: LINEAR.over("4"), "positive number of seconds; got '4'"),
     ],
 )
-def test_refused(make, message):
+def test_what_is_wrong_is_refused_where_it_is_made(make, message):
     with unchecked(), pytest.raises(ValueError, match=message):
         make()
 

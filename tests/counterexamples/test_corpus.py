@@ -166,7 +166,7 @@ def test_a_full_disk_is_one_error_that_names_the_file_and_hides_no_failure(
 
 
 @pytest.mark.slow
-def test_command(run, tmp_path, monkeypatch):
+def test_the_command_saves_counterexamples(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "spec.py").write_text(
         "import jax.numpy as jnp\nimport verifai_jax as vj\n"

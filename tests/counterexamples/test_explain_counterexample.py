@@ -102,14 +102,14 @@ def test_without_nominal_features(driven):
     assert why.plot() is not None
 
 
-def test_refusals(driven):
+def test_what_cannot_work_is_refused_with_the_reason(driven):
     with pytest.raises(ValueError, match="row 1 is no counterexample: status ok"):
         explain(driven, 1)
     with pytest.raises(ValueError, match="unknown feature 'mas'; did you mean 'mass'"):
         explain(driven, nominal={"mas": 1.0})
 
 
-def test_pictures(explained, tmp_path):
+def test_pictures_are_drawn_and_written(explained, tmp_path):
     figure = explained.plot(tmp_path / "why.png")
     assert (tmp_path / "why.png").stat().st_size > 10_000
     labels = [axes.get_ylabel() for axes in figure.get_axes()]
@@ -140,7 +140,7 @@ def test_an_absolute_value_over_two_formulas_and_a_black_box():
     assert why.plot() is not None
 
 
-def test_words():
+def test_numbers_and_spans_are_written_so_that_they_differ():
     assert format_apart(120.0004, 120.0) == ("120.0004", "120")
     assert format_apart(1.0, 2.0) == ("1", "2")
     assert format_spans([Span(0, 5), Span(5, 10), Span(15, 20)]) == (

@@ -166,7 +166,7 @@ def test_each_kind_by_itself():
     assert shrink(run, 1, budget=200, stay=True).changed["x0"][1] == pytest.approx(1.2, rel=0.01)
 
 
-def test_refusals(edges):
+def test_what_cannot_work_is_refused_with_the_reason(edges):
     safe = int(edges.table.safe.index[0])
     with pytest.raises(ValueError, match=rf"row {safe} is no counterexample: status ok, robustn"):
         shrink(edges, safe)
@@ -277,7 +277,7 @@ def test_the_nearest_point_of_half_spaces():
 
 
 @pytest.mark.thorough
-def test_departures():
+def test_departures_from_nominal_are_counted():
     space = {"x": vj.Box(0.0, 10.0), "n": vj.DiscreteBox(0, 4), "c": vj.Categorical("a", "b", "c")}
     problem = vj.Problem(
         "p", space, lambda f, k: vj.Trace({"m": jnp.zeros(2)}, dt=1.0), "m >= 0",

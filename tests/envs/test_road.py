@@ -97,7 +97,7 @@ class TestPaths:
             (lambda: road.Path.start(0, 0).turn(-3.0, 1.0), "must be positive; got -3.0"),
         ],
     )
-    def test_refusals(self, make, message):
+    def test_what_cannot_work_is_refused_with_the_reason(self, make, message):
         with pytest.raises(ValueError, match=message):
             make()
 

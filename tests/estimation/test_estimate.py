@@ -49,7 +49,7 @@ def test_says_what_is_guaranteed_and_what_is_not(rare):
     assert rare.simulations_until(1e-4) == pytest.approx(29956 - rare.prior_simulations, abs=1)
 
 
-def test_pictures(rare, tmp_path):
+def test_pictures_are_drawn_and_written(rare, tmp_path):
     rare.plot(tmp_path / "estimate.png")
     assert (tmp_path / "estimate.png").stat().st_size > 5000
 
@@ -132,7 +132,7 @@ easy = vj.Problem(
 
 
 @pytest.mark.thorough
-def test_command(tmp_path):
+def test_the_command_estimates_the_probability(tmp_path):
     (tmp_path / "easy.py").write_text(TARGET)
     arguments = [f"{tmp_path / 'easy.py'}:easy", "--budget", "3000", "--p0", "0.5"]
     result = CliRunner().invoke(command, arguments, catch_exceptions=False)

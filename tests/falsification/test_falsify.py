@@ -387,7 +387,7 @@ class TestRefusedBeforeAnythingCompiles:
             ({"search": 3}, "search must be a name or a search like"),
         ],
     )
-    def test_options(self, problem, options, message):
+    def test_options_that_cannot_work_are_refused(self, problem, options, message):
         with unchecked(), pytest.raises((ValueError, TypeError), match=message):
             vj.falsify(problem, **options)
 

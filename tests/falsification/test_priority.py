@@ -53,7 +53,7 @@ def test_a_search_goes_for_the_gravest(ordered, plain):
 
 
 @pytest.mark.thorough
-def test_front(ordered, plain):
+def test_the_front_holds_the_gravest_failures(ordered, plain):
     run = vj.falsify(ordered, "uniform", 256, batch=256)
     broken = np.maximum(-run.table.all[[f"rho.{name}" for name in SPEC]].to_numpy(), 0)
     front = run.front
@@ -83,14 +83,14 @@ def test_resuming_keeps_the_gravest(ordered):
 
 
 class TestStopWhen:
-    def test_within(self, plain):
+    def test_a_run_ends_when_the_rate_is_known_within_a_width(self, plain):
         run = vj.falsify(plain, "uniform", 100_000, batch=256, stop_when=vj.Within(0.05))
         assert run.stopped == "stop_when"
         assert run.failure_rate.high - run.failure_rate.low <= 0.1
         assert run.failure_rate.low <= 1 - 0.97 * 0.25 <= run.failure_rate.high
         assert 256 < run.simulations < 4096
 
-    def test_decided(self, plain):
+    def test_a_run_ends_when_the_rate_is_decided(self, plain):
         run = vj.falsify(plain, "uniform", 100_000, batch=256, stop_when=vj.Decided(0.5))
         assert run.failure_rate.low > 0.5
 

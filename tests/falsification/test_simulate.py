@@ -40,7 +40,7 @@ def test_features_as_a_person_writes_them(problem):
 
 
 @pytest.mark.thorough
-def test_contract():
+def test_the_contract_of_searches_holds():
     points = np.random.default_rng(0).random((50, 2), np.float32)
     check_search(PointList(points), Cube((0, 0)))
     check_batch_independence(PointList(points), Cube((0, 0)))

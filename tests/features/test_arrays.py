@@ -48,7 +48,7 @@ DOMAINS = [
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("domain", DOMAINS, ids=repr)
-def test_laws(domain):
+def test_the_laws_of_domains_hold(domain):
     check_domain(domain)
 
 
@@ -175,7 +175,7 @@ class TestWritten:
             (Items(jnp.zeros(2), jnp.int32(0)), "n must have 1 to 2 items; got 0"),
         ],
     )
-    def test_refused(self, value, message):
+    def test_what_is_wrong_is_refused_where_it_is_made(self, value, message):
         with unchecked(), pytest.raises(ValueError, match=message):
             SPACE.check({"cars": [], "n": value})
 

@@ -85,7 +85,7 @@ POINTS = np.asarray(jax.random.uniform(jax.random.key(2), (4096, SPACE.dim)))
     ],
     ids=["guards", "one event", "dead end"],
 )
-def test_laws(automaton):
+def test_the_laws_of_domains_hold(automaton):
     check_domain(automaton)
 
 

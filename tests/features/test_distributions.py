@@ -38,7 +38,7 @@ POINTS = np.concatenate([TAILS, np.linspace(0, 1, 257)[1:-1], 1 - TAILS]).astype
 @pytest.mark.parametrize("domain", REFERENCES, ids=repr)
 class TestEveryDistribution:
     @pytest.mark.thorough
-    def test_laws(self, domain):
+    def test_the_laws_of_domains_hold(self, domain):
         check_domain(domain)
 
     def test_quantiles(self, domain):
@@ -132,7 +132,7 @@ class TestWeights:
             (["x", 1], "a weight of a Categorical must be a number; got 'x'"),
         ],
     )
-    def test_refused(self, weights, message):
+    def test_what_is_wrong_is_refused_where_it_is_made(self, weights, message):
         with unchecked(), pytest.raises(ValueError, match=message):
             Categorical("a", "b", weights=weights)
 

@@ -40,7 +40,7 @@ DOMAINS = [
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("domain", DOMAINS, ids=repr)
-def test_laws(domain):
+def test_the_laws_of_domains_hold(domain):
     check_domain(domain)
 
 

@@ -158,7 +158,7 @@ def test_half_open_ranges_keep_to_themselves():
     assert vj.Box(0, 1, closed="left") != vj.Box(0, 1)
 
 
-def test_refused():
+def test_what_is_wrong_is_refused_where_it_is_made():
     with pytest.raises(ValueError, match=r"lef.*did you mean 'left'"):
         vj.Box(0, 1, closed="lef")
     with pytest.raises(ValueError, match="a Box must have a float32 number inside"):

@@ -57,7 +57,7 @@ POINTS = np.concatenate([TAILS, np.linspace(0, 1, 257)[1:-1], 1 - TAILS]).astype
 @pytest.mark.parametrize("domain", FAMILIES, ids=repr)
 class TestEveryFamily:
     @pytest.mark.thorough
-    def test_laws(self, domain):
+    def test_the_laws_of_domains_hold(self, domain):
         check_domain(domain)
 
     @pytest.mark.thorough

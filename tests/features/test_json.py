@@ -139,7 +139,7 @@ def only(entry, name="x"):
         ),
     ],
 )  # fmt: skip
-def test_refused(data, message):
+def test_what_is_wrong_is_refused_where_it_is_made(data, message):
     with unchecked(), pytest.raises(ValueError, match=message):
         FeatureSpace.from_json(data)
 

@@ -20,7 +20,7 @@ AFFINE = Reactive(("x", "y"))
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("domain", [NETWORK, AFFINE], ids=["network", "affine"])
-def test_laws(domain):
+def test_the_laws_of_domains_hold(domain):
     check_domain(domain)
 
 

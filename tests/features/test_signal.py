@@ -39,7 +39,7 @@ SIGNALS = [
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("domain", SIGNALS, ids=repr)
-def test_laws(domain):
+def test_the_laws_of_domains_hold(domain):
     check_domain(domain)
 
 
@@ -107,7 +107,7 @@ def test_what_a_person_writes():
         (lambda: SIGNALS[0].refined(0), "factor must be a positive integer; got 0"),
     ],
 )
-def test_refused(make, message):
+def test_what_is_wrong_is_refused_where_it_is_made(make, message):
     with unchecked(), pytest.raises(ValueError, match=message):
         make()
 

@@ -86,7 +86,7 @@ class TestTable:
         features = jax.jit(jax.vmap(SPACE.unflatten))(u)
         return features, pd.DataFrame(SPACE.rows(features))
 
-    def test_columns(self):
+    def test_columns_are_those_of_the_table(self):
         features, frame = self.frame()
         assert tuple(frame.columns) == SPACE.columns
         assert set(frame["alg"]) == {"ppo", "sac"}
@@ -169,11 +169,11 @@ class TestFeatures:
             ({"cars": {"x": [1, 99], "c": [0, 0]}}, r"cars\[1\].x must lie in \[0, 50\]; got 99"),
         ],
     )
-    def test_refused(self, changes, message):
+    def test_what_is_wrong_is_refused_where_it_is_made(self, changes, message):
         with unchecked(), pytest.raises(ValueError, match=message):
             SPACE.coerce({**WRITTEN, **changes})
 
-    def test_missing(self):
+    def test_a_missing_feature_is_named(self):
         with pytest.raises(ValueError, match="point is missing"):
             SPACE.check({k: v for k, v in WRITTEN.items() if k != "point"})
 
@@ -231,6 +231,6 @@ class TestSpaces:
             (lambda: SPACE.unflatten(jnp.zeros(3)), r"u must have shape \[12\].*got \[3\]"),
         ],
     )
-    def test_refused(self, make, message):
+    def test_what_is_wrong_is_refused_where_it_is_made(self, make, message):
         with unchecked(), pytest.raises((ValueError, TypeError), match=message):
             make()

@@ -23,7 +23,7 @@ SPACE = FeatureSpace(BOXES, where=below)
 
 
 class TestConstraints:
-    def test_accepts(self):
+    def test_a_constraint_accepts_one_value_and_a_batch(self):
         assert bool(SPACE.accepts(SPACE.unflatten(jnp.array([0.2, 0.7]))))
         assert not bool(SPACE.accepts(SPACE.unflatten(jnp.array([0.7, 0.2]))))
         assert bool(FeatureSpace(BOXES).accepts({"x": 3, "y": 1}))
@@ -78,7 +78,7 @@ class TestConstraints:
             ),
         ],
     )
-    def test_refused(self, where, message):
+    def test_what_is_wrong_is_refused_where_it_is_made(self, where, message):
         space = FeatureSpace(BOXES, where=where)
         with unchecked(), pytest.raises(ValueError, match=message):
             space.check_where()
@@ -118,7 +118,7 @@ NOMINAL = {"x": 0.5, "n": 1, "alg": "sac", "wind": [0, 1, 0], "cars": [0.25]}
 
 class TestViews:
     @pytest.mark.thorough
-    def test_only(self):
+    def test_only_the_chosen_features_vary(self):
         view = FULL.only("wind", "x", nominal=NOMINAL)
         assert (view.dim, view.columns) == (4, FULL.columns)
         assert view.coordinates == ("x", "wind[0]", "wind[1]", "wind[2]")
@@ -178,6 +178,6 @@ class TestViews:
             ),
         ],
     )
-    def test_refused(self, make, message):
+    def test_what_is_wrong_is_refused_where_it_is_made(self, make, message):
         with unchecked(), pytest.raises(ValueError, match=message):
             make()

@@ -118,7 +118,7 @@ def test_a_run_that_is_interrupted_before_its_first_batch_has_a_summary(monkeypa
 
 
 @pytest.mark.thorough
-def test_pictures(run, tmp_path):
+def test_pictures_are_drawn_and_written(run, tmp_path):
     run.coverage.plot(tmp_path / "pairs.png")
     assert (tmp_path / "pairs.png").stat().st_size > 5000
 
@@ -180,7 +180,7 @@ def test_without_a_formula_a_jax_system_is_checked_too():
         ({"problem": LEVEL, "cell": {}}, "did you mean 'cells'"),
     ],
 )
-def test_refused(options, message):
+def test_what_is_wrong_is_refused_where_it_is_made(options, message):
     started = time.perf_counter()
     with unchecked(), pytest.raises(ValueError, match=message):
         vj.fuzz(**options)

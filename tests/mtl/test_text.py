@@ -75,7 +75,7 @@ X, Y, A, B = signal("x"), signal("y"), signal("a"), signal("b")
         ('"pi" > 2rad', signal("pi") > 2.0),
     ],
 )
-def test_reads(text, formula):
+def test_a_text_is_read_as_its_formula(text, formula):
     parsed = parse(text)
     assert parsed == formula
     assert parse(str(parsed)) == parsed
@@ -106,7 +106,7 @@ def test_reads(text, formula):
         (signal("a b") > 0, '"a b" > 0'),
     ],
 )
-def test_writes(formula, text):
+def test_a_formula_is_written_so_that_it_is_read_again(formula, text):
     assert str(formula) == text
     assert parse(text) == formula
 
@@ -174,7 +174,7 @@ def test_writes(formula, text):
         ("(x + y)[0] > 2", "a component is a signal and a whole number"),
     ],
 )
-def test_refuses(text, message):
+def test_a_text_that_is_not_a_formula_is_refused(text, message):
     with pytest.raises(FormulaSyntaxError) as caught:
         parse(text)
     assert message in str(caught.value).split("\n")[0]
@@ -239,7 +239,7 @@ def test_python_refuses_what_makes_no_sense():
         signal('a"b')
 
 
-def test_services():
+def test_a_formula_knows_its_signals_and_its_horizon():
     formula = parse("G[0,2] (x > 0 -> F[0.5,1] (y > 0 U[0,3] z)) & O[0,9] w & x < 1")
     assert formula.signals() == ("x", "y", "z", "w")
     assert formula.horizon() == 6.0
@@ -255,7 +255,7 @@ def test_services():
     assert simplify(parse("a & FALSE")) == FALSE
 
 
-def test_latex():
+def test_a_formula_is_written_in_latex():
     assert latex(parse("-(x / 2)**2 > y**-1")) == (
         r"-\left(\frac{\mathit{x}}{2}\right)^{2} > \mathit{y}^{-1}"
     )

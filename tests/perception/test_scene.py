@@ -318,7 +318,7 @@ def test_coverage_of_a_strip_is_its_width():
     assert coverage(jnp.asarray([-1.0, 0.0, 0.25, 1.0])).tolist() == [0.0, 0.5, 0.75, 1.0]
 
 
-def test_hues():
+def test_hues_are_the_colours_of_the_wheel():
     for hue, rgb in {0.0: (1, 0, 0), 1 / 3: (0, 1, 0), 2 / 3: (0, 0, 1), 1 / 6: (1, 1, 0)}.items():
         np.testing.assert_allclose(hsv(hue), rgb, atol=1e-5)
     np.testing.assert_allclose(hsv(0.2, 0.0, 0.7), [0.7] * 3, atol=1e-6)

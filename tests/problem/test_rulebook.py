@@ -21,7 +21,7 @@ def bits(text):
 
 
 @pytest.mark.parametrize(("one", "other"), list(itertools.permutations(VECTORS, 2)))
-def test_example(one, other):
+def test_the_example_of_the_paper_is_ordered_as_there(one, other):
     graver = EXAMPLE.graver(bits(VECTORS[one]), bits(VECTORS[other]))
     assert graver == (one + other in GRAVER)
 
@@ -65,7 +65,7 @@ def by_definition(rulebook, one, other):
 
 @given(rulebooks(), st.data())
 @settings(max_examples=80, deadline=None)
-def test_definition(rulebook, data):
+def test_the_order_is_the_one_of_the_definition(rulebook, data):
     degrees = st.lists(
         st.integers(0, 2), min_size=len(rulebook.names), max_size=len(rulebook.names)
     )

@@ -142,7 +142,7 @@ def test_points_follow_the_histograms():
     ],
     ids=lambda cube: f"{len(cube.levels)} {cube.levels[:3]} {cube.lengths}",
 )
-def test_contract(cube):
+def test_the_contract_of_searches_holds(cube):
     check_search(CECompat(), cube)
 
 

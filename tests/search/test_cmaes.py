@@ -143,7 +143,7 @@ def test_a_diagonal_covariance_learns_the_scales():
         assert np.max(np.abs(evolution.mean)) < 0.02
 
 
-def test_recombination():
+def test_the_better_half_is_recombined_by_rank():
     # The better half of what is there, in the order of the ranks; ties share.
     inf = np.inf
     weights = np.maximum(np.log(2.5) - np.log([3, inf, 1, 2, 4]), 0)
@@ -202,7 +202,7 @@ def test_a_warm_start_begins_at_the_best_point():
     ],
     ids=["weighted", "unordered"],
 )
-def test_contract(cube):
+def test_the_contract_of_searches_holds(cube):
     check_search(CMAES(), cube, batch=5, rounds=6)
 
 

@@ -73,7 +73,7 @@ def compiled(search):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("search", "cube"), EACH)
-def test_contract(search, cube):
+def test_the_contract_of_searches_holds(search, cube):
     refused = REFUSED.get((type(search).__name__, cube))
     if refused is not None:
         with unchecked(), pytest.raises(ValueError, match=refused):
@@ -157,7 +157,7 @@ def test_useless_batches_leave_a_search_alive(search, spoil):
 
 
 class TestNames:
-    def test_all(self):
+    def test_every_name_makes_its_search(self):
         assert {"uniform", "halton", "cross_entropy", "gradient"} < set(names())
         for name in names():
             assert named(name) == type(named(name))()
@@ -171,7 +171,7 @@ class TestNames:
             ("uniform", {"elite": 1}, "option of search uniform 'elite'.*There is no"),
         ],
     )
-    def test_misspelt(self, name, options, message):
+    def test_a_misspelt_search_or_option_is_named(self, name, options, message):
         with unchecked(), pytest.raises(ValueError, match=message):
             named(name, **options)
 

@@ -29,7 +29,7 @@ MIXED = Cube((0, 4, 0, 3), ordered=(True, True, True, False))
     ],
     ids=str,
 )
-def test_contract(search, cube):
+def test_the_contract_of_searches_holds(search, cube):
     check_search(Diverse(search, capacity=8), cube)
 
 
@@ -68,7 +68,7 @@ def test_it_is_what_the_search_inside_is():
     assert Diverse(Uniform()).learns
 
 
-def test_refusals():
+def test_what_cannot_work_is_refused_with_the_reason():
     with (
         unchecked(),
         pytest.raises(TypeError, match=r"Diverse needs a search like CrossEntropy\(\); got 'ce'"),

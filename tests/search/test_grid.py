@@ -112,7 +112,7 @@ def test_large_indices_are_exact():
     assert search.ask(after, cube, 8)[1].index == total
 
 
-def test_totals():
+def test_a_grid_counts_its_points():
     assert Grid().total(Cube((0, 0, 4))) == 21 * 21 * 4
     assert Grid().total(Cube(())) == 1
     assert whole(Grid(), Cube(()), batch=1).shape == (1, 0)
@@ -130,7 +130,7 @@ def test_totals():
     ],
     ids=lambda cube: str(cube.levels),
 )
-def test_contract(cube):
+def test_the_contract_of_searches_holds(cube):
     check_search(Grid(), cube)
 
 

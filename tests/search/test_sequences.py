@@ -114,7 +114,7 @@ class TestHalton:
         even = stats.qmc.discrepancy(points(Halton(), 4, 256))
         assert even < 0.35 * stats.qmc.discrepancy(points(Uniform(), 4, 256))
 
-    def test_primes(self):
+    def test_primes_are_the_first_ones(self):
         assert primes(6) == [2, 3, 5, 7, 11, 13]
         assert primes(0) == []
         assert primes(200)[-1] == 1223

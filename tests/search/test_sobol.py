@@ -95,7 +95,7 @@ def test_the_key_decides_only_if_scrambled():
 
 
 @pytest.mark.thorough
-def test_contract():
+def test_the_contract_of_searches_holds():
     for cube in (Cube(()), Cube((0,) * 200)):
         check_search(Sobol(), cube)
     check_search(Sobol(scramble=False), Cube((0, 4, 0, 1, 1000)))
@@ -103,7 +103,7 @@ def test_contract():
         check_batch_independence(Sobol(scramble), Cube((0, 0, 5)))
 
 
-def test_refusals():
+def test_what_cannot_work_is_refused_with_the_reason():
     with unchecked(), pytest.raises(ValueError, match="scramble must be True or False; got 1"):
         Sobol(scramble=1)
     with pytest.raises(ValueError, match="at most 21201 unit coordinates; this space has 21202"):

@@ -38,7 +38,7 @@ CUBE = Cube(
     ],
     ids=repr,
 )
-def test_contract(search):
+def test_the_contract_of_searches_holds(search):
     check_search(search, CUBE)
 
 
@@ -90,7 +90,7 @@ def test_what_the_whole_is():
 @pytest.mark.parametrize(
     "search", [Split({"x": Gradient(shrinks=0.5)}, CrossEntropy(elite=0.2)), Halton(scramble=True)]
 )
-def test_json(search):
+def test_a_split_is_recorded_and_read_again(search):
     assert from_json(to_json(search)) == search
 
 

@@ -100,7 +100,7 @@ def test_looking_again_and_again_the_intervals_miss_as_rarely_as_they_say(q):
     assert (below | above).mean() > 0.01
 
 
-def test_verdicts():
+def test_an_interval_decides_whether_a_policy_is_safe():
     assert verdict(simultaneous_interval(0, 2000), 0.01) == "safe@0.01"
     assert verdict(simultaneous_interval(0, 100), 0.01) == "undecided"
     assert verdict(simultaneous_interval(50, 500), 0.01) == "unsafe"

@@ -92,7 +92,7 @@ class TestStopping:
         n = simulations_without_failure(rate, confidence)
         assert (1 - rate) ** n <= 1 - confidence < (1 - rate) ** (n - 1)
 
-    def test_rules(self):
+    def test_stopping_rules_end_when_the_interval_is_narrow_or_decided(self):
         assert not Within(0.01).done(0, 0)
         assert not Within(0.01).done(30, 1000)
         assert Within(0.01).done(300, 10_000)

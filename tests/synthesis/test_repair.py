@@ -275,7 +275,7 @@ def test_arrays_must_be_real():
 
 
 @pytest.mark.thorough
-def test_command(tmp_path):
+def test_the_command_repairs_and_reports(tmp_path):
     arguments = ["specs/tuning.py:first_order", "--parameters", "k", "--budget", "2500"]
     options = ["--no-gradient", "--attack", "halton", "--held-out", "100"]
     options += ["--plot", str(tmp_path / "rounds.png")]

@@ -268,7 +268,7 @@ def test_a_fixed_feature_is_no_parameter():
         synthesize(first_order.only("k", "w"), ["x0"])
 
 
-def test_command(tmp_path):
+def test_the_command_synthesizes_and_reports(tmp_path):
     arguments = ["specs/tuning.py:first_order", "--parameters", "k", "--budget", "1500"]
     options = ["--no-gradient", "--attack", "halton", "--held-out", "100"]
     options += ["--table", str(tmp_path / "found.csv")]

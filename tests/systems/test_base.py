@@ -55,7 +55,7 @@ def test_a_function_is_wrapped_once_for_jax():
     assert vj.Problem("again", SPACE, problem.system, "x <= 1").system is problem.system
 
 
-def test_defaults():
+def test_a_system_offers_nothing_unless_it_says_so():
     for system in (Half(), as_system(constant)):
         assert not system.black_box
         assert (system.lanes, system.forward_up_to, system.reverse_hint) == (512, 1, "")

@@ -48,7 +48,7 @@ class FrequentPatterns(Drawn):
     """Frequent combinations of values among `samples`.
 
     **Fields:** `items`: the single values, also those that never occur; `combinations`: each a
-    tuple of places in `items`; `counts` of rows; `minimum`: the least share that was looked for;
+    tuple of indices in `items`; `counts` of rows; `minimum`: the least share that was looked for;
     `against`: what the shares are compared with, `"table"`, `"prior"` or `"nothing"`; `expected`:
     the shares compared with.
     """
@@ -116,7 +116,7 @@ class FrequentPatterns(Drawn):
     def rows(self, index: int) -> Int[np.ndarray, " count"]:
         """Return the row numbers that the combination in row `index` of `table` covers.
 
-        **Raises:** `IndexError` for a place that is not in the table.
+        **Raises:** `IndexError` for an index that is not in the table.
         """
         if not 0 <= index < len(self.combinations):
             raise IndexError(

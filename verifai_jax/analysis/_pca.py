@@ -39,7 +39,7 @@ from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
 SHOWN = 5
-"""Components that are told, and compared with chance."""
+"""Components that are described, and compared with chance."""
 CHANCE = 0.99
 """Share of tables of unrelated features whose components explain less than a telling one does."""
 _TABLES = 300

@@ -76,7 +76,7 @@ class Region:
     """A box: bounds on the ordered columns, allowed choices of the unordered ones.
 
     **Fields:** `above` and `upto`, one a column of `Samples.values()`, infinite where there is no
-    bound; `allowed`: for each column of `Samples.codes()` the places allowed, None for all.
+    bound; `allowed`: for each column of `Samples.codes()` the indices allowed, None for all.
     """
 
     above: tuple[float, ...]

@@ -40,7 +40,7 @@ class Neighbours(Drawn):
 
     **Fields:** `rows` `[k]`: row numbers of the table; `distances` `[k]` of each from the centre,
     in the coordinates of `samples.points`, NaN for rows drawn at random; `centre`: the row around
-    which they lie, None if that is no row; `how`: how they were chosen, as text.
+    which they lie, None if that is not a row; `how`: how they were chosen, as text.
     """
 
     _picture = "neighbours", "plot_neighbours"

@@ -18,7 +18,7 @@ _ENTRIES = 20_000_000
 
 
 def tightest(coordinates: Float[np.ndarray, "n p"], codes: Int[np.ndarray, "n m"], k: int) -> int:
-    """Return the place of a row whose `k` nearest, itself included, have the least summed distance.
+    """Return the index of a row whose `k` nearest, itself included, have the least summed distance.
 
     The squared distance is that of the coordinates plus the number of different codes.
     """
@@ -48,7 +48,7 @@ def tightest(coordinates: Float[np.ndarray, "n p"], codes: Int[np.ndarray, "n m"
 
 
 def _groups(codes: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the places of rows with the same codes, group by group."""
+    """Yield the indices of rows with the same codes, group by group."""
     if codes.shape[1] == 0:
         yield np.arange(len(codes))
         return
@@ -102,8 +102,8 @@ def _tree(coordinates: np.ndarray) -> Any:
 def _nearest_of_all(
     coordinates: np.ndarray, codes: np.ndarray, some: np.ndarray, k: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances and places of the `k` nearest of `some` rows, by comparing them with all."""
-    # From the middle of the cloud, so that its place costs no digits.
+    """Return distances and indices of the `k` nearest rows of `some`, compared with all rows."""
+    # From the middle of the cloud, so that large coordinates cost no digits.
     centred = coordinates - coordinates.mean(axis=0)
     squares = (centred**2).sum(axis=1)
     squared = squares[some, None] + squares - 2 * centred[some] @ centred.T

@@ -43,7 +43,7 @@ class Examples:
         return len(self.rows)
 
     def take(self, indices: Any) -> "Examples":
-        """Return the examples at these places, in this order."""
+        """Return the examples at these indices, in this order."""
         inputs, labels = jax.tree.map(lambda leaf: leaf[indices], (self.inputs, self.labels))
         return Examples(self.rows.iloc[indices].reset_index(drop=True), inputs, labels)
 

@@ -150,7 +150,7 @@ class Augmentation(InNotebook):
 
         **Arguments:**
 
-        - `path`: of a picture to write; none when left out.
+        - `path`: file that the picture is written to, if given.
         - `metric`, `reference`: as in `compare`.
 
         **Returns:** the figure.
@@ -171,7 +171,7 @@ class Augmentation(InNotebook):
 
         **Arguments:**
 
-        - `path`: of a picture to write; none when left out.
+        - `path`: file that the picture is written to, if given.
         - `arm`, `seed`: as in `examples`.
         - `count`: images at most.
 

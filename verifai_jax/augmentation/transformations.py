@@ -24,7 +24,7 @@ from verifai_jax.core.checks import check_count, check_fraction
 def combine(*transformations: Transformation) -> Transformation:
     """Return the transformation that applies these, one after the other.
 
-    **Raises:** `TypeError` for what is no function.
+    **Raises:** `TypeError` for anything that is not a function.
     """
     for transformation in transformations:
         if not callable(transformation):

@@ -46,7 +46,8 @@ class Leader(NamedTuple):
 
     - `number`: the policy with the least posterior mean.
     - `chance`: posterior probability that no rate is below the leader's by more than `tie`.
-    - `rivals`: of each policy the probability that its rate is.
+    - `rivals`: for each policy, the probability that its rate is below the leader's by more than
+      that.
     """
 
     number: int

@@ -67,7 +67,7 @@ def check_attack(problem: Problem, search: str | Search) -> Search:
     """Return the search, if it can attack many policies.
 
     **Raises:** `ValueError` for an unknown name, one that the space does not suit, or one that
-    follows gradients; `TypeError` for what is no search.
+    follows gradients; `TypeError` for anything that is not a search.
     """
     found = searches.named(search) if isinstance(search, str) else search
     if isinstance(found, Search) and found.wants.derivatives:

@@ -28,10 +28,10 @@ MIN_WIDTH = 64
 class PolicyGroup:
     """Policies that one program can simulate.
 
-    - `numbers`: their places in the list that was given.
+    - `numbers`: their indices in the list that was given.
     - `weights`: the padded policies, with NumPy leaves, in that order.
     - `structure`: what they have in common, as text.
-    - `traced`: False for a policy that is no pytree of numbers and has to stay as it is.
+    - `traced`: False for a policy that is not a pytree of numbers and has to stay as it is.
     """
 
     numbers: tuple[int, ...]

@@ -50,7 +50,7 @@ class Simulator(Protocol):
 
         **Arguments:**
 
-        - `members`: of each block the policy, by its place in the group.
+        - `members`: of each block the policy, by its index in the group.
         - `points`: the samples of each block.
         - `first`: of each block the number of its first sample, which its random keys come from.
         - `key`: of all simulations.
@@ -249,7 +249,7 @@ def _one_by_one(devices: Sequence[Device]) -> bool:
 def _spread(
     rows: ArrayLike | Sequence[ArrayLike], indices: Int[np.ndarray, " n"], whole: int
 ) -> np.ndarray:
-    """Return an array of `whole` rows with these at their places, and the first one elsewhere."""
+    """Return an array of `whole` rows with these at their indices, and the first one elsewhere."""
     given = np.asarray(rows)
     spread = np.empty((whole, *given.shape[1:]), given.dtype)
     spread[:] = given[0]

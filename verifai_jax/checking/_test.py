@@ -58,8 +58,8 @@ def test(
     **Returns:** a decorator of a test function, which is called after the test has passed; a
     parameter `run` gets the `Run`, and all others are pytest's fixtures.
 
-    **Raises:** `TypeError` for something that is no problem; `ValueError` for numbers out of range,
-    and for a budget with which no test could pass.
+    **Raises:** `TypeError` for something that is not a problem; `ValueError` for numbers out of
+    range, and for a budget with which no test could pass.
     """
     if not isinstance(problem, Problem | str):
         raise TypeError(

@@ -325,7 +325,7 @@ def refuse_others(allowed: Container[str], why: str) -> None:
 
     **Arguments:**
 
-    - `allowed`: names of parameters, beside those that every command has.
+    - `allowed`: names of parameters, in addition to those that every command has.
     - `why`: the end of the message, after the option.
     """
     context = click.get_current_context()

@@ -54,7 +54,7 @@ USAGE_ERRORS = (
 
 
 class CommandError(click.ClickException):
-    """An error that is told in one line, with its exit code."""
+    """An error that is reported in one line, with its exit code."""
 
     def __init__(self, message: str, exit_code: int) -> None:
         super().__init__(message)

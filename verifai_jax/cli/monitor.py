@@ -118,7 +118,7 @@ def _read(
     period: float | None,
     method: Literal["hold", "linear"] | None,
 ) -> "Trace":
-    """Read the recording; what is missing is told as an option of this command."""
+    """Read the recording; what is missing is reported as an option of this command."""
     from verifai_jax import mtl
 
     if (period is None) != (method is None):

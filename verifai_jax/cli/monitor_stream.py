@@ -165,7 +165,7 @@ def _samples(lines: Iterable[str], formula: "Formula", time: str | None) -> Iter
 
 
 def _seconds_since(first: list[datetime.datetime], cell: str) -> float | None:
-    """Return the seconds since the first date of the stream; None for a cell that is no date."""
+    """Return the seconds since the first date of the stream; None for a cell that is not a date."""
     from verifai_jax.mtl.columns import moment_of
 
     text = cell.strip()

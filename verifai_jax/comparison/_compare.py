@@ -308,7 +308,7 @@ def _common(one: Mapping[str, Domain], other: Mapping[str, Domain]) -> list[str]
 
 
 def _held(space: FeatureSpace) -> dict[str, str]:
-    """Return the features that do not vary, as they are told."""
+    """Return the features that do not vary, as text."""
     return {name: repr(domain) for name, domain in space.root.fields if not domain.size}
 
 

@@ -90,7 +90,7 @@ class Comparison(InNotebook):
     - `simulations`: made in all.
     - `stopped`: `"decided"`, `"budget"`, `"max_seconds"` or `"interrupted"`.
     - `seconds`, `seed`: of the comparison.
-    - `notes`: what the two sides differ in beside the system.
+    - `notes`: differences of the two sides other than the system.
     - `sources`: what each side was made of, by its name, as a run records it; that of the baseline
       has the name `"baseline"`.
     """

@@ -286,4 +286,4 @@ class _Stages:
 
 
 CANDIDATE = ("image", "simulated", "rho", "fails", "rendered")
-"""Columns of a candidate beside its features."""
+"""Columns of a candidate in addition to its features."""

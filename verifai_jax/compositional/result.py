@@ -112,7 +112,7 @@ class Compositional(InNotebook):
 
         **Arguments:**
 
-        - `path`: of a picture to write; none when left out.
+        - `path`: file that the picture is written to, if given.
         - `features`: the columns; by default the two that the region depends on most.
 
         **Returns:** the figure.

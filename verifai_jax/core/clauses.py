@@ -1,6 +1,6 @@
 """Clauses of a requirement: how many have values of their own, and the value of one that is absent.
 
-`mtl.clauses` makes them, and searches are told of them.
+`mtl.clauses` makes them, and searches learn of them.
 """
 
 CLAUSES = 4

@@ -25,7 +25,7 @@ def available_cores() -> int:
 def claim_cores() -> None:
     """Give JAX one host device per core, unless its backend runs or the user chose a number.
 
-    **Raises:** `ValueError` for a `VERIFAI_JAX_CORES` that is no positive integer.
+    **Raises:** `ValueError` for a `VERIFAI_JAX_CORES` that is not a positive integer.
     """
     wanted = os.environ.get("VERIFAI_JAX_CORES", "").strip()
     if wanted and (not wanted.isdecimal() or int(wanted) < 1):

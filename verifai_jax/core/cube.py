@@ -119,7 +119,7 @@ class Cube:
 
     @cached_property
     def _edges(self) -> tuple[tuple[int, Float[np.ndarray, " edges"]], ...]:
-        """Where the unequal cells begin and end, by place among the discrete coordinates."""
+        """Where the unequal cells begin and end, by index among the discrete coordinates."""
         return tuple(
             (j, np.concatenate([[0], np.cumsum(self.probabilities[j])]).astype(np.float32))
             for j, i in enumerate(self.discrete)

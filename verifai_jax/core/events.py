@@ -1,7 +1,7 @@
 """A sequence of timed events, as an `Automaton` feature gives it to a system.
 
     events = features["traffic"]
-    events.times, events.kinds, events["gap"]           # [places] each, with `events.mask`
+    events.times, events.kinds, events["gap"]           # [slots] each, with `events.mask`
     events.within("cut_in", time, 2.0)                  # during two seconds after such an event
     events.latest("gap", time, otherwise=100.0)         # the parameter of the latest event
 
@@ -22,17 +22,17 @@ from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.text import format_seconds
 
 ABSENT = -1
-"""The kind at places behind the last event."""
+"""The kind of a slot after the last event."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Events:
-    """Events in the order in which they happen; places behind the last one are absent.
+    """Events in the order in which they happen; slots after the last one are absent.
 
-    - `kinds`: `[places]`, the place of each event's name in `names`; -1 where there is none.
-    - `waits`: `[places]`, seconds since the event before, or the start; 0 where there is none.
-    - `parameters`: `[places, ...]` by name; the middle of a domain where an event has none.
+    - `kinds`: `[slots]`, the index of each event's name in `names`; -1 where there is none.
+    - `waits`: `[slots]`, seconds since the event before, or the start; 0 where there is none.
+    - `parameters`: `[slots, ...]` by name; the middle of a domain where an event has none.
     - `names`: of the kinds of events.
     """
 
@@ -46,7 +46,7 @@ class Events:
 
     @property
     def mask(self) -> Bool[Array | np.ndarray, " slots"]:
-        """True at the places that hold an event."""
+        """True at the slots that hold an event."""
         return self.kinds >= 0
 
     @property
@@ -61,7 +61,7 @@ class Events:
         return xp.where(self.mask, xp.cumsum(self.waits, axis=-1), np.inf)
 
     def __getitem__(self, name: str) -> Any:
-        """Return a parameter `[places, ...]`, `"times"`, `"kinds"` or `"waits"`."""
+        """Return a parameter `[slots, ...]`, `"times"`, `"kinds"` or `"waits"`."""
         if name in ("times", "kinds", "waits"):
             return getattr(self, name)
         if name not in self.parameters:
@@ -69,7 +69,7 @@ class Events:
         return self.parameters[name]
 
     def are(self, *names: str) -> Bool[Array | np.ndarray, " slots"]:
-        """Return the places that hold an event of one of these names; of any without names."""
+        """Return the slots that hold an event of one of these names; of any without names."""
         if not names:
             return self.mask
         chosen = [self._kind_of(name) for name in names]
@@ -83,7 +83,7 @@ class Events:
         return self._past(time, names).sum(axis=-1)
 
     def active(self, time: Real[Array | np.ndarray, "*times"] | float, *names: str) -> Any:
-        """Return the place of the latest event of these names at `time`; -1 before the first."""
+        """Return the index of the latest event of these names at `time`; -1 before the first."""
         past = self._past(time, names)
         indices = past.shape[-1]
         xp = _library(past)

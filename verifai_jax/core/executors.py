@@ -71,7 +71,7 @@ class Executor(Protocol):
 
 
 def check_executor(executor: object) -> None:
-    """Refuse what is no executor, and a process pool whose workers would hang.
+    """Refuse anything that is not an executor, and a process pool whose workers would hang.
 
     **Raises:** `TypeError` for an object without `submit`; `ValueError` for a pool that forks.
     """

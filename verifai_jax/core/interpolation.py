@@ -1,4 +1,4 @@
-"""Interpolation between numbers at increasing places: lines and monotone cubics.
+"""Interpolation between numbers at increasing positions: lines and monotone cubics.
 
 `xp` is `numpy` for a simulator on the host and `jax.numpy` in a traced one.
 """
@@ -25,8 +25,8 @@ def monotone_cubic(knots: Any, gaps: Any, left: Any, share: Any, xp: Any) -> Any
     **Arguments:**
 
     - `knots`: `[n, ...]`, at least 2.
-    - `gaps`: `[n - 1]`, the distances between their places.
-    - `left`: index of the number before the place, from 0 to n - 2.
+    - `gaps`: `[n - 1]`, the distances between their positions.
+    - `left`: index of the number before the position, from 0 to n - 2.
     - `share`: of the distance to the next number, from 0 to 1.
     """
     count = knots.shape[0]

@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 
 class LiftedNumbers:
-    """The numbers of one program, and their places in its argument."""
+    """The numbers of one program, and their indices in its argument."""
 
     def __init__(self) -> None:
         self._indices: dict[tuple[int, str], int] = {}

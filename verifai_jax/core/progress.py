@@ -193,7 +193,7 @@ class ProgressBar:
                 bar._display.update(bar._stages[-1].task, visible=True)
 
     def advance(self, amount: float, figures: str = "") -> None:
-        """Count `amount` more units as done, and show `figures` beside the bar."""
+        """Count `amount` more units as done, and show `figures` next to the bar."""
         if self._own:
             stage = (self._shared or self)._stages[-1]
             self.update(stage.done + amount, figures=figures)
@@ -299,7 +299,7 @@ def count_done(amount: float) -> None:
 
 
 def say_done(done: float, total: float | None = None, figures: str = "") -> None:
-    """Set how much the verb that was called has done, of how much, with figures beside it."""
+    """Set how much the verb that was called has done, of how much, with figures next to it."""
     if (bar := _ongoing.get()) is not None:
         bar.update(done, total, figures)
 

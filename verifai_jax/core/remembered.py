@@ -52,7 +52,8 @@ def remembered_as(kind: str, *values: object) -> str | None:
     **Arguments:**
 
     - `kind`: of the program, for people who look into the folder.
-    - `values`: all that the program follows from, beside this package and JAX; see `identity`.
+    - `values`: all that the program follows from, in addition to this package and JAX; see
+      `identity`.
 
     **Returns:** the name; None if it cannot be said, or nothing is kept on disk.
     """

@@ -241,6 +241,6 @@ def _libraries() -> tuple[Path, ...]:
     names = ("stdlib", "platstdlib", "purelib", "platlib")
     folders = {Path(sysconfig.get_path(name)) for name in names}
     folders |= {PACKAGE, Path(__file__).parents[1], Path(os.__file__).parent}
-    # The plugin of pytest stands beside the package.
+    # The plugin of pytest stands next to the package.
     folders |= {folder.parent / "_verifai_jax_pytest.py" for folder in tuple(folders)}
     return tuple(folders | {folder.resolve() for folder in folders})

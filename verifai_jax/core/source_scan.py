@@ -120,7 +120,7 @@ def files_of_model(model: Path) -> list[Path]:
 
     **Arguments:**
 
-    - `model`: the file; one that is no model refers to none.
+    - `model`: the file; one that is not a model refers to none.
     """
     found: dict[Path, None] = {}
     waiting, folders = [model.resolve()], {model.resolve().parent: None}

@@ -117,7 +117,7 @@ def target_of_project(target: object, folder: Path, *, kind: str, remedy: str) -
 
     Loading a target runs its file, so a folder that came from elsewhere must not choose one: the
     target is the path of a Python file that exists, below the current folder, and outside of
-    whatever holds results: the folder that names it, those beside and above it, any that is called
+    whatever holds results: the folder that names it, those next to and above it, any that is called
     `runs` or `sweeps`, and any with the files of a run or a sweep.
 
     **Arguments:**
@@ -157,7 +157,7 @@ def _is_of_project(location: str, folder: Path) -> bool:
     folders = file.relative_to(here).parts[:-1]
     if any(name in RESULTS for name in folders):
         return False
-    # What came with the folder, as from one archive, lies beside it.
+    # Files of the same archive lie next to the folder.
     inside = folder.relative_to(here).parts[:1] if folder.is_relative_to(here) else ()
     if inside and inside == folders[:1]:
         return False

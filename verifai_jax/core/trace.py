@@ -322,7 +322,8 @@ def check_code(name: str, value: Any, wanted: str) -> int | None:
 def check_period(dt: Any) -> float:
     """Return a sampling period that JAX can compute with.
 
-    **Raises:** `TypeError` for what is no number, `ValueError` for one that is too small or large.
+    **Raises:** `TypeError` for anything that is not a number, `ValueError` for one that is too
+    small or large.
     """
     if not is_number(dt):
         if getattr(dt, "shape", None) != () or getattr(dt.dtype, "kind", "") not in "iuf":

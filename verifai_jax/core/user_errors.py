@@ -35,7 +35,7 @@ MAX_MESSAGE = 300
 MAX_READ = 4 * MAX_MESSAGE
 """Characters of a message that are read at all: one of megabytes costs no time."""
 MAX_TRACEBACK = 100_000
-"""The same of a message that ends with what was raised, behind its traceback."""
+"""The same for a message that begins with a traceback and ends with the error."""
 MAX_NAMES = 12
 """Names that a message lists."""
 

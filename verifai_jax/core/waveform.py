@@ -43,7 +43,7 @@ class Waveform:
       the last that at the end; with `"constant"` each is held for an equal part of the duration,
       its beginning included; with `"pulse"` for the first `width` seconds of that part, and the
       value is 0 for the rest. None may be masked.
-    - `duration`: in seconds; None until `over` sets it. Before 0 and behind the end the first and
+    - `duration`: in seconds; None until `over` sets it. Before 0 and after the end the first and
       the last value hold; those of pulses are 0.
     - `times`: of the control points in seconds, increasing; equal distances when left out.
     - `width`: of a pulse in seconds; half the shortest distance of two when left out.
@@ -213,7 +213,7 @@ class WaveformWithinStep(Waveform):
             return super().__call__(time)
         knots = jnp.asarray(self.knots)
         inside = (time >= self.begin) & (time <= self.now)
-        # Another time (a delay) moves with the stages as well: behind the beginning of the step, a
+        # Another time (a delay) moves with the stages as well: after the beginning of the step, a
         # piece that begins just there belongs to the next step.
         before = (self.now > self.begin) & ~inside
         position = jnp.where(inside, self.begin, time).astype(knots.dtype)
@@ -338,8 +338,8 @@ def acting_spans(
 ) -> list[tuple[float, float]]:
     """Return from when to when each control point changes the function, in seconds.
 
-    A point between two lines acts from the point before to the one behind, one of a cubic as far
-    as the second point before and behind it, and the first and the last to the ends.
+    A point between two lines acts from the point before to the one after, one of a cubic as far
+    as the second point before and after it, and the first and the last to the ends.
     """
     starts = [float(time) for time in control_times(count, hold, times, duration)]
     if hold in HELD:

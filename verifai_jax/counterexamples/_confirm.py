@@ -74,7 +74,7 @@ def confirm(
 
     **Returns:** a `Confirmation` for a row, `Confirmations` for all; after Ctrl-C what is finished.
 
-    **Raises:** `ValueError` for a run without its problem, a row that is no counterexample, a
+    **Raises:** `ValueError` for a run without its problem, a row that is not a counterexample, a
     simulator that does not fit; `IndexError` for a row that is not in the table.
     """
     if not isinstance(run, Run):

@@ -2,7 +2,7 @@
 
     why = explain(run)                                  # the worst row
     print(why)                                          # a paragraph
-    why.plot("why.png")                                 # the signal, and the features beside it
+    why.plot("why.png")                                 # the signal, and the features next to it
 
 Predicate and instant come from `mtl.explain` on the replayed trace. Features are judged by the
 robustness with each back at its nominal value, all others as they are, and by its gradient.

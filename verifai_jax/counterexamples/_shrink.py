@@ -76,8 +76,8 @@ def shrink(
       least distance; nothing that departs in more coordinates than the row does;
       `"distance"`: the least distance, whatever their number. It is Euclidean in unit coordinates,
       of which each is 1 over its whole range (by probability, for a distribution), between two
-      choices 1, and by places in integers. Every control point of a signal and every component of a
-      vector is a coordinate of its own.
+      choices 1, and by indices in integers. Every control point of a signal and every component of
+      a vector is a coordinate of its own.
     - `budget`: simulations at most; a gradient counts as one.
     - `seed`: of the random candidates.
     - `others`: whether other counterexamples of the run are looked at too.
@@ -220,7 +220,7 @@ class _Search:
         self.follow(self.starts())
         candidates.limit = candidates.budget - 2 * nominal.space.dim
         self.follow(self.starts()[:1])
-        # A boundary of many pieces has a nearest point on each: some of those beside this one.
+        # A boundary of many pieces has a nearest point on each: some of those next to this one.
         search_alongside(candidates, self.failures()[0], self.rng)
         self.follow(self.starts(self.failures()[:1], cosine=0.97)[1:], rounds=10)
         for _ in range(2):

@@ -35,7 +35,7 @@ FORMAT = 1
 
 
 class CorpusError(ValueError):
-    """An error for a file that is no counterexample, or a damaged one."""
+    """An error for a file that is not a counterexample, or a damaged one."""
 
 
 @dataclass(frozen=True)
@@ -301,7 +301,7 @@ def renamed(features: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, 
 
 
 def _spread(points: Any, maximum: int) -> list[int]:
-    """Return places of points, the first and then each time the one farthest from those before."""
+    """Return indices of points, the first and then each time the one farthest from those before."""
     chosen = [0]
     distance = np.linalg.norm(points - points[0], axis=1)
     while len(chosen) < min(maximum, len(points)):

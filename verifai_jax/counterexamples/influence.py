@@ -19,7 +19,7 @@ class Span(NamedTuple):
 def spans_of(domain: Domain, duration: float) -> tuple[Span, ...] | None:
     """Return when each coordinate of a signal acts; None for other domains.
 
-    A point between two lines acts from the point before to the one behind; see `Signal.spans`.
+    A point between two lines acts from the point before to the one after; see `Signal.spans`.
     """
     spans = domain.spans(duration)
     if spans is None:

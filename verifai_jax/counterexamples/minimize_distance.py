@@ -12,7 +12,7 @@ Each round a batch of candidates for each point that is followed:
   random load sequences, Computers and Structures 9, 1978), with a line search by batch; where
   several pieces of the boundary meet, nearest to all of their half-spaces
   (`statistics.least_distance`);
-- beside it and nearer, at random (Brendel, Rauber and Bethge, Decision-based adversarial
+- sideways and nearer, at random (Brendel, Rauber and Bethge, Decision-based adversarial
   attacks, ICLR 2018), which needs no gradient and no continuity;
 - one coordinate nearer alone; a cell nearer where discrete.
 
@@ -282,7 +282,7 @@ def advance(candidates: Candidates, track: Track, points: Points, failing: np.nd
 
 
 def share_of_segment(candidates: Candidates, u: Point, other: Point) -> float | None:
-    """Return the share of the way from nominal to `u` at which `other` lies; None if beside it."""
+    """Return where `other` lies between nominal (0) and `u` (1); None if it lies elsewhere."""
     u0 = candidates.nominal.u.astype(np.float64)
     v, w = u - u0, other - u0
     share = float(w @ v / max(v @ v, 1e-30))

@@ -90,7 +90,7 @@ class Nominal:
 
     @cached_property
     def groups(self) -> tuple[tuple[str, Int[np.ndarray, " k"]], ...]:
-        """The features, each with the places of its coordinates."""
+        """The features, each with the indices of its coordinates."""
         groups, first = [], 0
         for name, domain in self.space.root.fields:
             if domain.size:
@@ -160,7 +160,7 @@ class Nominal:
     def gaps(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
         """Return the departure of each coordinate, from 0 to 1.
 
-        That of integers and lengths is a difference of places, that of choices 0 or 1.
+        That of integers and lengths is a difference of indices, that of choices 0 or 1.
         """
         gap = np.abs(np.asarray(points, np.float64) - self.u)
         discrete = self.cube.discrete

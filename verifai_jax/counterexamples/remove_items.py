@@ -54,7 +54,7 @@ def remove_items(candidates: Candidates, u: Float[np.ndarray, " d"]) -> Float[np
 
 
 def _present(candidates: Candidates, u: Float[np.ndarray, " d"]) -> Int[np.ndarray, " k"]:
-    """Return the places of the items that there are: taking them away changes the point."""
+    """Return the indices of the items that are present: removing one changes the point."""
     single = np.eye(candidates.nominal.space.items, dtype=bool)
     changed = np.any(_without(candidates, u, single) != candidates.nominal.settle(u[None]), axis=1)
     return np.flatnonzero(changed)

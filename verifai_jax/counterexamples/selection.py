@@ -1,4 +1,4 @@
-"""The selection of a counterexample of a run, and of others beside it."""
+"""The selection of a counterexample of a run, and of others next to it."""
 
 from collections.abc import Mapping
 from typing import Any, TypeAlias
@@ -42,7 +42,7 @@ def select_row(run: Run, row: Row) -> tuple[int, dict[str, Any]]:
     **Returns:** its number, and the entries of its row by column.
 
     **Raises:** `ValueError` for a run without a counterexample, or a row that is none; `TypeError`
-    or `IndexError` for what is no row of the table.
+    or `IndexError` for anything that is not a row of the table.
     """
     failing = run.table.counterexamples
     if not len(failing):

@@ -60,7 +60,7 @@ CORNERS = (4, 5)
 A_PART = 4
 """Simulations for each doubling of the coordinates, about, to find those that decide."""
 IMPROBABLE = 20.0
-"""Logarithm of the prior's density beside the greatest, below which a region is left out."""
+"""A region whose log density under the prior is this much below the greatest is left out."""
 MIN_CHAINS, MAX_CHAINS = 8, 256
 """Chains, at least, where there are as many ends, and at most."""
 MERGES, NEIGHBOURS = 3, 4

@@ -224,7 +224,7 @@ def _share_out(
     weight: Float[np.ndarray, " n"],
     defensive: float,
 ) -> Float[np.ndarray, " k"]:
-    """Return the best share of each component of the anchors beside a mixture, of sum one at most.
+    """Return the best share of each component of the anchors next to a mixture; the sum is <= 1.
 
     The best ones for the whole would leave an improbable region without samples, and its own
     probability unknown. So failures `z` are weighed by one over the probability of their region,

@@ -55,7 +55,7 @@ SHARE_OF_LEVEL = 0.06
 SHARE_OF_REPLICATE = 0.02
 """Share of the budget for each level of splitting runs that are the estimate themselves."""
 EXPLORATIONS = 2
-"""Independent searches for failures beside splitting."""
+"""Independent searches for failures in addition to splitting."""
 SHARE_OF_EXPLORATION, SHARE_WITH_GRADIENTS = 0.08, 0.12
 """Share of the budget for each of them."""
 PRECISE, SHARE_BEYOND = 20_000, 0.25

@@ -7,7 +7,7 @@ A simulation depends on its features, and smoothly so. A normal feature is linea
 uniform one in the unit cube: there a line is a line, and a step of Newton's lands where the
 robustness promises. In normal space the same robustness bends, most of all near the ends of the
 interval, where a uniform feature hardly moves. So a natural coordinate is that of normal space, or,
-for a uniform feature, its place in the cube in units of its standard deviation.
+for a uniform feature, its position in the cube in units of its standard deviation.
 
 Source: Nocedal and Wright, Numerical Optimization (2006), section 19.2, for steps that go no more
 than a fraction of the way to a boundary.

@@ -131,7 +131,7 @@ class LimitState:
         self.pilot: tuple[int, int, int] = (0, 0, 0)
         """Simulations, failures and missing verdicts of the first samples of the prior."""
         self.own_chance = ""
-        """A sentence on memory or chance that the system has beside its random key, if it has."""
+        """A sentence on memory or chance that does not come from the random key; empty if none."""
         self.lowest = np.inf
         self.ended: str | None = None
         self.strict = False

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from verifai_jax.estimation.normal_space import LimitState, fails_at
 
 FRACTIONS = np.array([0.5, 0.25, 0.75, 0.1, 0.9])
-"""Places of a path that are simulated, the middle first."""
+"""Fractions of a path at which it is simulated, the middle first."""
 OUTWARD = 1.02
 """Factor on the distances of an arc, so that one along a boundary lies inside."""
 COST_OF_PATHS = 2 * len(FRACTIONS)

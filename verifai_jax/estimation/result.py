@@ -105,8 +105,8 @@ class Estimate(Drawn, InNotebook):
         - `p0`: failure probability to be shown, between 0 and 1.
         - `confidence`: of the bound; that of the estimate when left out.
 
-        **Returns:** the number of samples beside those that `upper_bound` rests on; 0 if these
-        show it already.
+        **Returns:** the number of samples in addition to those that `upper_bound` rests on; 0 if
+        these show it already.
 
         **Raises:** `ValueError` unless `0 < p0 < 1`.
         """

@@ -103,7 +103,7 @@ def _replace_by_parts(
     **Returns:** the failures `[n, d]`, and the coordinates that have kept their value.
     """
     z, kept, d = z.copy(), np.ones(z.shape, bool), z.shape[1]
-    # The place of each coordinate in the row of those that are tried; the others come last.
+    # The position of each coordinate in the row of those that are tried; the others come last.
     index = np.argsort(np.argsort(np.where(among, rng.random(z.shape), 2.0), axis=1), axis=1)
     count = among.sum(axis=1)
     begin, size, quarter = np.zeros(len(z), int), (count + 1) // 2, (count + 3) // 4

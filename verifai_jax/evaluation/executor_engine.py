@@ -72,8 +72,8 @@ class ExecutorEngine:
     - `journal`: of rows in flight, for a problem on the host.
     - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
 
-    **Raises:** `TypeError` for what is no executor; `ValueError` for one that cannot work here, or
-    that cannot send the problem.
+    **Raises:** `TypeError` for anything that is not an executor; `ValueError` for one that cannot
+    work here, or that cannot send the problem.
     """
 
     def __init__(

@@ -50,7 +50,7 @@ class Journal:
         self._log.put_json(str(row), entry)
 
     def recall(self, first: int, points: Float[np.ndarray, "n d"]) -> dict[int, RowVerdict]:
-        """Return the known rows from `first` on, of the same points, by their place among them."""
+        """Return the known rows from `first` on, of the same points, by their index among them."""
         if not self._known:
             return {}
         found = {}

@@ -1,4 +1,4 @@
-"""Simulations that all raise: an error of the problem, which is told once and ends the work.
+"""Simulations that all raise: an error of the problem, which is reported once and ends the work.
 
     raising = Raising()
     raising.add(verdicts.status, verdicts.messages)     # of each batch, until one does not raise

@@ -118,7 +118,7 @@ class Replay(InNotebook):
 
         **Arguments:**
 
-        - `path`: of a picture to write; none when left out.
+        - `path`: file that the picture is written to, if given.
         - `signals`: the signals, and features that are Signals, to draw; chosen when left out.
 
         **Raises:** `UnknownNameError` for a signal that does not exist.

@@ -199,7 +199,7 @@ def with_status(
 ) -> tuple[Float[Array, " formulas"], Int[Array, ""]]:
     """Return robustness and status given whether all signals are finite; NaN unless it is OK.
 
-    A status that is no code of `Status` is an error.
+    A status that is not a code of `Status` is an error.
     """
     known = (status >= min(Status)) & (status <= max(Status))
     status = jnp.where(known, status, jnp.int32(Status.ERROR))

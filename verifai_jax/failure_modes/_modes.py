@@ -64,7 +64,7 @@ probability."""
 MORE_DIVIDING = 2
 """Factor on that share for a system that draws random numbers."""
 SHOWN = 200
-"""Failures of a mode that its result keeps, and samples of the prior that its name is told from."""
+"""Number of failures that a mode keeps, and of prior samples from which its name is made."""
 OUTWARD = (1.0, 1.005, 1.02, 1.05)
 """Factors on a likeliest failure, of which the first that fails again in a run is its row."""
 MAX_RUN_FAILURES = 200
@@ -104,8 +104,8 @@ def modes(
     could not be weighed, and a note says so. Where the system draws random numbers, probabilities
     are over these too, and each mode holds the random key under which its likeliest failure fails.
 
-    **Raises:** `TypeError` for something that is no problem or run; `ValueError` for options out of
-    range, or a run that was loaded without its problem.
+    **Raises:** `TypeError` for something that is not a problem or run; `ValueError` for options out
+    of range, or a run that was loaded without its problem.
     """
     started = time.perf_counter()
     if not isinstance(source, Problem | Run):

@@ -1,4 +1,4 @@
-"""The search for failing regions, which are told apart by their least distant failures.
+"""The search for failing regions, which are distinguished by their least distant failures.
 
     regions = find_regions(limit_state, rng, failures, weights, nearest)
     joined, tried = share_explained(limit_state, rng, regions, failures, weights)

@@ -20,7 +20,7 @@ from verifai_jax.estimation.normal_space import squared_distances
 NEIGHBOURS = 5
 """Regions whose nearest point a path is tried to, and further nearest points, at most."""
 PRIOR_FREEDOM = 4
-"""Degrees of freedom that the prior's standard deviations count as, beside those of a region."""
+"""Weight of the prior's standard deviations, in samples, when those of a region are fitted."""
 MIN_SCALE, MAX_SCALE = 1e-4, 3.0
 """Least and greatest standard deviation of a region."""
 

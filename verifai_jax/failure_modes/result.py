@@ -26,7 +26,7 @@ from verifai_jax.problem.problem import Problem
 class Mode(InNotebook):
     """One failing region.
 
-    - `number`: its place in the order of probability; 0 is the most probable one.
+    - `number`: its index in the order of probability; 0 is the most probable one.
     - `name`: conditions in words that set it apart from the prior.
     - `probability`: of a failure in it, under the prior.
     - `low`, `high`: the interval, at the confidence of the result.

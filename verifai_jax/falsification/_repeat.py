@@ -166,7 +166,7 @@ def repeat(
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     A search that plans its rounds learns that an unclaimed violation is none, as in `falsify`. Any
-    other that learns has its rounds compiled together and learns from them as simulated: behind a
+    other that learns has its rounds compiled together and learns from them as simulated: after a
     seed's first unclaimed violation its simulations may be others than those of `falsify`.
 
     **Returns:** the robustness and the verdicts of each seed's simulations, as simulated, and which

@@ -365,7 +365,7 @@ class Run(InNotebook):
             return self.compared(seen)
         if not own or not finding_of(seen, stored, self._several, NEAR):
             return replace(seen, changed=self.changed_since(number))
-        # The other precision may be all that differs, which is no finding.
+        # The other precision may be all that differs, which is not a finding.
         again = self._replayed(self.problem, values, number, self.precision)
         again = self.compared(again)
         return replace(seen, changed=again.changed, finding=again.finding)

@@ -127,7 +127,7 @@ def standing_out(columns: Columns) -> Int[np.ndarray, " k"]:
 
 
 def write_segment(run: Path, first: int, columns: Columns) -> Segment:
-    """Write rows from `first` on into the folder of a run, and those that stand out beside them.
+    """Write rows from `first` on into the folder of a run, and those that stand out next to them.
 
     **Raises:** `OSError` where they cannot be written.
     """

@@ -64,7 +64,7 @@ def describe_run(
     - `simulations`, `counterexamples`, `least_robustness`: the run so far.
     - `rows`: the last rows of the table, without those that are among the worst: features,
       robustness (`rho`, and `rho.NAME` of each of several formulas), `status`.
-    - `worst`: the rows with the least robustness, the worst first; besides, `explanation` in words,
+    - `worst`: the rows with the least robustness, the worst first; also `explanation`, a text,
       `critical` (which predicate decides, at how many seconds, with what robustness and share), and
       `trace`: signals by name, with `times` and `values`, `least` and `greatest`.
     - `refused`: what was wrong with suggestions that were left out, one text each.

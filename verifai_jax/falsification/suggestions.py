@@ -6,7 +6,7 @@
     suggestions.waiting(rows)                           # rows to simulate next, [n, row]
 
 What was suggested is in the checkpoint, written before the first of it is simulated: a run that
-goes on asks again for nothing that it was told.
+goes on does not ask again for suggestions that it has already received.
 """
 
 from collections.abc import Iterable, Mapping
@@ -85,8 +85,8 @@ class Suggestions:
     def ask(self, question: dict[str, Any], rows: int) -> None:
         """Ask, and keep the suggestions that can be simulated.
 
-        **Raises:** `SuggestionError` for what is no list of suggestions, and with `strict` for one
-        that cannot be simulated; what the function itself raises.
+        **Raises:** `SuggestionError` for anything that is not a list of suggestions, and with
+        `strict` for one that cannot be simulated; what the function itself raises.
         """
         number = len(self.asked) + 1
         points, wrong = [], []
@@ -134,8 +134,9 @@ def row_of(problem: Problem, suggestion: object, precision: str) -> Float[np.nda
       columns that are none of features are ignored.
     - `precision`: of the run.
 
-    **Raises:** `TypeError` for what is no mapping; `ValueError` that names the feature for one that
-    is missing, unknown or outside its domain, and for features that break the constraint.
+    **Raises:** `TypeError` for anything that is not a mapping; `ValueError` that names the feature
+    for one that is missing, unknown or outside its domain, and for features that break the
+    constraint.
     """
     if not isinstance(suggestion, Mapping):
         raise TypeError(f"a suggestion must be a mapping of names to values; got {suggestion!r}")

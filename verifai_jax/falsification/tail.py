@@ -34,7 +34,7 @@ def tail_entry(first: int, batch: "pa.RecordBatch") -> dict[str, Arrays]:
 def read_tail(folder: Path) -> "list[tuple[int, pa.RecordBatch]]":
     """Return the batches of a tail that are whole, each with the number of its first row.
 
-    **Raises:** `DamagedError` for what is no file.
+    **Raises:** `DamagedError` for anything that is not a file.
     """
     import pyarrow as pa
 

@@ -57,7 +57,7 @@ class TraceForm:
 
     @property
     def positions(self) -> Float[np.ndarray, " samples"]:
-        """Places of the modelled samples among all."""
+        """Indices of the modelled samples among all."""
         return np.linspace(0, self.length - 1, min(self.length, SAMPLES))
 
     def fits(self, trace: Trace) -> bool:

@@ -105,7 +105,8 @@ def as_wanted(engine: str) -> Wanted:
 def check_search(problem: object, search: object) -> Search:
     """Return the search, by its name or itself, if it can work on this problem.
 
-    **Raises:** `TypeError` for what is no problem or no search; `ValueError` for one that cannot.
+    **Raises:** `TypeError` for anything that is not a problem or a search; `ValueError` for one
+    that cannot.
     """
     if not isinstance(problem, Problem):
         raise TypeError(f"falsify needs a Problem; got {type(problem).__name__}")
@@ -393,7 +394,7 @@ def new_folder(folder: str | Path | None) -> Iterator[Path | None]:
         yield None
         return
     folder = Path(folder)
-    if not (folder / LOCK).exists():  # Whoever writes there is told by the lock.
+    if not (folder / LOCK).exists():  # The lock says who writes there.
         _check_empty(folder)
     with write_lock(folder):
         _check_empty(folder)  # Another run may have begun in it, and ended, since.

@@ -54,7 +54,7 @@ class Automaton(Domain):
     **Raises:** `ValueError` for events that are none, options that are unknown or out of range,
     states that no event leads to, a `to` that is nearly the name of another state, a `min_events`
     that no sequence reaches, guards that tell too many pasts apart; `TypeError` for a parameter
-    that is no domain.
+    that is not a domain.
     """
 
     start: str

@@ -96,7 +96,7 @@ class Box(Domain):
     def from_intervals(cls, *intervals: Sequence[float]) -> "Box":
         """Translate VerifAI's notation: an interval for each entry, its ends in any order.
 
-        **Raises:** `ValueError` for an interval that is no pair of numbers, and as the `Box`.
+        **Raises:** `ValueError` for an interval that is not a pair of numbers, and as the `Box`.
         """
         ends = _in_order(intervals)
         if len(ends) == 1:
@@ -255,7 +255,7 @@ class DiscreteBox(Domain):
 
         The ends are rounded inwards.
 
-        **Raises:** `ValueError` for an interval that is no pair of numbers, and as the
+        **Raises:** `ValueError` for an interval that is not a pair of numbers, and as the
         `DiscreteBox`.
         """
         ends = [(math.ceil(low), math.floor(high)) for low, high in _in_order(intervals)]

@@ -27,7 +27,7 @@ class Struct(Domain):
     - `fields`: name -> `Domain`, in the order in which coordinates and columns come.
 
     **Raises:** `ValueError` for no fields, or a name that is empty or no text; `TypeError` for a
-    field that is no domain.
+    field that is not a domain.
     """
 
     fields: tuple[tuple[str, Domain], ...]

@@ -149,7 +149,7 @@ class Domain(ForUsers, abc.ABC):
     def from_columns(self, row: Row, name: str) -> PyTree:
         """Return the value that a table row holds, exactly.
 
-        **Raises:** `ValueError` for an entry that is no value of this kind.
+        **Raises:** `ValueError` for an entry that is not a value of this kind.
         """
 
     @property

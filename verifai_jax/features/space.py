@@ -58,7 +58,7 @@ class FeatureSpace(ForUsers):
       prior is then that of the domains given that it holds, and only such points are simulated.
 
     **Raises:** `ValueError` for no features, bad names, or names that give one column twice;
-    `TypeError` for a value that is no domain, or a `where` that is no function.
+    `TypeError` for a value that is not a domain, or a `where` that is not a function.
     """
 
     _internal = frozenset((
@@ -577,7 +577,7 @@ class FeatureSpace(ForUsers):
     def _point(self, features: Mapping[str, Any] | Row) -> Float[Array, " dim"]:
         """Return the point of these features, checked unless a system sees them so."""
         if isinstance(features, Row) and not isinstance(features, Mapping):
-            features = self.from_row(features)  # Of pandas, which is no mapping.
+            features = self.from_row(features)  # Of pandas, which is not a mapping.
         leaves = jax.tree.leaves(features, is_leaf=lambda leaf: isinstance(leaf, list | tuple))
         if not all(isinstance(leaf, jax.Array) for leaf in leaves):
             self.root.check(self.completed(features), "")

@@ -270,9 +270,9 @@ class Empirical(Continuous):
     """Numbers as they were measured: `Empirical(data)`.
 
     The quantiles are those of the sorted data, with straight lines between neighbours; a number
-    that comes several times has the middle of its ranks. No value lies beyond the least and the
-    greatest number, which the coordinates 0 and 1 are: what is rarer than the data show is not in
-    it.
+    that comes several times has the middle of its ranks. The coordinates 0 and 1 are the least and
+    the greatest number, and no value lies beyond them: values rarer than those in the data do not
+    occur.
 
     **Arguments:**
 

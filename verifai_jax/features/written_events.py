@@ -86,7 +86,7 @@ class WrittenEvents:
         }
 
     def check(self, value: object, name: str) -> None:
-        """Refuse what is no sequence of the automaton.
+        """Refuse anything that is not a sequence of the automaton.
 
         **Raises:** `ValueError`, which names the event and what it can be.
         """

@@ -1,6 +1,6 @@
 """Fuzzing with a model: what may happen is a feature space, what has happened guides the search.
 
-    run = fuzz(problem, budget=20_000)                  # beside the formulas: finite, ended
+    run = fuzz(problem, budget=20_000)                  # in addition to the formulas: finite, ended
     run = fuzz(space=space, system=simulate, ranges={"speed": (0, 60)})       # without any formula
     print(run); run.coverage; run.corpus; vj.shrink(run)
 

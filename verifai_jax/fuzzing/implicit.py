@@ -212,7 +212,7 @@ def with_implicit(
     cells: Cells | None,
     name: str,
 ) -> Problem:
-    """Return a problem with the implicit properties, beside its own formulas if it has some.
+    """Return a problem with the implicit properties added to its own formulas, if any.
 
     **Raises:** `ValueError` for both or neither of a problem and a space with a system, and for
     ranges that are none.
@@ -241,7 +241,7 @@ def with_implicit(
         own = problem.formulas
         behaviour = own_behaviour or Behaviour(cells, own.values())
         checked = CheckedSystem(problem.system, ranges, verdicts=False, cells=given)
-        # What has no order beside the priority is as good as none.
+        # A rule without a place in the priority's order cannot be ranked.
         return replace(problem, system=checked, spec={**own, **properties}, behaviour=behaviour)
     if space is None or system is None:
         raise ValueError("fuzz needs a problem, or space= and system=")

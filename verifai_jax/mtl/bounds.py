@@ -40,7 +40,7 @@ def constant_bounds(predicate: Formula) -> tuple[Term, list[float]] | None:
 
     `abs(x) <= 2` bounds `x` by 2 and -2. There are no numbers where signals are compared.
 
-    **Returns:** None for a formula that is no comparison.
+    **Returns:** None for a formula that is not a comparison.
     """
     match predicate:
         case Predicate("<" | "<=", Arithmetic("abs", (inner,)), Number(limit)):

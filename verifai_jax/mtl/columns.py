@@ -14,7 +14,7 @@ FRACTIONS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
 
 
 class LeftOut(str):
-    """A note on a `column` of a recording that is no signal of its trace."""
+    """A note on a `column` of a recording that is not a signal of its trace."""
 
     column: str
 

@@ -72,7 +72,7 @@ def as_formula(formula: Formula | str) -> Formula:
 
 
 def check_trace(trace: object) -> None:
-    """Refuse what is no trace, and say how to make one of it.
+    """Refuse anything that is not a trace, and say how to make one of it.
 
     **Raises:** `TypeError`.
     """

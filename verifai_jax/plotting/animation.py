@@ -161,7 +161,7 @@ def _frame(
     texts = (axes.get_title(), axes.get_xlabel(), axes.get_ylabel())
     lines = tuple(text.count("\n") if text else -1 for text in texts)
     reasons = (axes.get_xlim(), axes.get_ylim(), axes.get_aspect(), lines)
-    # With a colour bar or a second panel beside them, each frame is laid out.
+    # With a colour bar or a second panel next to them, each frame is laid out.
     alone = figure.axes == [axes] and not figure.texts and axes.get_legend() is None
     if alone and before is not None and before.reasons == reasons:
         figure.set_layout_engine("none")

@@ -24,7 +24,7 @@ def plot_arms(
     **Arguments:**
 
     - `result`: the result.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
     - `metric`, `reference`: as in `Augmentation.compare`.
 
     **Returns:** the figure.
@@ -76,7 +76,7 @@ def plot_montage(
     **Arguments:**
 
     - `result`: the result.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
     - `arm`, `seed`: which arm of which seed.
     - `count`: images at most.
 

@@ -23,7 +23,7 @@ def plot_importance(importance: Importance, path: str | Path | None = None) -> F
     **Arguments:**
 
     - `importance`: what `analysis.importance` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.
     """
@@ -46,7 +46,7 @@ def plot_sensitivity(sensitivity: Sensitivity, path: str | Path | None = None) -
     **Arguments:**
 
     - `sensitivity`: what `analysis.sobol_indices`, `morris` or `gradient_sensitivity` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.
     """
@@ -80,7 +80,7 @@ def plot_bars(
     - `columns`: the name in the legend of each column to draw, empty for none.
     - `title`: above the bars.
     - `label`: of the horizontal axis.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.
     """
@@ -129,7 +129,7 @@ def plot_effects(table: pd.DataFrame, title: str, path: str | Path | None = None
 
     - `table`: that of `analysis.morris`.
     - `title`: above the picture.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.
     """

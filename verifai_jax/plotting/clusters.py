@@ -20,7 +20,7 @@ def plot_clusters(clusters: Clusters, path: str | Path | None = None) -> Figure:
     **Arguments:**
 
     - `clusters`: what `analysis.clusters` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.
     """

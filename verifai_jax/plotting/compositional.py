@@ -21,7 +21,7 @@ def plot_region(
     **Arguments:**
 
     - `result`: what `vj.perception.abstract` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
     - `features`: the columns across and up; by default the two that the region depends on most.
 
     **Returns:** the figure.

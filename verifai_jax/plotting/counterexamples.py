@@ -35,7 +35,7 @@ def plot_explanation(explained: Explained, path: str | Path | None = None) -> Fi
     **Arguments:**
 
     - `explained`: what `explain` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.
     """
@@ -140,7 +140,7 @@ def _course(
     """Return times and values that draw a function of time through these control points."""
     count = len(knots)
     if wave.hold == "linear":
-        # The first and the last value hold before and behind given times.
+        # The first and the last value hold before and after given times.
         times = control_times(count, wave.hold, wave.times, length)
         clock = np.concatenate([[0.0], times, [max(length, float(times[-1]))]])
         return clock, np.concatenate([knots[:1], knots, knots[-1:]])
@@ -189,12 +189,12 @@ def _draw_bars(axes: Axes, explained: Explained) -> None:
 
 
 def plot_shrunk(shrunk: Shrunk, path: str | Path | None = None) -> Figure:
-    """Draw the coordinates that depart from nominal, beside the signal that breaks the property.
+    """Draw the coordinates that depart from nominal, next to the signal that breaks the property.
 
     **Arguments:**
 
     - `shrunk`: what `shrink` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.
     """

@@ -19,7 +19,7 @@ def plot_coverage(coverage: Coverage, path: str | Path | None = None) -> Figure:
     **Arguments:**
 
     - `coverage`: what `analysis.coverage` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.
     """

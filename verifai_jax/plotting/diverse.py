@@ -16,7 +16,7 @@ def plot_diverse(diverse: Diverse, path: str | Path | None = None) -> Figure:
     **Arguments:**
 
     - `diverse`: what `analysis.diverse` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.
     """

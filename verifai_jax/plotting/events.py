@@ -15,7 +15,7 @@ def plot_pairs(coverage: FuzzCoverage, path: str | Path | None = None) -> Figure
     **Arguments:**
 
     - `coverage`: of a run whose features have an automaton; the first one is drawn.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.
 

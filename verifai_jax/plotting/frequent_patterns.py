@@ -1,4 +1,4 @@
-"""Frequent patterns as bars beside the shares expected."""
+"""Frequent patterns as bars next to the shares expected."""
 
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ def plot_frequent_patterns(patterns: FrequentPatterns, path: str | Path | None =
     **Arguments:**
 
     - `patterns`: what `analysis.frequent_patterns` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.
     """

@@ -23,7 +23,7 @@ COLORS = (
 )
 """Colours of the modes, in turn."""
 WIDEST = 30
-"""Characters of a line of a name beside its bar."""
+"""Characters of a line of a name next to its bar."""
 
 
 def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
@@ -35,7 +35,7 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
     - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure. Failures are drawn over the two numerical features in which the modes
-    differ most, beside their likeliest ones.
+    differ most, next to their likeliest ones.
     """
     numeric = _apart(modes)
     figure = style.new_figure(figsize=(10.4 if numeric else 6.2, 0.6 * max(len(modes), 4) + 1.6))

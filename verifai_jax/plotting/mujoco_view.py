@@ -1,8 +1,8 @@
 """Where a film of a MuJoCo model is seen from: the camera that shows best what moves.
 
 A model's own cameras are made for a task, and may look at a wall. Each is tried on a few small
-pictures, beside cameras that are made for the motion: the one in whose pictures what moves is large
-and whole is taken.
+pictures, and from cameras that are made for the motion. The camera that shows the moving parts
+large and completely is taken.
 """
 
 from collections.abc import Callable
@@ -86,7 +86,7 @@ def _moving(
         shift = np.linalg.norm(position - first, axis=1)
         turn = np.linalg.norm(rotation - turned, axis=1) * model.geom_rbound
         far = np.maximum(far, np.maximum(shift, turn))
-    # What shakes a little beside what moves is not what one looks at.
+    # Parts that only shake a little are not of interest.
     moving = drawn & (far > max(0.02 * far[drawn].max(initial=0.0), 1e-6))
     if not moving.any():
         moving = drawn & (model.body_weldid[model.geom_bodyid] > 0)

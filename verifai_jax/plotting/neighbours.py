@@ -14,7 +14,7 @@ def plot_neighbours(neighbours: Neighbours, path: str | Path | None = None) -> F
     **Arguments:**
 
     - `neighbours`: what `analysis.k_closest`, `nearest` or `random_rows` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.
     """

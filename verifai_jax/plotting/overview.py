@@ -22,7 +22,7 @@ def plot_overview(analysis: Analysis, path: str | Path | None = None) -> Figure:
     **Arguments:**
 
     - `analysis`: what `analysis.analyze` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.
     """

@@ -25,7 +25,7 @@ def plot_rules(rules: Rules, path: str | Path | None = None) -> Figure:
     **Arguments:**
 
     - `rules`: what `analysis.rules` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.
     """

@@ -19,7 +19,7 @@ def plot_components(components: Components, path: str | Path | None = None) -> F
     **Arguments:**
 
     - `components`: what `analysis.pca` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.
     """

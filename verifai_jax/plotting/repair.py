@@ -14,7 +14,7 @@ def plot_repair(repair: Repair, path: str | Path | None = None) -> Figure:
     **Arguments:**
 
     - `repair`: what `repair` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.
     """

@@ -57,7 +57,7 @@ def plot_replay(
     **Arguments:**
 
     - `replay`: what `run.replay` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
     - `signals`: the signals and Signal features to draw, in this order; chosen when left out.
 
     **Returns:** the figure.
@@ -267,7 +267,7 @@ def _shade(axes: Axes, clock: Float[np.ndarray, " t"], fails: Bool[np.ndarray, "
 
 
 def _name_signal(axes: Axes, name: str) -> None:
-    """Write a name beside its panel, across: panels are less high than names are long."""
+    """Write a name next to its panel, across: panels are less high than names are long."""
     axes.set_ylabel(
         wrap_name(name, WIDEST_NAME, 4), rotation=0, ha="right", va="center", fontsize=9
     )

@@ -12,7 +12,7 @@ from verifai_jax.core.figure import Axes
 
 DOTS = 3000
 """Rows drawn at most."""
-# The first eight are told apart by colour-blind readers (Okabe and Ito, 2008).
+# Colour-blind readers can distinguish the first eight (Okabe and Ito, 2008).
 PALETTE = (
     "#0072b2",
     "#e69f00",

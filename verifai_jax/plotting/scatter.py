@@ -33,7 +33,7 @@ def plot_features(
     **Arguments:**
 
     - `run`: what `falsify` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: file that the picture is written to, if given.
     - `features`: names; by default the `maximum` that distinguish failing from safe samples best.
     - `maximum`: features at most, where they are not named.
 
@@ -122,7 +122,7 @@ def distinguishing_features(run: Run) -> list[str]:
     ranks with the robustness.
     """
     table = run.table.all
-    # Items that do not exist have no value, which is told apart from all others.
+    # Items that do not exist have no value, which differs from all other values.
     varying = [name for name in run.table.features if len(table[[name]].drop_duplicates()) > 1]
     numeric = [n for n in varying if np.issubdtype(table[n].to_numpy().dtype, np.number)]
     failing, safe = run.table.counterexamples, run.table.safe

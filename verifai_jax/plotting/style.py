@@ -1,4 +1,4 @@
-"""One look for all pictures; its colours are told apart by colour-blind readers too."""
+"""One look for all pictures; colour-blind readers can distinguish its colours."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -54,7 +54,7 @@ def show_or_save(drawn: Figure, path: str | Path | None) -> Figure:
 
 
 def wrap_name(name: str, width: int = 20, lines: int = 2) -> str:
-    """Break a name into lines behind blanks and signs; one that is too long lacks its middle."""
+    """Break a name into lines after blanks and signs; one that is too long lacks its middle."""
     return "\n".join(_broken(shorten(name, width * lines), width))
 
 
@@ -76,7 +76,7 @@ def log_ticks(axis: Axis) -> None:
 def name_points(
     axes: Axes, names: Sequence[str], x: Positions, y: Positions, low: Positions, high: Positions
 ) -> None:
-    """Write names beside points, none on another; call it when the limits are set.
+    """Write names next to points without overlaps; call it when the limits are set.
 
     A name that has no room at its point is moved up or down, and a line joins the two.
 
@@ -131,9 +131,9 @@ def _overlap(one: Sequence[float], other: Sequence[float]) -> bool:
 
 
 def _broken(line: str, width: int) -> list[str]:
-    """Break a line behind blanks so that each part has at most so many characters.
+    """Break a line after blanks so that each part has at most so many characters.
 
-    What is longer without a blank is broken behind signs.
+    What is longer without a blank is broken after signs.
     """
     lines, parts = [""], list[str]()
     for word in re.findall(r"\S*\s|\S+", line):

@@ -75,7 +75,7 @@ def policy(
     - `action`: what the outputs mean, where the file does not say it: `"argmax"`; `"clip"`,
       `"scale"` or `"tanh"` with `low=` and `high=`; `"positive"`; `"outputs"` (default).
     - `low`, `high`: bounds of the action.
-    - `activation`: of an MLP, behind each of its layers but the last.
+    - `activation`: of an MLP, after each of its layers but the last.
     - `network(weights, observation) -> outputs`: of other weights; `weights` by their names.
     - `layers`: names of the layers of an MLP, in order; otherwise in the order of their names.
     - `output`: of an ONNX graph with several outputs, the one that is the action.

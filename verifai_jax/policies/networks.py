@@ -43,7 +43,7 @@ def activation_name(name: str) -> str:
 
 @dataclass(frozen=True)
 class Mlp:
-    """A multilayer perceptron: an activation behind each layer but the last.
+    """A multilayer perceptron: an activation after each layer but the last.
 
     - `activation`: a name of `ACTIVATIONS`.
     - `categories`: observations that are integers become one-hot vectors of these lengths.

@@ -41,7 +41,7 @@ def from_object(source: object, observation: ArrayLike | None, batched: bool) ->
     - `observation`: an example, where the object cannot be translated without one.
     - `batched`: a Python function takes a batch of observations.
 
-    **Raises:** `PolicyError` for something that is no policy.
+    **Raises:** `PolicyError` for something that is not a policy.
     """
     root = type(source).__module__.partition(".")[0]
     if root in ("stable_baselines3", "sb3_contrib"):

@@ -182,7 +182,7 @@ def read_onnx(
 
     **Arguments:**
 
-    - `path`: of the file, beside which tensors may be kept; None for bytes alone.
+    - `path`: of the file, next to which tensors may be kept; None for bytes alone.
     - `data`: the model.
     - `what`: its name, for errors.
     - `output`: name of the output that is meant, of several.
@@ -337,7 +337,7 @@ def _attribute(attribute: Any, opset: int, known: set[str], path: Path | None, w
 
 
 def _tensor(tensor: Any, path: Path | None, what: str) -> np.ndarray:
-    """Return a tensor of the model, from the file beside it where it is kept there."""
+    """Return a tensor of the model, from the file next to it where it is kept there."""
     package = require("onnx", extra="policies")
     try:
         if tensor.data_location == package.TensorProto.EXTERNAL:
@@ -396,7 +396,7 @@ def _memory(
         check_names("output of the network", stated.values(), [o.name for o in made])
         return list(stated.items())
     # The first input is the observation. Another one is memory if an output after the first has its
-    # shape: exporters write states in their order, behind the outputs.
+    # shape: exporters write states in their order, after the outputs.
     pairs, left = [], list(made[1:])
     for one in fed[1:]:
         match = next((o for o in left if _shape(o) == _shape(one)), None)

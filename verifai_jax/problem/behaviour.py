@@ -87,7 +87,7 @@ class Behaviour:
 
     @property
     def goals(self) -> Goals | None:
-        """The clauses that are told apart; None without formulas."""
+        """The clauses that are distinguished; None without formulas."""
         return goals_of(self.formulas) if self.formulas else None
 
     @property

@@ -1,9 +1,9 @@
-"""A person's term beside the robustness, which steers a search and decides nothing.
+"""A user's term that steers a search in addition to the robustness, and decides nothing.
 
     Guide("always distance > 10")                       # its robustness
     Guide(lambda trace, features: trace["speed"].min(), weight=0.8, scale=5.0)
 
-Where the robustness says little, somebody may know what leads to a failure. A search is told a
+Where the robustness says little, somebody may know what leads to a failure. A search receives a
 weighted sum of both, as in ATheNA, which joins fitness that is made of the requirement with fitness
 that an engineer defines (Formica, Fan, Menghi, Search-based software testing driven by
 automatically generated and manually defined fitness functions, ACM Transactions on Software
@@ -32,10 +32,10 @@ Term = Callable[[Trace, Mapping[str, PyTree]], Float[Array, ""] | float]
 class Guide:
     """A term that steers a search.
 
-    The search is told `(1 - weight) * robustness + weight * t` of a simulation that keeps the
+    The search receives `(1 - weight) * robustness + weight * t` of a simulation that keeps the
     property, where `t = (1 + g / (abs(g) + scale)) / 2` lies between 0 and 1 and rises with the
     term's value `g`; so it never takes a safe simulation for a failure. Of one that breaks the
-    property it is told the robustness.
+    property it receives the robustness.
 
     **Arguments:**
 
@@ -95,11 +95,11 @@ class Guide:
     def steer(
         self, observed: Float[np.ndarray, " n"], value: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"]:
-        """Return what a search is told instead; failures, and rows without a verdict, as they are.
+        """Return what a search receives instead; failures, and rows without a verdict, as they are.
 
         **Arguments:**
 
-        - `observed`: the robustness, or whatever a search is told otherwise.
+        - `observed`: the robustness, or what a search receives otherwise.
         - `value`: of the term.
         """
         # In NumPy: of an array of JAX each first use of this kind compiles a program.

@@ -60,14 +60,14 @@ class Problem(InNotebook):
       simulation is the least of them.
     - `nominal`: features of an ordinary day; must lie in the space.
     - `description`: one line for `verifai-jax list`.
-    - `end`: what a formula sees behind the end of a trace; `"hold"` repeats the last sample.
+    - `end`: what a formula sees after the end of a trace; `"hold"` repeats the last sample.
     - `priority`: which of several formulas matter more: names in falling order, or pairs
       `(higher, lower)` of a graph (`rulebook.Rulebook`). A search then looks for the gravest
       counterexamples instead of the least robustness.
     - `behaviour`: what a trace shows, as numbers of cells (`Behaviour`), for a search guided by
       coverage.
-    - `guide`: a term beside the robustness that steers searches and decides nothing: a formula,
-      its text, a function of the trace and the features, or a `Guide` with its weight.
+    - `guide`: a term in addition to the robustness that steers searches and decides nothing: a
+      formula, its text, a function of the trace and the features, or a `Guide` with its weight.
     - `draw`: draws one instant for an animation: `(axes, trace, sample, features)`.
     - `made_in`: the modules whose code makes the problem, for the record of its runs; those on the
       stack when left out, and where a problem is made of another one, those of the other.

@@ -32,10 +32,10 @@ MAX_RULES = 30
 class Rulebook:
     """Rules by name, and pairs `(higher, lower)` of which the first matters more.
 
-    `order` lists the rules so that each comes behind all that matter more: topologically, in the
+    `order` lists the rules so that each comes after all that matter more: topologically, in the
     order of `names` where the edges leave it open.
 
-    **Raises:** `ValueError` for a name that is no rule, edges that go round in a circle, or more
+    **Raises:** `ValueError` for a name that is not a rule, edges that go round in a circle, or more
     than `MAX_RULES` rules.
     """
 

@@ -1,10 +1,10 @@
-"""Mistakes in a problem that raise nothing: found before the first simulation, told as sentences.
+"""Mistakes in a problem that raise no error, reported before the first simulation.
 
     silent_mistakes(problem)                            # ("feature 'wind' influences no ...",)
 
 A formula that looks beyond the end of the trace, a feature that nothing reads, a system that is not
 a function of its features and its key. Nothing compiles: the system is traced twice, which takes a
-fraction of a second. What is not surely a mistake is not told.
+fraction of a second. Only certain mistakes are reported.
 """
 
 import math
@@ -64,7 +64,7 @@ def silent_mistakes(problem: Problem) -> tuple[str, ...]:
 def beyond_the_trace(problem: Problem) -> Iterator[str]:
     """Yield the formulas that look beyond the end of a whole trace even at its first instant.
 
-    What they ask at later instants may well lie behind the end: windows that slide do so.
+    What they ask at later instants may well lie after the end: windows that slide do so.
     """
     form, duration = problem.form(), problem.duration
     if form is None or form.dt is None or duration is None or problem.end not in END_OF_TRACE:

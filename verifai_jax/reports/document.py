@@ -1,4 +1,4 @@
-"""Reports as files: one HTML file, and its claims as JSON beside it.
+"""Reports as files: one HTML file, and its claims as JSON next to it.
 
 write_report(run, "balance.html")               # balance.html and balance.claims.json
 write_report(sweep, "sweep.html")               # a sweep, an estimate, a comparison
@@ -40,7 +40,7 @@ def write_report(
     problem: Problem | None = None,
     progress: bool | None = None,
 ) -> Path:
-    """Write the evidence report on a result as one HTML file, and its claims as JSON beside it.
+    """Write the evidence report on a result as one HTML file, and its claims as JSON next to it.
 
     **Arguments:**
 
@@ -63,7 +63,7 @@ def write_report(
     **Raises:** `UnknownNameError` for a unit or a reason of a feature that does not exist;
     `ValueError` for a number of simulations that is none, and for a run whose rows have changed
     since they were written;
-    `TypeError` for something that is no result.
+    `TypeError` for something that is not a result.
     """
     path, about = Path(path), About(units or {}, reasons or {})
     if modes is not None:

@@ -33,7 +33,7 @@ def escape(text: object) -> Markup:
 
 
 def join(*children: Child) -> Markup:
-    """Return the HTML of several children behind each other."""
+    """Return the HTML of several children, one after another."""
     parts = []
     for child in children:
         if child is None:

@@ -49,7 +49,7 @@ class Page:
 
 
 def asset(name: str) -> str:
-    """Return the text of a file that lies beside this one."""
+    """Return the text of a file that lies next to this one."""
     return resources.files("verifai_jax.reports").joinpath(name).read_text(encoding="utf-8")
 
 

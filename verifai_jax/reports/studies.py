@@ -213,7 +213,7 @@ def png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     picture = Image.open(buffer).convert("RGB").quantize(colors=128, dither=Image.Dither.NONE)
-    # Nothing of the library's version or of the day is written beside the picture.
+    # Nothing of the library's version or of the day is written next to the picture.
     small = io.BytesIO()
     picture.save(small, format="png", optimize=True)
     return small.getvalue()

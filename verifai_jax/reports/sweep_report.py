@@ -35,7 +35,7 @@ TOGETHER = (
 )
 """Assumption of every certificate."""
 COLUMNS = ("verdict", "nominal_return", "failures", "simulations", "failure_low", "failure_high")
-"""Columns of the table that a report shows beside the hyper-parameters."""
+"""Columns of the table that a report shows in addition to the hyper-parameters."""
 MAX_ROWS = 40
 """Policies that are listed at most."""
 

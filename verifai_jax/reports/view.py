@@ -101,7 +101,7 @@ def view_data(
 def _thinned(
     group: Int[np.ndarray, " n"], maximum: int, kept: Int[np.ndarray, " k"]
 ) -> Int[np.ndarray, " shown"]:
-    """Return places of rows, evenly spread over each verdict, the graver ones first."""
+    """Return indices of rows, evenly spread over each verdict, the graver ones first."""
     chosen, left = [kept], maximum - len(kept)
     for verdict in reversed(range(len(GROUPS))):
         indices = np.flatnonzero(group == verdict)
@@ -114,7 +114,7 @@ def _thinned(
 
 
 def _column(name: str, values: "pd.Series") -> dict[str, Any] | None:
-    """Describe a column: numbers with six digits, texts as places in their list."""
+    """Describe a column: numbers with six digits, texts as indices in their list."""
     array = values.to_numpy()
     if np.issubdtype(array.dtype, np.number):
         return {"name": name, "values": numbers_of(array)}

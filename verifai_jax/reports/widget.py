@@ -44,7 +44,7 @@ def _widget_class() -> Any:
     import traitlets
 
     class TableView(anywidget.AnyWidget):
-        """A run's table; the picture beside it is for whoever shows no widgets."""
+        """A run's table; the picture next to it is for viewers that show no widgets."""
 
         _esm = asset("view.js") + asset("widget.js")
         _css = asset("view.css")

@@ -91,7 +91,7 @@ class _Batch(NamedTuple):
 
 @dataclass(eq=False)
 class _Lane:
-    """A run on its way: the batch that it was last part of, and its place there."""
+    """A run on its way: the batch that it was last part of, and its index there."""
 
     batch: _Batch
     index: int
@@ -113,7 +113,7 @@ class BatchedTraining:
 
     **Arguments:**
 
-    - `configurations`: the runs; numbers below are places in this sequence.
+    - `configurations`: the runs; numbers below are indices in this sequence.
     - `devices`: JAX devices to spread them over; all of this process when left out.
     - `per_device`: runs under one `vmap` on a device; when left out 1 on CPUs, else 64.
     - `watch`: called every few seconds with the number of each run and its learning curve so far.

@@ -206,7 +206,7 @@ def save_policy(
     - `path`: the file.
     - `sources`: what it was trained with, as a run records it; that of the modules that call this
       function when left out. `policy_sources` reads it.
-    - `notes`: plain data that JSON can hold, kept beside the arrays; `policy_notes` reads them.
+    - `notes`: plain data that JSON can hold, kept next to the arrays; `policy_notes` reads them.
     """
     kind = next(name for name, cls in _KINDS.items() if isinstance(policy.action, cls))
     about = {

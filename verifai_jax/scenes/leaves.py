@@ -144,7 +144,7 @@ class Histogram(Leaf):
 
 @dataclass(frozen=True, eq=False)
 class Chosen(Leaf):
-    """An integer, or the place of an option.
+    """An integer, or the index of an option.
 
     - `values`: what the feature's choices stand for; None if the feature is the integer.
     """
@@ -156,7 +156,7 @@ class Chosen(Leaf):
         if self.values is None:
             return int(part) if xp is np else part
         domain = self.domains[self.feature]
-        # A single option is a constant, and has no choices to be told apart.
+        # A single option is a constant: there is nothing to choose.
         index = 0 if domain.tuning is None else part
         if domain.tuning is not None and domain.numeric:
             choices = np.array(domain.tuning.choices, np.float64)

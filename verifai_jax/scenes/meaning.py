@@ -289,7 +289,7 @@ def _height(node: Any) -> float:
 
 
 def as_output(value: Any) -> Any:
-    """Return a value as one number for a system; the place of an option that is no number.
+    """Return a value as one number for a system; the index of an option that is not a number.
 
     **Raises:** `Unsupported` for anything else.
     """

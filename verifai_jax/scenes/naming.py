@@ -92,7 +92,7 @@ def leaf_names(
 
 
 def unique(name: str, taken: Iterable[str]) -> str:
-    """Return a name that is not taken, by a number behind it."""
+    """Return a name that is not taken, if necessary with a number appended."""
     known = set(taken)
     if name not in known:
         return name

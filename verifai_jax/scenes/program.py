@@ -76,7 +76,7 @@ class ScenicProgram:
 
         Pure JAX; `jax.vmap` it for batches. Positions are in metres, headings in radians,
         counterclockwise from the y axis, as in Scenic. Global parameters come under `params`; an
-        option that is no number comes as its place. What has no meaning in JAX (`in_python`) is
+        option that is not a number comes as its index. What has no meaning in JAX (`in_python`) is
         computed by Scenic, without derivatives.
 
         **Arguments:**

@@ -40,7 +40,7 @@ COMPUTED = {
 """Distributions of Scenic that draw nothing themselves."""
 
 GUESSES = 64
-"""Random places that are tried for what a scene does not tell."""
+"""Random positions that are tried for what a scene does not tell."""
 
 LOCK = threading.RLock()
 """Held while Scenic computes."""
@@ -241,7 +241,7 @@ class Sampling:
         """Return the features of what Scenic drew, and whether it tells all of them.
 
         Scenic keeps no value of an option that was not chosen, and its bytes none of the ends of an
-        interval: their features are at this place of the unit interval, or at random ones.
+        interval: their features are at this position of the unit interval, or at random ones.
         """
         values = sys.modules["scenic.core.utils"].DefaultIdentityDict()
         features: dict[str, Any] = {}

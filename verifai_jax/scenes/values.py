@@ -121,7 +121,7 @@ def as_yaw(value: Any) -> Yaw:
 
 @dataclass(frozen=True)
 class Vec:
-    """A vector; `heading` is that of a place with one, such as a point on a line."""
+    """A vector; `heading` is that of a position with one, such as a point on a line."""
 
     x: Any
     y: Any
@@ -211,7 +211,7 @@ class Vec:
 
 
 def as_vec(value: Any) -> Vec:
-    """Return a vector, a tuple of coordinates, or the place of an object as a vector."""
+    """Return a vector, a tuple of coordinates, or the position of an object as a vector."""
     if isinstance(value, Vec):
         return value
     if isinstance(value, Body):
@@ -227,7 +227,7 @@ SIDES = {
     **{"left": (-1, 0), "right": (1, 0), "front": (0, 1), "back": (0, -1)},
     **{"frontLeft": (-1, 1), "frontRight": (1, 1), "backLeft": (-1, -1), "backRight": (1, -1)},
 }
-"""Places on an object, in halves of its width and length."""
+"""Positions on an object, in halves of its width and length."""
 
 
 @dataclass(frozen=True)
@@ -266,7 +266,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Choice:
-    """One of several values that are no numbers, by its place."""
+    """One of several values that are not numbers, by its index."""
 
     index: Any
     options: tuple[Any, ...]

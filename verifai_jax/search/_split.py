@@ -36,9 +36,9 @@ class Split(Search[tuple[PyTree, ...]]):
     and takes the temperature of its first part that wants gradients, the plan of its first part
     that has one.
 
-    **Raises:** `ValueError` for no parts; `TypeError` for a part that is no search. `check` raises
-    `ValueError` for a name that is no feature, a feature in two parts, or a part that cannot work
-    on its features.
+    **Raises:** `ValueError` for no parts; `TypeError` for a part that is not a search. `check`
+    raises `ValueError` for a name that is not a feature, a feature in two parts, or a part that
+    cannot work on its features.
     """
 
     parts: tuple[tuple[str, Search], ...]

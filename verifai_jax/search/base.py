@@ -101,7 +101,7 @@ class TraceOptions:
 
 @dataclass(frozen=True)
 class Wants:
-    """Needs of a search from the loop, besides the robustness of its points.
+    """Needs of a search from the loop, in addition to the robustness of its points.
 
     **Arguments:**
 

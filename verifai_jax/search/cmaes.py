@@ -103,9 +103,9 @@ class CMAES(Search[CMAESState]):
       in more of them it is less, in proportion.
     - `full_up_to`: coordinates up to which there is a whole covariance matrix.
     - `min_std`: standard deviation at which a run has converged, if all coordinates are below.
-    - `patience`: generations without progress after which a run ends, besides four times those in
-      which the covariance is learned (25 in all in four coordinates with batches of 16, 130 in ten
-      with batches of 10).
+    - `patience`: generations without progress after which a run ends, in addition to four times
+      those in which the covariance is learned (25 in all in four coordinates with batches of 16,
+      130 in ten with batches of 10).
     - `failures`: after this many failing points, and no fewer than two generations', a run ends.
 
     **Raises:** `ValueError` for values out of range.

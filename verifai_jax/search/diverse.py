@@ -77,7 +77,7 @@ class Diverse(Wrapper[DiverseState]):
     - `by`: what distinct failures are far from each other in: `"inputs"`, or `"behaviour"`, for
       which the radius is a share of what can differ (`search.behaviour.unlike`).
 
-    **Raises:** `TypeError` for what is no search; `ValueError` for values out of range.
+    **Raises:** `TypeError` for anything that is not a search; `ValueError` for values out of range.
     """
 
     search: Search

@@ -48,8 +48,8 @@ class Suggested(Wrapper[PyTree]):
     - `strict`: end the run at a suggestion that cannot be simulated. Otherwise it is left out, the
       notes of the run say so, and so does the next question.
 
-    **Raises:** `TypeError` for what is no function or no search; `ValueError` for a search that
-    does not learn, or numbers out of range.
+    **Raises:** `TypeError` for anything that is neither a function nor a search; `ValueError` for a
+    search that does not learn, or numbers out of range.
     """
 
     suggest: Suggest

@@ -31,7 +31,7 @@ class Wrapper(Search[State]):
     A subclass whose state holds more than that of the search inside defines `inner_state` and
     `with_inner_state`, and one that changes what the search inside learns defines `learn`.
 
-    **Raises:** `TypeError` for what is no search.
+    **Raises:** `TypeError` for anything that is not a search.
     """
 
     _internal = frozenset(("inner_state", "learn", "with_inner_state"))

@@ -44,7 +44,7 @@ class Cache:
       process only.
     - `kind`: of the work: `"sweep"` or `"augmentation"`.
 
-    **Raises:** `CacheError` for a file that is no cache, or damaged.
+    **Raises:** `CacheError` for a file that is not a cache, or damaged.
     """
 
     def __init__(self, folder: str | Path | None = None, kind: str = "sweep") -> None:

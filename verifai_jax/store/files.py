@@ -63,8 +63,8 @@ def write_record(path: Path, record: Mapping[str, Any]) -> dict[str, Any]:
 def read_record(path: Path) -> dict[str, Any]:
     """Read what `write_record` has written.
 
-    **Raises:** `FileNotFoundError` where there is none; `DamagedError` for what is no record, or
-    not as it was written.
+    **Raises:** `FileNotFoundError` where there is none; `DamagedError` for anything that is not a
+    record, or not as it was written.
     """
     try:
         record = json.loads(path.read_text())

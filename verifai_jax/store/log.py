@@ -140,7 +140,7 @@ class Log:
     def _index(self) -> dict[str, _Extent]:
         """Find the frames of the file: the place of the last entry of each name.
 
-        **Raises:** `DamagedError` for what is no file.
+        **Raises:** `DamagedError` for anything that is not a file.
         """
         if self._extents is None:
             extents: dict[str, _Extent] = {}
@@ -186,7 +186,7 @@ def _find_frames(file: IO[bytes]) -> Iterator[dict[str, _Extent] | None]:
 def _extents(frame: bytes, begin: int) -> dict[str, _Extent]:
     """Return where the entries of a frame are in a file, in which it begins at `begin`.
 
-    **Raises:** `ValueError` for what is no frame, or has changed.
+    **Raises:** `ValueError` for anything that is not a frame, or has changed.
     """
     mark, head, body, own = _HEADER.unpack_from(frame)
     if (

@@ -110,7 +110,7 @@ def sweep(
     - `max_seconds`: wall-clock limit; no training begins after two thirds of it.
     - `progress`: True draws progress bars, False none; None draws them on a terminal and in a
       notebook.
-    - `note`: plain data that is stored in the folder beside the work.
+    - `note`: plain data that is stored in the folder next to the work.
     - `callbacks`: functions called for each policy when its return is known, and again when its
       safety is, with the number of calls so far and a dictionary of plain numbers; work that is
       read from the folder counts too.

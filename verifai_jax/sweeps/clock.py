@@ -69,7 +69,7 @@ class Clock:
             self._bar.end()
 
     def advance(self, amount: float, figures: str = "") -> None:
-        """Count further units of the present stage as done, and show `figures` beside the bar."""
+        """Count further units of the present stage as done, and show `figures` next to the bar."""
         self._bar.advance(amount, figures)
 
     def show(self, done: float, total: float, figures: str) -> None:

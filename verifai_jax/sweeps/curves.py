@@ -32,7 +32,7 @@ def check_curve(formula: Formula | str) -> Formula:
     **Returns:** the formula.
 
     **Raises:** `FormulaSyntaxError` for text that does not parse; `UnknownNameError` for another
-    signal, with the nearest; `TypeError` for something that is no formula.
+    signal, with the nearest; `TypeError` for something that is not a formula.
     """
     if isinstance(formula, str):
         formula = parse(formula)

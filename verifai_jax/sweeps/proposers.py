@@ -75,8 +75,8 @@ def make_proposer(
     **Returns:** the proposer.
 
     **Raises:** `UnknownNameError` for another name; `ValueError` for a search that needs gradients
-    or does not fit this space; `TypeError` for something that is no search; `MissingExtra` without
-    Optuna.
+    or does not fit this space; `TypeError` for something that is not a search; `MissingExtra`
+    without Optuna.
     """
     rounds = max(available_cores(), -(-configurations // ROUNDS))
     if isinstance(search, str) and search.startswith("optuna:"):

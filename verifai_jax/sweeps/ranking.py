@@ -23,7 +23,7 @@ def is_safe(table: "pd.DataFrame") -> Bool[np.ndarray, " rows"]:
 
 
 def preference_order(table: "pd.DataFrame") -> Int[np.ndarray, " certified"]:
-    """Return the places of the rows with a certificate, the most preferable first.
+    """Return the indices of the rows with a certificate, the most preferable first.
 
     Safe ones come before others, by their nominal return; the others by the upper end of their
     failure probability. Then the lower failure rate, then fewer environment steps.

@@ -360,7 +360,7 @@ class Sweep(Drawn):
         return format_html(self.findings)
 
     def report(self, path: str | Path, **options: Any) -> Path:
-        """Write the evidence report on the sweep: one HTML file, and its claims as JSON beside it.
+        """Write the evidence report on the sweep: one HTML file, and its claims as JSON next to it.
 
         **Arguments:**
 

@@ -6,8 +6,9 @@
     curves.npz            the learning curves
     policies/12.npz       the policy of row 12; `vj.policy` reads it too
 
-`sweep.json` has the checksums of the others and one of itself: what has changed is told by name.
-The study is code, which the files never name: `load_sweep(folder, study)` takes it from its caller.
+`sweep.json` has the checksums of the others and one of itself: what has changed is reported by
+name. The study is code, which the files never name: `load_sweep(folder, study)` takes it from its
+caller.
 """
 
 import json
@@ -125,7 +126,7 @@ def _write_files(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> No
 
 
 def _files(folder: Path, rows: int) -> list[Path]:
-    """Return the files beside the record; rows may have no policy."""
+    """Return the files next to the record; rows may have no policy."""
     policies = (folder / POLICIES / f"{row}.npz" for row in range(rows))
     return [folder / TABLE, folder / FAILING, folder / CURVES, *(p for p in policies if p.exists())]
 

@@ -39,7 +39,7 @@ class Study:
     - `trainer`: the task and the algorithms.
     - `problem`: from a policy to the problem of its closed loop. JAX may trace the policy's
       weights.
-    - `checkpoints`: environment steps at which a training's policy is a row of the table, beside
+    - `checkpoints`: environment steps at which a training's policy is a row of the table, next to
       the end of the training.
     - `seeds`: training seeds of each configuration: their number (0, 1, ...), or the seeds.
     - `p`: the failure probability below which a policy is safe, between 0 and 1.
@@ -47,7 +47,7 @@ class Study:
     - `description`: one line.
     - `made_in`: as in `Problem`.
 
-    **Fields** beside these:
+    **Fields** in addition to these:
 
     - `training_seeds`: the seeds.
     - `curve_formula`: the parsed formula.

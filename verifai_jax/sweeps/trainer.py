@@ -73,8 +73,9 @@ class Trainer:
       they observe, as functions and modules of flax.
     - `workers`: for a function, processes at a time; as many as there are cores when left out.
 
-    **Raises:** `StudyError` without an algorithm, for something that is no algorithm or no task, a
-    number of steps that is not positive, or a nominal task with other actions or observations.
+    **Raises:** `StudyError` without an algorithm, for something that is not an algorithm or
+    task, a number of steps that is not positive, or a nominal task with other actions or
+    observations.
     """
 
     task: Any

@@ -22,7 +22,7 @@ def check_options(
 ) -> None:
     """Check the options of a sweep, alone and with its study.
 
-    **Raises:** `TypeError` for something that is no study or no `Halving`; `ValueError` for a
+    **Raises:** `TypeError` for something that is not a study or a `Halving`; `ValueError` for a
     number out of range, or a budget that cannot sample all policies; `StudyError` for halving
     without checkpoints or of trainings of several lengths.
     """

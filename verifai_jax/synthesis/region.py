@@ -91,7 +91,7 @@ class Region:
 def region_of(loop: Parametric, mass: float) -> Region | None:
     """Return the region in which the environment of a loop is attacked; None without one.
 
-    **Raises:** `ValueError` for a mass that is no probability above 0.
+    **Raises:** `ValueError` for a mass that is not a probability above 0.
     """
     if isinstance(mass, bool) or not isinstance(mass, int | float) or not 0 < mass <= 1:
         raise ValueError(

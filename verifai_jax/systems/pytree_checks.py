@@ -14,8 +14,8 @@ from jaxtyping import Array, PyTree
 def as_floating(tree: PyTree, origin: str) -> Any:
     """Return the same pytree with every leaf an array of one common floating-point dtype.
 
-    **Raises:** `ValueError`, naming `origin`, for a tree without leaves or a leaf that is no real
-    number.
+    **Raises:** `ValueError`, naming `origin`, for a tree without leaves or a leaf that is not a
+    real number.
     """
     leaves = jax.tree.leaves(tree)
     if not leaves:

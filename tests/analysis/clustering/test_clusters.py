@@ -164,7 +164,7 @@ def test_absent_items_are_a_kind():
     assert set(found.table["representative"]) <= set(frame.index)
 
 
-def test_refused():
+def test_what_is_wrong_is_refused_where_it_is_made():
     frame, _ = blobs()
     with (
         unchecked(),

@@ -132,7 +132,7 @@ def test_a_space_says_what_columns_are():
     )
 
 
-def test_scales():
+def test_columns_are_scaled_as_asked():
     frame = pd.DataFrame({"x": [1.0, 2.0, 4.0], "c": [7.0, 7.0, 7.0]})
     samples = Samples.of(frame)
     np.testing.assert_allclose(samples.matrix("rows"), [[0, 0], [1 / 3, 0], [1, 0]])
@@ -201,7 +201,7 @@ def test_empty_parts_say_what_there_is():
         Samples.of(ErrorTable(("x",)))
 
 
-def test_refused():
+def test_what_is_wrong_is_refused_where_it_is_made():
     frame = pd.DataFrame({"speed": [1.0], "alg": ["a"]})
     with pytest.raises(UnknownNameError, match="unknown column 'sped'; did you mean 'speed'"):
         Samples.of(frame, columns=["sped"])
@@ -249,7 +249,7 @@ def test_other_rows_of_the_same_table():
     assert samples.others("safe").kind == "1 safe row of table"
 
 
-def test_generators():
+def test_a_seed_or_a_key_makes_the_same_generator():
     draws = [generator(seed).uniform() for seed in (3, 3, 4)]
     assert draws[0] == draws[1] != draws[2]
     keyed = [generator(jax.random.key(seed)).uniform() for seed in (3, 3, 4)]

@@ -197,7 +197,7 @@ def test_black_boxes_are_simulated_and_have_no_gradient():
         gradient_sensitivity(black)
 
 
-def test_refusals(mixed, ishigami):
+def test_what_cannot_work_is_refused_with_the_reason(mixed, ishigami):
     with pytest.raises(ValueError, match="samples must be an integer of at least 16; got 3"):
         sobol_indices(mixed, samples=3)
     with pytest.raises(ValueError, match="levels must be an even number of at least 2; got 5"):
@@ -222,7 +222,7 @@ def test_refusals(mixed, ishigami):
             analysis(tied)
 
 
-def test_pictures(ishigami, mixed, tmp_path):
+def test_pictures_are_drawn_and_written(ishigami, mixed, tmp_path):
     from PIL import Image
 
     for name, found in {

@@ -94,7 +94,7 @@ def test_each_solver_that_is_known_can_be_used():
         jax.eval_shape(van_der_pol(method=adaptive(name, rtol=1e-3)), {"mu": 1.0}, None)
 
 
-def test_refused():
+def test_what_is_wrong_is_refused_where_it_is_made():
     pytest.importorskip("diffrax")
     with pytest.raises(UnknownNameError, match="did you mean 'Kvaerno5'"):
         adaptive("Kvaerno6")

@@ -59,7 +59,7 @@ def test_it_holds_what_it_was_given():
 
 
 @pytest.mark.parametrize("seconds", [0, -1.0, float("nan")])
-def test_refused(seconds):
+def test_what_is_wrong_is_refused_where_it_is_made(seconds):
     with pytest.raises(ValueError, match="longest must be a positive number of seconds"):
         delay_line(0.0, longest=seconds, period=0.1)
     with pytest.raises(ValueError, match="period must be a positive number of seconds"):

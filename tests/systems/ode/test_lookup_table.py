@@ -72,7 +72,7 @@ def test_tables_of_vectors():
         (lambda: LookupTable([1, 2], [0, 1], beyond="clap"), "unknown beyond 'clap'; did you mean"),
     ],
 )
-def test_refused(make, message):
+def test_what_is_wrong_is_refused_where_it_is_made(make, message):
     with unchecked(), pytest.raises(ValueError, match=message):
         make()
     with pytest.raises(TypeError, match="a function of 1 numbers; got 2"):

@@ -238,7 +238,7 @@ def test_latches_and_hysteresis():
         ({"update": lambda t, s, f: 0.0}, "update must return a state, in the form of the state"),
     ],
 )
-def test_refused(options, message):
+def test_what_is_wrong_is_refused_where_it_is_made(options, message):
     with unchecked(), pytest.raises(ValueError, match=message):
         ball(**options)({"height": 1.0})
 

@@ -41,7 +41,7 @@ class Column:
     length: bool = False
 
     def codes(self, entries: pd.Series | pd.DataFrame) -> Int[np.ndarray, " n"]:
-        """Return the places of entries in `choices`; -1 for an absent one.
+        """Return the indices of entries in `choices`; -1 for an absent one.
 
         **Raises:** `ValueError` for an entry that is none of the choices.
         """

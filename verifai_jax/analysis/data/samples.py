@@ -6,7 +6,7 @@
     samples.codes()                                      # unordered columns as integers, [n, m]
     samples.points()                                     # all columns, for Euclidean distances
 
-Results always speak of row numbers of the table (`samples.rows`), never of places among the rows
+Results always speak of row numbers of the table (`samples.rows`), never of indices among the rows
 looked at.
 """
 
@@ -75,7 +75,7 @@ class Samples:
         - `source`: a run, its table, a DataFrame with feature columns and row numbers as index, or
           `Samples`, which are taken as they are, with other `columns` where they are given.
         - `which`: `"counterexamples"`, `"safe"`, `"failed"` (rows without a verdict), or `"all"`
-          rows with a verdict. Those of a DataFrame are told by its columns `violated` and
+          rows with a verdict. Those of a DataFrame are recognised by its columns `violated` and
           `status`, else by `rho < 0`; without either, all rows are counterexamples.
         - `columns`: what to analyse; by default all features. `"rho"` and `"rho.NAME"`, the
           robustness, are columns too, but only if named here.
@@ -166,7 +166,7 @@ class Samples:
 
     @property
     def worst(self) -> int:
-        """Place (not the row number) of the least robustness; the first without any."""
+        """Index (not the row number) of the row with the least robustness; 0 if none has any."""
         return int(np.argmin(np.nan_to_num(self.rho, nan=np.inf)))
 
     def others(self, which: Which) -> "Samples":
@@ -248,7 +248,7 @@ class Samples:
         return scaled
 
     def codes(self) -> Int[np.ndarray, "n m"]:
-        """Return the unordered columns as places in their `choices`; -1 where absent."""
+        """Return the unordered columns as indices in their `choices`; -1 where absent."""
         return self.embed()[1]
 
     def points(self, scale: Scale = "range") -> Float[np.ndarray, "n d"]:

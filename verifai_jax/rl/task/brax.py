@@ -101,7 +101,7 @@ def brax_task(
 
     **Raises:** `MissingExtra` without brax; `UnknownNameError` for an unknown environment or
     backend; `ValueError` for an environment in a wrapper that resets, ends or batches episodes, for
-    observations that are no array, and for a `time_limit` that is no positive integer.
+    observations that are no array, and for a `time_limit` that is not a positive integer.
     """
     check_count("time_limit", time_limit)
     chosen = tuple(sorted((options or {}).items()))

@@ -83,7 +83,7 @@ def box_actions(
 def flat_observation(observation: object, name: str) -> Float[Array, " k"]:
     """Return an observation as one vector of float32.
 
-    **Raises:** `ValueError` for one that is no array of numbers.
+    **Raises:** `ValueError` for one that is not an array of numbers.
     """
     if not hasattr(observation, "shape") or not hasattr(observation, "dtype"):
         raise ValueError(

@@ -268,7 +268,7 @@ def _make(name: str, backend: str | None, options: dict[str, object]) -> Any:
 
 
 def _check_env(env: Env, name: str) -> None:
-    """Refuse what is no environment, or one that resets itself."""
+    """Refuse anything that is not an environment, or one that resets itself."""
     for part in ("reset", "step", "action_size"):
         if not hasattr(type(env), part) and not hasattr(env, part):
             raise ValueError(

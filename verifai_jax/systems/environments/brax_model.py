@@ -1,7 +1,7 @@
 """Paths to the parts of a Brax environment, and copies of it with parts set.
 
-place = system_location(env, "link.inertia.mass[pole]", "hopper")
-env = with_system(env, with_value(env.unwrapped.sys, place, 2.0, "mass"))
+location = system_location(env, "link.inertia.mass[pole]", "hopper")
+env = with_system(env, with_value(env.unwrapped.sys, location, 2.0, "mass"))
 """
 
 import contextlib
@@ -71,7 +71,7 @@ def explain_errors(env: Env, name: str, what: str, backend: str | None = None) -
 
 
 def system_location(env: Env, path: str, name: str) -> Location:
-    """Return the place of a path such as `link.inertia.mass[pole]` or `geom_friction[floor, 0]`.
+    """Return the location of a path such as `link.inertia.mass[pole]` or `geom_friction[floor, 0]`.
 
     **Raises:** `UnknownNameError` for a part or an entry that does not exist; `ValueError` for an
     environment without `sys`, or a part that holds no numbers.
@@ -151,7 +151,7 @@ def _row(text: str, parts: tuple[str, ...], length: int, named: dict[str, int], 
 
 
 def joint_location(env: Env, path: str, name: str) -> Location:
-    """Return the place of a path such as `q[hinge]` in the initial `q` or `qd`."""
+    """Return the location of a path such as `q[hinge]` in the initial `q` or `qd`."""
     match = re.fullmatch(r"(\w+)\[([^\]]+)\]", path.strip())
     part = match.group(1) if match else path
     if part not in ("q", "qd") or match is None:

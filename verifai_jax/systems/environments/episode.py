@@ -135,7 +135,7 @@ def _run(
     def sample(carry: PyTree, k: Int[Array, ""]) -> Any:
         (moment, memory, (observations, actions), age), collected = carry
         frozen = (k >= episode.steps) | moment.over
-        # Time, and with it randomness, stops with the state: the samples behind the end repeat.
+        # Time, and with it randomness, stops with the state: the samples after the end repeat.
         time = age.astype(float) * episode.dt
         decide_key, step_key = (jax.random.fold_in(k, age) for k in (keys.decide, keys.step))
         observed, observations = through(observations, moment.observation, delays.observation)

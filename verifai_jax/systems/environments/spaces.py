@@ -1,9 +1,10 @@
-"""Actions and observations of Gymnasium's spaces, told apart by the class of the space.
+"""Actions and observations of Gymnasium's spaces, distinguished by the class of the space.
 
 fit(env.action_space, action, clip=True)            # as the environment takes it, or a Misfit
 named_numbers("action", action)                     # {"action": ...}, or {"action.grip": ...}
 
-Classes are told by their names: Gymnasium is an optional package, and older ones have the same.
+Classes are recognised by their names: Gymnasium is an optional package, and older ones have the
+same.
 """
 
 from collections.abc import Iterator, Mapping
@@ -111,7 +112,7 @@ def fit(space: Space, action: object, clip: bool = True) -> Fitted:
     - `clip`: whether what lies outside the bounds of a Box is set to the nearest bound, as training
       libraries do, or passed on. Either way `outside` says so.
 
-    **Raises:** `Misfit` for a value that is no action of the space.
+    **Raises:** `Misfit` for a value that is not an action of the space.
     """
     kind = kind_of(space)
     if kind == "Dict":

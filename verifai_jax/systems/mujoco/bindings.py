@@ -47,9 +47,9 @@ Bound = Mapping[str, "str | Scaled | Sequence[str | Scaled]"]
 
 @dataclass(frozen=True)
 class Scaled:
-    """A place whose value the feature multiplies: at 1 the model's value stays as it is.
+    """A location whose value the feature multiplies: at 1 the model's value stays as it is.
 
-    - `path`: of the place, as in `bind`: `"body/torso/mass"`.
+    - `path`: of the location, as in `bind`: `"body/torso/mass"`.
     """
 
     path: str
@@ -57,7 +57,7 @@ class Scaled:
 
 @dataclass(frozen=True)
 class Binding:
-    """One feature sets one place."""
+    """One feature sets one location."""
 
     feature: str
     location: Location
@@ -163,7 +163,7 @@ class Bindings:
         """Refuse features that the bindings do not fit.
 
         **Raises:** `ValueError` for a bound feature that does not exist, one of another shape than
-        its place, and a `Signal` where only constants can go.
+        its location, and a `Signal` where only constants can go.
         """
         for binding in self.all:
             check_names(f"feature bound to {binding.location.path!r}:", [binding.feature], features)

@@ -61,7 +61,7 @@ def bodies_of_geoms(
     **Arguments:**
 
     - `model`: with the spec that it came from.
-    - `changed`: numbers of geoms of another size or in another place.
+    - `changed`: numbers of geoms of another size or in another location.
     - `massive`: numbers of geoms with another mass, and the paths that say so.
 
     **Raises:** `ValueError` for a body whose inertia cannot be computed here (meshes, shells), and

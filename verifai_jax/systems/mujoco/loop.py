@@ -72,7 +72,7 @@ class Sample(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """The carry from sample to sample beside the physics."""
+    """The carry from sample to sample in addition to the physics."""
 
     memory: Any
     age: Int[Array, ""]
@@ -130,7 +130,7 @@ class Loop:
 
     @cached_property
     def locations(self) -> dict[str, Location]:
-        """The places of signals that are named by a path."""
+        """The locations of signals that are named by a path."""
         if callable(self.signals):
             return {}
         chosen = self._default_signals() if self.signals is None else self.signals
@@ -226,7 +226,7 @@ class Loop:
             for name, shape in self.shapes.items()
         }
         sensors = full["sensordata"]
-        # Sensors that were added for contacts lie behind the model's own.
+        # Sensors that were added for contacts lie after the model's own.
         own = sensors[: self.compiled.nsensordata - len(self.bindings.model.contact_sensors)]
         return State(time, **{**full, "sensordata": own}), sensors
 

@@ -63,7 +63,7 @@ KINDS = ("body", "joint", "geom", "site", "actuator", "tendon", "equality", "pai
 GEOM_MASS = "geom_mass"
 """The masses of geoms, `[ngeom]`, of which MuJoCo keeps only what they add up to in their body."""
 
-# What can be set, beside parameters of the model: the state at time 0, and what acts on it.
+# What can be set, in addition to parameters of the model: the state at time 0, and what acts on it.
 _INPUTS = {
     "body": ("force", "torque"),
     "geom": ("mass",),
@@ -96,7 +96,7 @@ _PATH = re.compile(r"^(?P<kind>[^/\[\]]+)/(?P<rest>.+?)(\[(?P<index>[^\]]*)\])?$
 
 @dataclass(frozen=True)
 class Location:
-    """The place of some numbers in one array.
+    """The location of some numbers in one array.
 
     - `array`: its name in MjModel or MjData; `"opt.gravity"` is in the model's options.
     - `index`: flat indices `[k]` into it.
@@ -147,7 +147,7 @@ def load(
     **Arguments:**
 
     - `source`: the path of an MJCF file, its text, an `mujoco.MjSpec`, or an `mujoco.MjModel`.
-    - `contacts`: paths `contact/GEOM` and `contact/GEOM/GEOM`, for which a sensor is added behind
+    - `contacts`: paths `contact/GEOM` and `contact/GEOM/GEOM`, for which a sensor is added after
       the model's own.
     - `keyframe`: name or number of the keyframe that simulations begin with.
     - `options`: fields of the model's options to set, where they are not None.
@@ -341,7 +341,7 @@ def names(model: MjModel, kind: str) -> list[str]:
 
 
 def locate(model: MjModel, path: str) -> list[Location]:
-    """Return the places that a bound path sets.
+    """Return the locations that a bound path sets.
 
     **Raises:** `UnknownNameError` for an unknown kind, element or field, with the nearest ones;
     `ValueError` for an index outside the field.
@@ -386,7 +386,7 @@ def _locate_input(
         return [_pick(path, "ctrl", np.array([element]), index)]
     if field == "act":
         return [_pick(path, "act", _activations(model, element, path), index)]
-    # A position servo is gain kp and bias -kp; a damped one has bias -kv beside.
+    # A position servo is gain kp and bias -kp; a damped one also has bias -kv.
     gain, bias = model.actuator_gainprm.shape[1], model.actuator_biasprm.shape[1]
     if model.actuator_biastype[element] != 1:
         raise ValueError(
@@ -401,7 +401,7 @@ def _locate_input(
 
 
 def reading(model: MjModel, path: str) -> Location:
-    """Return the place of a signal's path in the state.
+    """Return the location of a signal's path in the state.
 
     **Raises:** as `locate`.
     """
@@ -480,7 +480,7 @@ def _flat(array: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _pick(path: str, array: str, where: np.ndarray, index: str | None) -> Location:
-    """Return the place of those numbers of an element that an index or a slice selects."""
+    """Return the location of those numbers of an element that an index or a slice selects."""
     if index is None:
         return Location(array, where, () if where.size == 1 else (where.size,), path)
     try:

@@ -136,7 +136,7 @@ class _Program:
         )
 
     def _stage(self) -> int:
-        """Return the stage up to which MuJoCo must compute at a sample, beside the steps."""
+        """Return the stage up to which MuJoCo computes at each sample, in addition to the steps."""
         derived = set(self.names) - {"qpos", "qvel", "act"}
         if not derived:
             return 0

@@ -213,7 +213,7 @@ class _Rollout:
         over = k >= self.loop.steps
         if self.loop.terminate is None:
             return k.astype(_dtype(state)) * self.loop.dt, over
-        # Time stops with the state: whatever the signals depend on, the samples behind the end
+        # Time stops with the state: whatever the signals depend on, the samples after the end
         # repeat the last valid one.
         ended = self.loop.terminate(state, self.features)
         return age.astype(_dtype(state)) * self.loop.dt, over | ended

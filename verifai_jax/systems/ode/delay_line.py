@@ -70,7 +70,7 @@ def delay_line(value: Any, *, longest: float, period: float) -> DelayLine:
     - `period`: seconds between two samples: `dt` for a line that `update` pushes, the control
       period for one in a controller's memory. A delay shorter than it reads the newest sample.
 
-    **Raises:** `ValueError` for seconds that are not positive, and a value that is no number.
+    **Raises:** `ValueError` for seconds that are not positive, and a value that is not a number.
     """
     for name, seconds in (("longest", longest), ("period", period)):
         if not is_number(seconds) or not 0 < seconds < math.inf:

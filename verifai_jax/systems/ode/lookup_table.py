@@ -30,12 +30,12 @@ class LookupTable:
     """A function of one or more numbers, linear in each between the points of a grid.
 
     It can be jitted, vmapped and differentiated, in its arguments and in its values. At a
-    breakpoint the derivative is that of the line behind it.
+    breakpoint the derivative is that of the line after it.
 
     **Arguments:**
 
     - `axes_and_values`: the increasing breakpoints of each argument, at least two of each, and
-      last the values, of shape `[len(axis), ...]` by `[len(axis), ...]` and so on. Axes behind
+      last the values, of shape `[len(axis), ...]` by `[len(axis), ...]` and so on. Axes after
       these make a table of vectors.
     - `beyond`: `"clip"` has the value at the end of an axis beyond it, `"extrapolate"` goes on
       along the last line.

@@ -210,7 +210,7 @@ class _Step:
     def armed(
         self, first: Bool[Array, " switches"], instant: Any, jumped: PyTree
     ) -> Bool[Array, " switches"]:
-        """Return which switches may happen in the rest of the step, behind the first."""
+        """Return which switches may happen in the rest of the step, after the first."""
         ahead = (jnp.ones_like(instant), self.derivative(instant, jumped))
         guards, rates = jax.jvp(self.guards, (instant, jumped), ahead)
         # The switch that has just happened is at zero. It happens again where it moved away and

@@ -215,7 +215,7 @@ def remote(
 
 
 def _text(features: Features, seed: int) -> bytes:
-    """Return a point of a `work` message, its JSON behind the id."""
+    """Return a point of a `work` message, its JSON after the id."""
     text = wire.to_text({"seed": int(seed), "features": wire.plain(features)})
     return text[1:].encode()
 

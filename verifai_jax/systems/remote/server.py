@@ -180,7 +180,7 @@ class Server(threading.Thread):
         self._flush(client)
 
     def _make_room(self) -> None:
-        """Drop the oldest connection that is no client, if there is one.
+        """Drop the oldest connection that is not a client, if there is one.
 
         Connections that say nothing must not shut out those that do.
         """
