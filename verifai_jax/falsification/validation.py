@@ -98,8 +98,8 @@ def check_engine(engine: object) -> None:
 
 
 def as_wanted(engine: str) -> Wanted:
-    """Return an engine that was checked, with its type."""
-    return cast(Wanted, engine)
+    """Return an engine that was checked or recorded, as one to ask for: a host has no other."""
+    return cast(Wanted, "xla" if engine == "host" else engine)
 
 
 def check_search(problem: object, search: object) -> Search:

@@ -1,9 +1,11 @@
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from verifai_jax.systems.ode import sin_cos
+from verifai_jax.systems.ode import sin_cos, trigonometry
 
 
 @pytest.mark.slow
@@ -13,6 +15,16 @@ def test_as_close_as_float32_can_tell(largest):
     sin, cos = jax.jit(sin_cos)(angles)
     np.testing.assert_allclose(sin, np.sin(angles.astype(float)), atol=1.3e-7)
     np.testing.assert_allclose(cos, np.cos(angles.astype(float)), atol=1.3e-7)
+
+
+def test_parts_of_half_pi_have_exact_products():
+    # Without fused operations a rounded product is as wrong as half a unit in its last place.
+    parts = trigonometry._HALF_PI
+    assert abs(math.fsum(map(float, parts)) - math.pi / 2) < 1e-16
+    quadrants = np.arange(2**16)
+    for part in parts[:-1]:
+        exact = quadrants * float(part)
+        np.testing.assert_array_equal(np.float32(exact), exact)
 
 
 def test_special_angles():

@@ -12,9 +12,13 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-# pi / 2 in three parts; the first two have so few bits that their products with a quadrant number
-# below 2^16 are exact (Cody and Waite, Software Manual for the Elementary Functions, 1980).
-_HALF_PI = tuple(np.float32(part) for part in (1.5703125, 4.837512969970703125e-4, 7.54978995e-8))
+# pi / 2 in four parts. The first three have eight bits, so that their products with a quadrant
+# number below 2^16 are exact, also where multiplication and subtraction are not fused (Cody and
+# Waite, Software Manual for the Elementary Functions, 1980).
+_HALF_PI = tuple(
+    np.float32(part)
+    for part in (1.5703125, 4.825592041015625e-4, 1.2665987014770508e-6, 9.92093629470503e-10)
+)
 _LARGEST = np.float32(1e5)
 
 # Minimax polynomials on [-pi/4, pi/4] (S. Moshier, Cephes 2.2, sinf.c).
