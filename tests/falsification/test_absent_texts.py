@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.falsification.columns import checksum, column_to_arrow
+from verifai_jax.falsification.columns import column_checksum, column_to_arrow
 
 
 @pytest.mark.thorough
@@ -38,9 +38,9 @@ def test_columns_with_absent_texts(absent):
     assert column.to_pylist() == [None, "red", None, "blue"]
     assert str(column_to_arrow(values[:1]).type) == "string"
     back = column.to_numpy(zero_copy_only=False)
-    assert checksum(values) == checksum(back)
+    assert column_checksum(values) == column_checksum(back)
     # In any parts, the same.
-    parts = checksum(values[:1])
-    assert checksum(values[1:], parts) == checksum(values)
+    parts = column_checksum(values[:1])
+    assert column_checksum(values[1:], parts) == column_checksum(values)
     numbers = np.array([1.0, np.nan])
     assert column_to_arrow(numbers).null_count == 0

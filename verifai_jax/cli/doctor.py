@@ -25,6 +25,7 @@ EXTRAS = {
     "gymnax": "gymnax",
     "gymnasium": "gymnasium",
     "diffrax": "diffrax",
+    "playground": "playground",
 }
 """Optional packages, and the extra of verifai_jax that installs each."""
 

@@ -86,7 +86,7 @@ class Trainer:
     observation: Any = None
     workers: int | None = None
 
-    def __new__(cls, task: Task | Train, *arguments: object, **options: object) -> "Trainer":
+    def __new__(cls, task: object = None, *arguments: object, **options: object) -> "Trainer":
         """Make the trainer of a function where `task` is one."""
         is_function = callable(task) and not isinstance(task, Task | type)
         return object.__new__(FunctionTrainer if cls is Trainer and is_function else cls)
