@@ -85,7 +85,7 @@ def test_completion_shows_what_is_for_users(problem, run):
         (problem.system, set(), {"reverse_hint", "lanes", "why_not"}),
         (problem.formulas["low"], {"horizon", "until", "signals"}, {"below", "children"}),
         (run, {"replay", "table", "best", "plot"}, {"checkpoint", "damage", "space_data"}),
-        (run.table, {"all", "counterexamples", "safe"}, {"append", "digest", "count_rows"}),
+        (run.table, {"all", "counterexamples", "safe"}, {"append", "digest", "missing"}),
         (vj.search.Uniform(), {"ask", "tell"}, {"wants", "fallback"}),
     ):
         assert wanted <= names(thing), thing

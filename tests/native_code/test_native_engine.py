@@ -42,14 +42,6 @@ def problem_of(system, spec="always (abs(angle) < 2)", space=SPACE, **more):
     return vj.Problem("swing", space, system, spec, **more)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _cache(tmp_path_factory):
-    """Libraries of these tests are their own, and compiled here."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("VERIFAI_JAX_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 @pytest.fixture(scope="module")
 def ending():
     return problem_of(swing(terminate=lambda state, features: jnp.abs(state["angle"]) > 2.5))
@@ -159,7 +151,7 @@ def test_the_record_says_which_engine(ending, tmp_path):
     assert vj.load(tmp_path / "small", ending).engine == small.engine == "xla"
 
 
-def test_by_default_native_where_the_budget_is_worth_it(ending):
+def test_auto_is_native_where_the_budget_is_worth_it(ending):
     engine = engine_for(ending, BATCH)
     enough = int(native_engine.WORTH / engine.work) + 1
     assert NativeEngine(engine, "auto", enough)._is_worth
