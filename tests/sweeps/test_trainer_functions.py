@@ -8,6 +8,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from drifting import Point
 from numpy_training import study, sweep, train, train_anew
 
 import verifai_jax as vj
@@ -31,7 +32,7 @@ def test_what_is_wrong_is_said_before_anything_trains():
     with pytest.raises(StudyError, match=r"must be train\(key, hyperparameters, steps=\.\.\."):
         vj.Trainer(lambda key, values: None, steps=8, example=lambda o: o)
     with pytest.raises(StudyError, match="example belongs to a function that trains"):
-        vj.Trainer(vj.rl.gymnax_task("CartPole-v1"), example=lambda o: o)
+        vj.Trainer(Point(), example=lambda o: o)
 
     def inner(key, hyperparameters, steps):
         return None

@@ -346,6 +346,14 @@ def _has_rule(primitive: Any) -> bool:
     return any(isinstance(table, dict) and primitive in table for table in tables)
 
 
+def operands_of_scan(options: Mapping[str, Any]) -> tuple[int, int]:
+    """Return how many operands of a scan are constants and how many are carried."""
+    if "ft_in" in options:  # JAX 0.12 groups the operands, versions before it count them.
+        constants, carried, _ = options["ft_in"].unpack()
+        return len(constants), len(carried)
+    return options["num_consts"], options["num_carry"]
+
+
 _CUSTOM_CALLS = ("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
 _CALLS = ("checkpoint", "closed_call", "core_call", "jit", "pjit", "remat", "remat2")
 _RUN_AS_THEY_ARE = frozenset({*_CUSTOM_CALLS, *_CALLS, "cond", "scan", "while"})

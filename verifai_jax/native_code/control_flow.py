@@ -5,7 +5,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from verifai_jax.core.fingerprint import programs_in
+from verifai_jax.core.fingerprint import operands_of_scan, programs_in
 from verifai_jax.native_code.translation import SINGLE, Translator, pairs, rule, words_of
 from verifai_jax.native_code.values import (
     KEY,
@@ -126,7 +126,7 @@ def until_settled(
 @rule("scan")
 def _scan(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     params = step.params
-    consts, count, length = params["num_consts"], params["num_carry"], params["length"]
+    (consts, count), length = operands_of_scan(params), params["length"]
     program = params["jaxpr"]
     shared, start = inputs[:consts], inputs[consts : consts + count]
     forms = [each.aval for each in step.outvars]

@@ -21,6 +21,7 @@ from jaxtyping import Array, PyTree
 
 from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.errors import require
+from verifai_jax.core.fingerprint import operands_of_scan
 from verifai_jax.policies.errors import PolicyError
 from verifai_jax.policies.onnx_graph import OPSET, Graph
 from verifai_jax.policies.onnx_operators import Node
@@ -189,7 +190,7 @@ class _Translation:
 
     def scan(self, given: list[Value], options: Mapping[str, Any]) -> list[Value]:
         """Return the outputs of a loop of fixed length, written out."""
-        fixed, carried = options["num_consts"], options["num_carry"]
+        fixed, carried = operands_of_scan(options)
         constants, carry = given[:fixed], given[fixed : fixed + carried]
         series, inner = given[fixed + carried :], options["jaxpr"]
         shapes = [v.aval.shape for v in inner.jaxpr.invars[fixed + carried :]]

@@ -31,6 +31,7 @@ from verifai_jax.core.fingerprint import (
     as_function,
     describe_step,
     of_some,
+    operands_of_scan,
     programs_in,
     used_inputs,
     without_unused,
@@ -153,7 +154,7 @@ class _Sweep:
         if name in _CALLS and _CALLS[name] in options:
             return self(_program(options[_CALLS[name]]), moved)
         if name == "scan":
-            constants, carried = _operands_of_scan(options)
+            constants, carried = operands_of_scan(options)
             fixed, carry = moved[:constants], moved[constants : constants + carried]
             rows = moved[constants + carried :]
             return self.repeated(_program(options["jaxpr"]), fixed, carry, rows)
@@ -231,14 +232,6 @@ def _is_of_jax(step: Any) -> bool:
     return str(getattr(rule, "__module__", "")).startswith(
         ("jax._src.lax", "jax._src.interpreters")
     )
-
-
-def _operands_of_scan(options: dict[str, Any]) -> tuple[int, int]:
-    """Return how many operands of a scan are constants and how many are carried."""
-    if "ft_in" in options:  # JAX 0.12 groups the operands, versions before it count them.
-        constants, carried, _ = options["ft_in"].unpack()
-        return len(constants), len(carried)
-    return options["num_consts"], options["num_carry"]
 
 
 def _program(program: Any) -> jax.extend.core.Jaxpr:
