@@ -69,7 +69,7 @@ def transfer(
 
     **Arguments:**
 
-    - `policy`: given to both problems; None where they have it already.
+    - `policy`: given to both problems; None if they have it already.
     - `problem_a`, `problem_b`: a function from the policy to a `Problem`, or a `Problem`. Features
       that both have, with the same domains, are varied; all others are held at their nominal
       values.
@@ -331,12 +331,6 @@ def _columns(trace: Trace | None) -> dict[str, Float[np.ndarray, " time"]]:
     return found
 
 
-def _times(trace: Trace, count: int) -> Float[np.ndarray, " time"]:
-    if trace.times is not None:
-        return np.asarray(trace.times, float)[:count]
-    return np.arange(count) * float(trace.dt or 1.0)
-
-
 def _scales(sides: Sequence[Verdicts]) -> dict[str, float]:
     """Return the range of each common signal, over all traces of both engines.
 
@@ -371,7 +365,7 @@ def _gaps(
     """
     one, other = _columns(a), _columns(b)
     counts = [len(next(iter(each.values()))) for each in (one, other)]
-    t, s = _times(a, counts[0]), _times(b, counts[1])
+    t, s = (np.asarray(x.clock())[:n] for x, n in zip((a, b), counts, strict=True))
     ends = t[-1], s[-1]
     times = t[t <= min(ends) + 1e-9]
     period = max(np.max(np.diff(each), initial=0.0) for each in (t, s))

@@ -56,10 +56,7 @@ class Compared:
         **Raises:** `ValueError` where there is no such pair.
         """
         rows = self.pairs.assign(violated=self.pairs["worse"]).drop(columns=["worse", "better"])
-        samples = lazy_import("verifai_jax.analysis.data.samples", "Samples")
-        return lazy_import("verifai_jax.analysis", "rules")(
-            samples.of(rows, "all", list(self.space.columns), self.space), **options
-        )
+        return _rules(rows, self.space, options)
 
     def __str__(self) -> str:
         rates, words = self.rates, self.verdict.upper()
@@ -156,6 +153,14 @@ class Comparison(InNotebook):
     __repr__ = __str__
 
 
+def _rules(rows: "pd.DataFrame", space: FeatureSpace, options: Mapping[str, Any]) -> Any:
+    """Describe the violating ones of these rows by boxes of their features."""
+    samples = lazy_import("verifai_jax.analysis.data.samples", "Samples")
+    return lazy_import("verifai_jax.analysis", "rules")(
+        samples.of(rows, "all", list(space.columns), space), **options
+    )
+
+
 def judge(rates: PairedRates, margin: float) -> str:
     """Decide from an interval: worse by more than the margin, better, the same within it, open."""
     if rates.low > margin:
@@ -176,7 +181,7 @@ class Transfer(InNotebook):
       do; `searched`, whether the search chose it; `proper`, whether both ended.
     - `space`: of the common features.
     - `influence`: of each coordinate the share of the gap's variance among samples, from 0 to 1.
-    - `worst`: the row that parts most, with its traces in a and in b; None where none does.
+    - `worst`: the row that parts most, with its traces in a and in b; None if none parts.
     - `tolerance`, `seed`: as given.
     - `stopped`: `"budget"` or `"interrupted"`.
     - `seconds`: that it took.
@@ -218,10 +223,7 @@ class Transfer(InNotebook):
         """
         rows: Any = self.table[self.table["proper"]]
         rows = rows.assign(violated=rows.index.isin(self.flips.index), rho=-rows["gap"])
-        samples = lazy_import("verifai_jax.analysis.data.samples", "Samples")
-        return lazy_import("verifai_jax.analysis", "rules")(
-            samples.of(rows, "all", list(self.space.columns), self.space), **options
-        )
+        return _rules(rows, self.space, options)
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the pair that parts most, and the gaps of all by the feature that matters most.

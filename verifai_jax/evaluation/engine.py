@@ -203,7 +203,7 @@ class Engine:
 
     @property
     def row_identity(self) -> str | None:
-        """A hash of all that the function of one row computes; None where it has none."""
+        """A hash of all that the function of one row computes; None if that has no hash."""
         if not self.gradient:
             return fingerprint(self._trace("evaluate").jaxpr, derivatives=False)
         computes, *_ = self._derivatives

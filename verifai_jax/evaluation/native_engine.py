@@ -9,7 +9,7 @@ compiled, and all rows whose robustness is so near to zero that rounding may dec
 native program is used once it agreed with XLA on the rows that it met first.
 """
 
-import re
+import math
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache, cached_property
@@ -26,6 +26,8 @@ from verifai_jax.core.programs import Slot
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine, Wanted
 from verifai_jax.evaluation.verdicts import Verdicts, violations
+from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.tree import Term, postorder
 from verifai_jax.native_code.library import (
     Library,
     Unavailable,
@@ -50,7 +52,7 @@ FIRST = 512
 that it simulates at a time where it only decides what is near to zero."""
 SLACK = 4e-7
 """Robustness below which rounding may decide a verdict, relative to the greatest number of the
-formula: three units in the last place of single precision."""
+formula, its reach in seconds included: three units in the last place of single precision."""
 AGREES = 1e-3
 """Relative difference of two robustness values from which on they differ by more than rounding."""
 
@@ -207,12 +209,17 @@ class NativeEngine:
     @cached_property
     def _slack(self) -> Float[np.ndarray, " formulas"]:
         """Robustness of each formula below which rounding may decide the verdict."""
-        return np.array(
-            [
-                SLACK * max([1.0, *map(float, re.findall(r"\d+\.?\d*(?:[eE][-+]?\d+)?", str(f)))])
-                for f in self.engine.problem.formulas.values()
-            ]
-        )
+        return np.array([SLACK * _greatest(f) for f in self.engine.problem.formulas.values()])
+
+
+def _greatest(formula: Formula) -> float:
+    """Return the greatest of 1, the numbers that a formula compares with, and its finite reach.
+
+    Rounding is relative to what is compared, and adds up over time.
+    """
+    numbers = [node.number or 0.0 for node in postorder(formula) if isinstance(node, Term)]
+    reach = filter(math.isfinite, (formula.horizon(), formula.history()))
+    return max([1.0, *map(abs, numbers), *reach])
 
 
 def _cut(temperature: Temperature, which: slice | np.ndarray) -> Temperature:

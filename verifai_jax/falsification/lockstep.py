@@ -64,7 +64,7 @@ def lockstep(
     """Run the search from every seed and return the histories.
 
     A seed that has found a failure makes no further simulation if `stop_early`. With `claims` a
-    failure is what these claim, and the search learns of the others as in `falsify`.
+    failure is what these claim, and the search learns from all other rows, as in `falsify`.
 
     **Raises:** `AlwaysRaises` where all of the first simulations raise.
     """

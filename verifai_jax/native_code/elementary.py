@@ -93,7 +93,7 @@ _FOLDED: dict[str, Callable[..., Any]] = {
 
 
 def fold(name: str, kind: str, values: list[np.generic]) -> Any:
-    """Return the result of an operation on whole numbers or truth values; None where unknown."""
+    """Return the result of an operation on whole numbers or truth values; None if unknown."""
     if name == "convert_element_type":
         return values[0] if isinstance(values[0], (np.integer, np.bool_)) or kind == "f" else None
     if name not in _FOLDED or not all(isinstance(v, (np.integer, np.bool_)) for v in values):

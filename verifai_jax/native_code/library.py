@@ -1,6 +1,6 @@
 """Translated programs as libraries of machine code, compiled once and kept on disk.
 
-    name = library_name(fingerprint)                    # None where there is no compiler
+    name = library_name(fingerprint)                    # `Unavailable` without a compiler
     library = load(name, lambda: translate(program))    # or `Unavailable`, which says why
     library(rows, key, first, temperatures, numbers)    # [n, count] of bits
 
@@ -108,7 +108,7 @@ def library_name(fingerprint: str | None) -> str:
 
     **Arguments:**
 
-    - `fingerprint`: of the program; None where it has none.
+    - `fingerprint`: of the program; None if it has none.
 
     **Raises:** `Unavailable` where there is no compiler, no cache folder, or no fingerprint.
     """
@@ -148,7 +148,7 @@ def load(name: str, count: int, translate: Callable[[], str], quickly: bool = Fa
 
 
 def is_approved(name: str) -> bool | None:
-    """Return whether a library computes what XLA does, as `approve` noted; None where unknown."""
+    """Return whether a library computes what XLA does, as `approve` noted; None if unknown."""
     try:
         return {"yes": True, "no": False}.get((_folder() / f"{name}.agrees").read_text())
     except (OSError, Unavailable):

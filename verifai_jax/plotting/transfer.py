@@ -32,9 +32,8 @@ def plot_transfer(result: Transfer, path: str | Path | None = None) -> Figure:
         for trace, label, color, style in styles:
             values = np.asarray(trace.signals[name], float)[: trace.valid]
             values = values if values.ndim == 1 else values[:, int(entry.rstrip("]"))]
-            dt = float(trace.dt or 1.0)
-            times = np.arange(len(values)) * dt if trace.times is None else trace.times
-            left.plot(np.asarray(times)[: len(values)], values, style, color=color, label=label)
+            times = np.asarray(trace.clock())[: len(values)]
+            left.plot(times, values, style, color=color, label=label)
         left.axvline(result.table.loc[row, "parted"], color=BOUND, lw=0.8, ls=":")
         left.set_xlabel("time [s]")
         left.set_ylabel(result.table.loc[row, "signal"])
