@@ -119,9 +119,9 @@ class Allocation:
         - `margins`: what decides between equals who leads; see `find_leader`.
         """
         k, n = np.asarray(failures), np.asarray(simulations)
-        lowest = np.maximum(-(-(self.samples - n) // self.block), 0)
-        if lowest.any():
-            return lowest
+        missing = np.maximum(-(-(self.samples - n) // self.block), 0)
+        if missing.any():
+            return missing
         left = (self.budget - int(n.sum())) // self.block
         if left <= 0:
             return np.zeros(len(n), np.int64)

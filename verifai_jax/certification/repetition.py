@@ -42,10 +42,8 @@ def repeat_failures(
     ]
     rows.sort(key=lambda row: row[0])
     found = Repetitions()
-    begin, maximum = (
-        0,
-        max(REPEATED, (sampled.simulations + attacked.simulations) // SHARE_REPEATED),
-    )
+    maximum = max(REPEATED, (sampled.simulations + attacked.simulations) // SHARE_REPEATED)
+    begin = 0
     while begin < min(len(rows), maximum):
         part = rows[begin : min(begin + REPEATED, maximum)]
         begin += len(part)
