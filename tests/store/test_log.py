@@ -1,5 +1,6 @@
 """Logs: entries come back as they were, whatever became of those beside them."""
 
+import gc
 import json
 import os
 import shutil
@@ -9,6 +10,7 @@ import sys
 import tempfile
 import threading
 import time
+import warnings
 from pathlib import Path
 
 import hypothesis
@@ -201,3 +203,16 @@ def test_a_full_disk_is_named(tmp_path):
     path.symlink_to("/dev/full")
     with pytest.raises(OSError, match=r"No space left.*a\.log"):
         Log(path).put({"a": {"x": np.zeros(3)}})
+
+
+def test_a_log_in_a_cycle_is_closed_before_its_file_is_collected(tmp_path):
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        for number in range(20):
+            file_first, log = [], Log(tmp_path / f"{number}.rows")
+            log.put({"0": {"x": np.arange(3.0)}})
+            file_first.extend((log._file, log, file_first))
+            del file_first, log
+            gc.collect()
+    assert not [each for each in seen if each.category is ResourceWarning]
+    assert Log(tmp_path / "0.rows").names() == ["0"]

@@ -17,7 +17,8 @@ import json
 import os
 import re
 import struct
-from collections.abc import Iterator, Mapping
+import weakref
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from io import FileIO
 from pathlib import Path
@@ -54,6 +55,7 @@ class Log:
         self.path = path
         self._memory = io.BytesIO()
         self._file: FileIO | io.BytesIO | None = None
+        self._close_file: Callable[[], object] | None = None
         self._extents: dict[str, _Extent] | None = None
         self._damaged = False
 
@@ -64,9 +66,13 @@ class Log:
         """
         frame = _encode(entries)
         try:
-            if self._file is None:
+            if self.path is None:
+                self._file = self._memory
+            elif self._file is None:
                 # No buffer, which a forked process would write once more.
-                self._file = self._memory if self.path is None else FileIO(self.path, "a")
+                self._file = FileIO(self.path, "a")
+                # Not `__del__`: in a cycle of references the file may be collected before the log.
+                self._close_file = weakref.finalize(self, self._file.close)
             begin, rest = self._file.seek(0, os.SEEK_END), memoryview(frame)
             try:
                 while rest:
@@ -127,12 +133,9 @@ class Log:
 
     def close(self) -> None:
         """Close the file; what is put later opens it again."""
-        file, self._file = self._file, None
-        if file is not None and file is not self._memory:
-            file.close()
-
-    def __del__(self) -> None:
-        self.close()
+        close, self._close_file, self._file = self._close_file, None, None
+        if close is not None:
+            close()
 
     def _opened(self) -> AbstractContextManager[IO[bytes]]:
         return contextlib.nullcontext(self._memory) if self.path is None else open(self.path, "rb")
