@@ -27,6 +27,7 @@ LAYERS = (
     },
     {"failure_modes"},
     {"sweeps", "augmentation", "checking"},
+    {"hardening"},
     {"plotting"},
     {"reports"},
     {"cli"},
