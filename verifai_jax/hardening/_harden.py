@@ -171,10 +171,10 @@ def harden(
     untrained = made.problem(trainer.untrained_policy(trainer.algorithm_name(values)))
     untrained.check()
     with locked_cache(folder, KIND) as cache:
-        work = Work(made, plan, values, untrained, start, cache)
         cache.claim(
             _fingerprint(made, plan, values, untrained), untrained.sources(), even_if_changed
         )
+        work = Work(made, plan, values, untrained, start, cache)
         result = work.run(max_seconds)
     if folder is not None:
         result.save(folder)

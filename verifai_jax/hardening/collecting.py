@@ -1,4 +1,4 @@
-"""What a stage's policy fails at, as points whose neighbourhoods it is trained on next.
+"""Failures of a stage's policy, as points around which it is trained next.
 
 found = collect(problem, failing, seed=3, added=64, table=512, shrunk=4)
 found.points, found.sources                 # [n, d], and for each where it comes from

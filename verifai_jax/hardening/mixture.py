@@ -44,7 +44,7 @@ class MixtureTask:
     """A task that draws the features of an episode from a mixture; made by `mixture_of`.
 
     - `shares`: of episodes that are the task's own, from the prior, and from neighbourhoods.
-    - `low`, `high`: `[neighbourhoods, d]`, boxes of the unit cube, of which the first `count` count.
+    - `low`, `high`: `[neighbourhoods, d]`, boxes of the unit cube; the first `count` of them count.
     - `own`: the point of the unit cube of the task's own episodes; None where they are its `reset`.
     """
 
@@ -100,7 +100,8 @@ class MixtureTask:
         index = jax.random.randint(which_key, (), 0, jnp.maximum(self.count, 1))
         tries = 1 if self.space.where is None else TRIES
         u = jax.random.uniform(point_key, (tries, self.space.dim))
-        inside = self.low[index] + u * (self.high[index] - self.low[index])
+        low, high = (jnp.asarray(ends)[index] for ends in (self.low, self.high))
+        inside = low + u * (high - low)
         points = jnp.where(near, inside, u)
         if tries == 1:
             return points[0]

@@ -118,10 +118,10 @@ class Hardening(Drawn, InNotebook):
         lines.append(f"  the intervals hold together with {sure}, on samples trained on by none")
         before, after = self.before.rate, self.after.rate
         if before is not None and after is not None and self.chosen[HARDENED]:
-            least = before.low / after.high if after.high else float("inf")
+            by_bounds = before.low / after.high if after.high else float("inf")
             lines.append(
                 f"  the failure probability is {self.times_safer:z.3g} times lower, "
-                f"{least:z.3g} times at least by the intervals"
+                f"{by_bounds:z.3g} times at least by the intervals"
             )
         if self.comparison is not None:
             compared = self.comparison.candidates[0]
