@@ -113,14 +113,13 @@ def until_settled(
     emit: Callable[[Carry], list[Value] | None],
 ) -> list[Value]:
     """Write a loop or branch, again as long as more of its values turn out to differ."""
-    t.code.control("")
-    begin = len(t.code.items)
+    mark = t.code.mark()
     while True:
         carry = Carry(t, forms, uniform)
         results = emit(carry)
         if results is not None:
             return results
-        del t.code.items[begin:]
+        t.code.back_to(mark)
 
 
 @rule("scan")
@@ -145,7 +144,7 @@ def _scan(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
             t.code.memory(form.shape, kind_of(form.dtype)) if some else np.empty(0, object)
             for form, some in zip(forms[count:], wanted, strict=True)
         ]
-        t.code.control(f"for (int {head}) {{")
+        t.code.open_loop(f"for (int {head}) {{", i)
         now = [each(i) for each in stacked]
         results = t.closed(program, [*shared, *carry.values, *now])
         if carry.varies(results[:count]):
@@ -155,7 +154,7 @@ def _scan(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
                 assert isinstance(out, Memory)
                 _store(t, out._replace(offset=f"{i} * {out.size // length}"), value)
         carry.assign(results[:count])
-        t.code.control("}")
+        t.code.close_loop()
         return [*carry.values, *outs]
 
     return until_settled(t, forms[:count], [is_uniform(v) for v in start], emit)
@@ -213,7 +212,7 @@ def _while(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
 
     def emit(carry: Carry) -> list[Value] | None:
         carry.assign(start)
-        t.code.control("for (;;) {")
+        t.code.open_loop("for (;;) {")
         (goes_on,) = t.closed(params["cond_jaxpr"], [*asked, *carry.values])
         on = elements(goes_on).item()
         if on.uniform:
@@ -231,7 +230,7 @@ def _while(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
         if carry.varies(results):
             return None
         carry.assign(results)
-        t.code.control("}")
+        t.code.close_loop()
         return carry.values
 
     return until_settled(t, forms, [is_uniform(value) for value in start], emit)

@@ -199,10 +199,7 @@ class Translator:
         if all(each.value is not None for each in flat):
             array = np.array([each.value for each in flat], DTYPES[kind]).reshape(value.shape)
             return Memory(self.code.table(array, kind), kind, True, value.shape, values=array)
-        memory = self.code.memory(value.shape, kind, all(each.uniform for each in flat))
-        for i, each in enumerate(flat):
-            self.code.store(memory.at(i), each, memory.uniform)
-        return memory
+        return self.code.stored(flat.tolist(), value.shape)
 
     def _stored(self, value: Memory) -> Memory:
         """Compute an array into memory."""
