@@ -209,15 +209,14 @@ template <class T> INLINE T exponential1(T x) {
   return choose(truth(absolute(x) < 0.35f), p, choose(truth(x > 88.f) , exponential(x),
     e * e - 1.f)); }
 template <class T> INLINE T hyperbolic(T x) {
-  T end = filled(x, 7.90531110763549805f), c = choose(truth(x > end), end, x);
-  c = choose(truth(c < -end), -end, c);
+  T end = filled(x, 7.90531110763549805f), c = greater(-end, lesser(end, x));
   T s = c * c, p = filled(x, -2.76076847742355e-16f), q = filled(x, 1.19825839466702e-06f);
   p = p * s + 2.00018790482477e-13f; p = p * s - 8.60467152213735e-11f;
   p = p * s + 5.12229709037114e-08f; p = p * s + 1.48572235717979e-05f;
   p = p * s + 6.37261928875436e-04f; p = p * s + 4.89352455891786e-03f;
   q = q * s + 1.18534705686654e-04f; q = q * s + 2.26843463243900e-03f;
   q = q * s + 4.89352518554385e-03f;
-  return choose(truth(absolute(x) < 0.0004f), x, ordinary_ratio(c * p, q)); }
+  return ordinary_ratio(c * p, q); }
 template <class T> INLINE T inverse_error(T x) {
   T w = -logarithm1(-x * x), a = w - 2.5f, b = root(w) - 3.f;
   T p = filled(x, 2.81022636e-08f), q = filled(x, -0.000200214257f);
