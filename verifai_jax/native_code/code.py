@@ -19,8 +19,8 @@ MAX_LINES = 30_000
 STACK = 4096
 """Numbers of a simulation in arrays on the stack at most; others are in the thread's memory."""
 MANY_DIVISIONS = 0.03
-"""Share of divisions in a piece from which on they are made of products: the unit that divides would
-make the others wait."""
+"""Share of divisions in a piece from which on they are made of products: the unit that divides
+would make the others wait."""
 _DIVISION = re.compile(r"F (v\d+) = (\S+) / (v\d+|\(?-?[\d.e+-]+f\)?);")
 _NAME = re.compile(r"\bv\d+\b")
 _MADE = re.compile(r"\b([uvimw])\d+\b")

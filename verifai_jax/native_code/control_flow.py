@@ -14,7 +14,6 @@ from verifai_jax.native_code.values import (
     Form,
     Memory,
     Program,
-    Untranslatable,
     Value,
     constant,
     elements,
@@ -67,7 +66,7 @@ class Carry:
             if isinstance(other, Memory) and other.name == mine.name and not other.offset:
                 continue
             if isinstance(other, Memory) and not memory.uniform:
-                _store(self.t, memory, other)
+                self.t.write(memory, other)
                 moved.append((mine, memory))
                 continue
             for i, each in enumerate(elements(other).ravel()):
@@ -152,24 +151,12 @@ def _scan(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
         for out, value, some in zip(outs, results[count:], wanted, strict=True):
             if some:
                 assert isinstance(out, Memory)
-                _store(t, out._replace(offset=f"{i} * {out.size // length}"), value)
+                t.write(out._replace(offset=f"{i} * {out.size // length}"), value)
         carry.assign(results[:count])
         t.code.close_loop()
         return [*carry.values, *outs]
 
     return until_settled(t, forms[:count], [is_uniform(v) for v in start], emit)
-
-
-def _store(t: Translator, out: Memory, value: Value) -> None:
-    if isinstance(value, Memory):
-        i, size = t.code.name("i"), value.size
-        each = f"wide({value.at(i)})" if value.uniform else value.at(i)
-        t.line(f"for (int {i} = 0; {i} < {size}; {i}++) {out.at(i)} = {each};")
-        return
-    for i, each in enumerate(value.ravel()):
-        if not isinstance(each, Element):
-            raise Untranslatable("random keys that a loop collects")
-        t.code.store(out.at(i), each)
 
 
 def _stacked(t: Translator, value: Value) -> Callable[[str], Value]:

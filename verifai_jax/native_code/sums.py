@@ -162,9 +162,11 @@ def _dot(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     if batches * rows * columns * summed == 0:
         return [filled(form.shape, constant(0, "f"))]
     if batches * rows * columns * summed <= PRODUCTS:
-        # What is used more than once is not computed more than once.
-        one = elements(left if columns == 1 or not isinstance(left, Memory) else t.in_memory(left))
-        other = elements(right if rows == 1 or not isinstance(right, Memory) else t.in_memory(right))
+        one, other = (
+            # What is used more than once is not computed more than once.
+            elements(t.in_memory(v) if isinstance(v, Memory) and uses > 1 else v)
+            for v, uses in ((left, columns), (right, rows))
+        )
         out = np.empty((batches, rows, columns), object)
         for b, i, j in np.ndindex(out.shape):
             terms = zip(one[b, i], other[b, j], strict=True)
