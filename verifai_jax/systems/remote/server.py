@@ -414,9 +414,10 @@ class Server(threading.Thread):
                     why = f"no hello came within {connection.GREETING_SECONDS:zg} s"
                     self._send_away(client, why)
                     self._flush(client)
-            elif self.rules.timeout is not None and client.has:
-                if overdue := client.overdue(now, self.rules.timeout):
-                    self._end_overdue(client, overdue)
+            elif self.rules.timeout is not None and (
+                overdue := client.overdue(now, self.rules.timeout)
+            ):
+                self._end_overdue(client, overdue)
         self._look_for_clients(now)
 
     def _end_overdue(self, client: Client, overdue: list[Point]) -> None:
