@@ -23,8 +23,10 @@ from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.user_errors import check_called_with, defined_at
 from verifai_jax.core.waveform import set_durations, within_step
 from verifai_jax.systems.base import Carry, Features, Seed, System
+from verifai_jax.systems.channels import Channels, Link, Passing, States, first_refusal
 from verifai_jax.systems.checkpointing import checkpointed_scan
 from verifai_jax.systems.clock import count_periods
+from verifai_jax.systems.delays import joined
 from verifai_jax.systems.ode.delay_line import DelayLine
 from verifai_jax.systems.ode.integrators import Integrator, Step, Time, check_factor, integrator
 from verifai_jax.systems.ode.switching import Inputs, Switch, switched_step
@@ -63,6 +65,7 @@ class Ode(System):
     exact_step: bool = False
     update: Callable[..., Any] | None = None
     switches: tuple[Switch, ...] = ()
+    links: tuple[Link, ...] = ()
 
     @property
     def duration(self) -> float:
@@ -92,7 +95,42 @@ class Ode(System):
         Only a waveform without a duration is given that of the simulation.
         """
         features = set_durations(features, self.duration)
-        return _Rollout(self, features).trace(as_floating(self.initial(features, key), "initial"))
+        start = as_floating(self.initial(features, key), "initial")
+        return _Rollout(self, features, key).trace(start)
+
+    def check(self, features: Features) -> None:
+        """Refuse features that a fault cannot read."""
+        for link in self.links:
+            link.check(features)
+
+    def why_error(self, features: Features) -> str | None:
+        """Say which fault has a number that it may not have."""
+        return first_refusal(self.links, features, "this system")
+
+    def passing(self, features: Features) -> Passing:
+        """Return what the controller sees, the state, and what it returns.
+
+        **Raises:** `ValueError` for a plant without a controller.
+        """
+        if self.controller is None:
+            raise ValueError(
+                "faults lie between a plant and its controller; this system has no controller"
+            )
+
+        def first(features: Features, key: Seed) -> Any:
+            features = set_durations(features, self.duration)
+            state = as_floating(self.initial(features, key), "initial")
+            memory = in_working_precision(self.controller_memory)
+            return state, _Rollout(self, features, key).decided(state, memory)
+
+        key = jax.eval_shape(lambda: jax.random.key(0))
+        state, control = jax.eval_shape(first, features, key)
+        period = self.dt * self.steps_per_control
+        return Passing(state, control, period, self.duration)
+
+    def with_links(self, links: tuple[Link, ...]) -> "Ode":
+        """Return the same loop with faults in it."""
+        return replace(self, links=joined(self.links, links))
 
     def fold(
         self,
@@ -108,7 +146,7 @@ class Ode(System):
         **Returns:** the last carry, and the status.
         """
         features = set_durations(features, self.duration)
-        rollout = _Rollout(self, features)
+        rollout = _Rollout(self, features, key)
         return rollout.fold(as_floating(self.initial(features, key), "initial"), carry, update)
 
 
@@ -118,6 +156,27 @@ class _Rollout:
 
     loop: Ode
     features: Any
+    key: Any = None
+
+    @property
+    def channels(self) -> Channels:
+        """What states pass through to the controller, and controls from it."""
+        return Channels(self.loop.links, self.loop.dt * self.loop.steps_per_control, self.features)
+
+    def decided(self, state: PyTree, memory: PyTree) -> Any:
+        """Return the control at time 0, without faults."""
+        assert self.loop.controller is not None
+        arguments = (state,) if self.loop.controller_memory is None else (state, memory)
+        made = self.loop.controller(jnp.zeros((), _dtype(state)), *arguments, self.features)
+        return made if self.loop.controller_memory is None else made[0]
+
+    def states(self, state: PyTree, memory: PyTree) -> States:
+        """Return what delays and faults remember at first."""
+        if not self.loop.links:
+            return ()
+        form = jax.eval_shape(self.decided, state, memory)
+        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form)
+        return self.channels.begin(state, nothing, self.key)
 
     def trace(self, state: PyTree) -> Trace:
         loop = self.loop
@@ -129,7 +188,7 @@ class _Rollout:
             samples,
             dt=loop.dt,
             valid=age + 1 if ends else None,
-            status=_status(last),
+            status=_status(last, self.channels.valid()),
             held=ends,
             finite=finite,
         )
@@ -142,7 +201,7 @@ class _Rollout:
         last, _, carry, _ = self.run(
             state, memory, carry, lambda c, sample: (update(c, sample), None)
         )
-        return carry, _status(last)
+        return carry, _status(last, self.channels.valid())
 
     def run(
         self,
@@ -169,6 +228,7 @@ class _Rollout:
 
         # A controller that runs at every sample holds nothing between samples.
         held = None
+        memory = (memory, self.states(state, memory))
         if loop.steps_per_control > 1:
             time = jnp.zeros((), _dtype(state))
             form = jax.eval_shape(self.control, time, state, memory)[0]
@@ -228,12 +288,17 @@ class _Rollout:
 
     def control(self, time: Time, state: PyTree, memory: PyTree) -> tuple[Any, Any]:
         loop = self.loop
+        own, states = memory
         if loop.controller is None:
             return None, memory
+        seen, states = self.channels.observation(states, state, time)
         if loop.controller_memory is None:
-            return loop.controller(time, state, self.features), memory
-        control, after = loop.controller(time, state, memory, self.features)
-        return control, as_precise_as(after, memory)
+            control = loop.controller(time, seen, self.features)
+        else:
+            control, after = loop.controller(time, seen, own, self.features)
+            own = as_precise_as(after, own)
+        control, states = self.channels.action(states, control, time)
+        return control, (own, states)
 
     def signals(self, time: Time, state: PyTree, control: PyTree) -> Any:
         if self.loop.signals is None:
@@ -367,13 +432,14 @@ def updated(loop: Ode, time: Time, state: PyTree, features: Features) -> Any:
     return _where(finite, after, state)
 
 
-def _status(last: PyTree) -> Int[Array, ""]:
+def _status(last: PyTree, valid: Bool[Array, ""] | bool = True) -> Int[Array, ""]:
     # Integrators add to the state, and NaN or Inf plus anything is never finite again: if the last
     # state is finite, all were. A state frozen at its end is covered by the same check.
     finite = jnp.array(True)
     for leaf in jax.tree.leaves(last):
         finite &= jnp.all(jnp.isfinite(leaf))
-    return jnp.where(finite, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE))
+    status = jnp.where(finite, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE))
+    return status if valid is True else jnp.where(valid, status, jnp.int32(Status.ERROR))
 
 
 def _where(condition: Bool[Array, ""], yes: PyTree, no: PyTree) -> Any:
