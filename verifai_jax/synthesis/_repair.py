@@ -23,7 +23,7 @@ from verifai_jax.core.budget import Budget, split_budget
 from verifai_jax.core.checks import check_options
 from verifai_jax.core.errors import check_names, suggests_options
 from verifai_jax.core.progress import shows_progress
-from verifai_jax.core.sources import sources_of
+from verifai_jax.core.source_collection import sources_of
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.validation import usual_batch
 from verifai_jax.problem.problem import Problem
