@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from verifai_jax import blocks as blocks
     from verifai_jax import clusters as clusters
     from verifai_jax import events as events
+    from verifai_jax import faults as faults
     from verifai_jax import mtl as mtl
     from verifai_jax import perception as perception
     from verifai_jax import policies as policies
