@@ -25,7 +25,7 @@ LAYERS = (
         "analysis",
         "compositional",
     },
-    {"failure_modes"},
+    {"failure_modes", "failure_table"},
     {"sweeps", "augmentation", "checking"},
     {"plotting"},
     {"reports"},

@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from verifai_jax.failure_modes import Mode as Mode
     from verifai_jax.failure_modes import Modes as Modes
     from verifai_jax.failure_modes import modes as modes
+    from verifai_jax.failure_table import FailureTable as FailureTable
+    from verifai_jax.failure_table import fmea as fmea
     from verifai_jax.falsification import ErrorTable as ErrorTable
     from verifai_jax.falsification import Replay as Replay
     from verifai_jax.falsification import Run as Run

@@ -28,7 +28,7 @@ OPTIONS = {
 def all_kinds(channel, source=None, choices=False):
     made = []
     for kind in KINDS:
-        if choices and not kind.choices or kind is faults.WrongChannel and source is None:
+        if (choices and not kind.choices) or (kind is faults.WrongChannel and source is None):
             continue
         own = {"source": source} if kind is faults.WrongChannel else OPTIONS.get(kind.__name__, {})
         made.append(kind(channel, **own, **WINDOW))
@@ -99,7 +99,8 @@ def test_gymnasium_continuous_actions():
         problem.with_faults(faults.Bias("action", offset=vj.Box(0, 2))), "uniform", 8,
         progress=False,
     )  # fmt: skip
-    assert "action_bias.offset" in run.table.all and len(run.table.all) == 8
+    assert "action_bias.offset" in run.table.all
+    assert len(run.table.all) == 8
 
 
 @pytest.mark.thorough
@@ -142,7 +143,8 @@ def test_mujoco(backend):
 
     system = vj.mujoco(
         MUJOCO, duration=0.6, control_period=0.02, controller=controller, backend=backend,
-        bind={"start": "joint/hinge/qpos"}, signals={"angle": "joint/hinge/qpos", "u": "actuator/motor/ctrl"},
+        bind={"start": "joint/hinge/qpos"},
+        signals={"angle": "joint/hinge/qpos", "u": "actuator/motor/ctrl"},
     )  # fmt: skip
     problem = vj.Problem("pole", {"start": vj.Box(-0.3, 0.3)}, system, "always abs(angle) <= 1")
 

@@ -1,4 +1,4 @@
-"""What a fault is: a channel, when it begins and ends, and numbers that say how bad it is.
+"""Descriptions of faults: a channel, when one begins and ends, and numbers for how bad it is.
 
 Each number is fixed, or a domain, which makes it a feature of the problem.
 """
@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import jax.numpy as jnp
@@ -17,11 +18,17 @@ from verifai_jax.core.checks import check_count, check_name, is_number
 from verifai_jax.features import Categorical, Domain, Struct
 
 Number: TypeAlias = float | Domain
+Ranges: TypeAlias = Mapping[str, tuple[float, float]]
 Vector: TypeAlias = Float[Array | np.ndarray, " n"]
 
 
+def within(**ranges: tuple[float, float]) -> Ranges:
+    """Return the ends between which numbers have to lie, by their names."""
+    return MappingProxyType(ranges)
+
+
 class Moment(NamedTuple):
-    """What a fault knows at an instant.
+    """The things that a fault knows at an instant.
 
     - `xp`: `jax.numpy`, or `numpy` on the host.
     - `number`: its numbers by name.
@@ -45,11 +52,22 @@ class Moment(NamedTuple):
 
 
 class FaultFeatures(Struct):
-    """The numbers of a fault that vary; nominal is the weakest, shortest and latest fault."""
+    """The numbers of a fault that vary; nominal is the weakest, shortest and latest fault.
 
-    def __init__(self, fields: Mapping[str, Domain], nominal: Mapping[str, PyTree]) -> None:
+    - `fault`: whose they are; None for the choice of `AtMost`.
+    """
+
+    fault: "Fault | None"
+
+    def __init__(
+        self,
+        fields: Mapping[str, Domain],
+        nominal: Mapping[str, PyTree],
+        fault: "Fault | None" = None,
+    ) -> None:
         super().__init__(fields)
         object.__setattr__(self, "_nominal", dict(nominal))
+        object.__setattr__(self, "fault", fault)
 
     @property
     def nominal(self) -> dict[str, PyTree]:
@@ -76,7 +94,7 @@ class Fault:
     """The number that says how bad it is."""
     off: ClassVar[float] = 0.0
     """The severity at which there is no fault."""
-    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}
+    ranges: ClassVar[Ranges] = MappingProxyType({})
     """The numbers of this kind, each with the ends between which it has to lie."""
     choices: ClassVar[bool] = True
     """Whether a channel of whole numbers can have it."""
@@ -105,10 +123,10 @@ class Fault:
                     f"{name} of {kind} must be a number, or a domain of one number such as "
                     f"vj.Box(0, 1); got {value!r}"
                 )
-            least, greatest = ends(value)
-            if not (math.isfinite(least) and math.isfinite(greatest)):
+            first, last = ends(value)
+            if not (math.isfinite(first) and math.isfinite(last)):
                 raise ValueError(f"{name} of {kind} must be finite; got {value!r}")
-            if least < low or greatest > high:
+            if first < low or last > high:
                 within = f"at least {low:zg}" if high == math.inf else f"from {low:zg} to {high:zg}"
                 raise ValueError(f"{name} of {kind} must be {within}; got {value!r}")
 
@@ -140,7 +158,8 @@ class Fault:
         """The feature that the fault is; None for one of which nothing varies."""
         if not self.domains:
             return None
-        return FaultFeatures(self.domains, {name: self.weakest(name) for name in self.domains})
+        nominal = {name: self.weakest(name) for name in self.domains}
+        return FaultFeatures(self.domains, nominal, self)
 
     def weakest(self, name: str) -> PyTree:
         """Return the value of a number at which the fault is least: latest, shortest, weakest."""

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Key, PyTree
 
 from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.keys import as_key
 from verifai_jax.faults.fault import AtMost, Fault, Moment
 from verifai_jax.faults.kinds import WrongChannel
 from verifai_jax.faults.smoothing import blend
@@ -95,7 +96,7 @@ class Injected(Link):
         if now.xp is np:
             return (int(key or 0), number), memory
         key = jax.random.key(0) if key is None else key
-        return jax.random.key_data(jax.random.fold_in(key, number)), memory
+        return jax.random.key_data(jax.random.fold_in(key, number))[-2:], memory
 
     def through(self, state: PyTree, value: PyTree, now: Instant) -> tuple[PyTree, PyTree]:
         xp, number = now.xp, self.numbers(now.features)
@@ -133,9 +134,7 @@ class Injected(Link):
         return happens
 
 
-def inject(
-    fault: Fault, passing: Passing, choice: tuple[str, int] | None = None
-) -> Injected:
+def inject(fault: Fault, passing: Passing, choice: tuple[str, int] | None = None) -> Injected:
     """Return a fault as a link in the loop of a system.
 
     **Raises:** `UnknownNameError` for a channel that the system does not have; `ValueError` for one
@@ -158,9 +157,7 @@ def inject(
     return Injected(fault, entries, other, choice)
 
 
-def with_faults(
-    problem: Problem, faults: Sequence[object], by_simulator: bool = False
-) -> Problem:
+def with_faults(problem: Problem, faults: Sequence[object], by_simulator: bool = False) -> Problem:
     """Return a problem with faults; see `Problem.with_faults`."""
     chosen: list[tuple[Fault, tuple[str, int] | None]] = []
     features: dict[str, Domain] = dict(problem.space.domains)
@@ -190,7 +187,9 @@ def with_faults(
     space = FeatureSpace(features, problem.space.where)
     nominal = problem.nominal
     if nominal is not None:
-        new = {name: domain for name, domain in features.items() if name not in problem.space.domains}
+        new = {
+            name: domain for name, domain in features.items() if name not in problem.space.domains
+        }
         nominal = {**nominal, **{name: domain.nominal for name, domain in new.items()}}
     return replace(problem, space=space, system=system, nominal=nominal)
 
@@ -253,7 +252,7 @@ def _draws(seed: Any, now: Instant, count: int, xp: Any) -> tuple[Any, Any, Any]
     if xp is np:
         rng = np.random.default_rng([*seed, int(now.step)])
         return rng.random(count), rng.standard_normal(count), rng.random()
-    key = jax.random.fold_in(jax.random.wrap_key_data(seed), now.step)
+    key = jax.random.fold_in(as_key(seed), now.step)
     each, normal, one = jax.random.split(key, 3)
     return (
         jax.random.uniform(each, (count,)),

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from verifai_jax.faults.fault import Fault, Moment, Number, Vector, ends
+from verifai_jax.faults.fault import Fault, Moment, Number, Ranges, Vector, ends, within
 from verifai_jax.faults.smoothing import straight
 
 POSITIVE = (0.0, math.inf)
@@ -19,7 +19,7 @@ ANY = (-math.inf, math.inf)
 class Dropout(Fault):
     """The channel reads `value` instead of what it should: a sensor that is disconnected."""
 
-    ranges = {"value": ANY}
+    ranges: ClassVar[Ranges] = within(value=ANY)
     value: Number = 0.0
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
@@ -30,7 +30,7 @@ class Dropout(Fault):
 class Stuck(Dropout):
     """The channel is stuck at `value`, such as a valve that is open."""
 
-    value: Number
+    value: Number  # pyright: ignore[reportGeneralTypeIssues]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ class HeldAction(Fault):
     """The channel changes only every `hold` seconds, and is held between."""
 
     severity = "hold"
-    ranges = {"hold": POSITIVE}
+    ranges: ClassVar[Ranges] = within(hold=POSITIVE)
     channel: str = field(default="action", kw_only=False)
     hold: Number
 
@@ -73,7 +73,7 @@ class Delay(Fault):
     """
 
     severity = "seconds"
-    ranges = {"seconds": POSITIVE, "swing": POSITIVE, "cycle": (1e-9, math.inf)}
+    ranges: ClassVar[Ranges] = within(seconds=POSITIVE, swing=POSITIVE, cycle=(1e-9, math.inf))
     seconds: Number
     swing: Number = 0.0
     cycle: Number = 1.0
@@ -93,7 +93,7 @@ class ClockJitter(Fault):
 
     severity = "jitter"
     draws = True
-    ranges = {"jitter": POSITIVE}
+    ranges: ClassVar[Ranges] = within(jitter=POSITIVE)
     jitter: Number
 
     def memory(self, zero: Vector, period: float) -> PyTree:
@@ -110,7 +110,7 @@ class PacketLoss(Fault):
 
     severity = "loss"
     draws = True
-    ranges = {"loss": (0.0, 1.0)}
+    ranges: ClassVar[Ranges] = within(loss=(0.0, 1.0))
     loss: Number
 
     def memory(self, zero: Vector, period: float) -> PyTree:
@@ -133,7 +133,7 @@ class Bias(Fault):
     """A constant `offset` is added."""
 
     severity, choices = "offset", False
-    ranges = {"offset": ANY}
+    ranges: ClassVar[Ranges] = within(offset=ANY)
     offset: Number
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
@@ -145,7 +145,7 @@ class Drift(Fault):
     """An offset is added that grows by `rate` in each second since the onset."""
 
     severity, choices = "rate", False
-    ranges = {"rate": ANY}
+    ranges: ClassVar[Ranges] = within(rate=ANY)
     rate: Number
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
@@ -157,7 +157,7 @@ class Noise(Fault):
     """Normal noise with standard deviation `std` is added, independent at each instant."""
 
     severity, choices, draws = "std", False, True
-    ranges = {"std": POSITIVE}
+    ranges: ClassVar[Ranges] = within(std=POSITIVE)
     std: Number
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
@@ -170,7 +170,7 @@ class Spikes(Fault):
     """Single values are off by `height`, up or down, `rate` times a second on average."""
 
     severity, choices, draws = "height", False, True
-    ranges = {"height": POSITIVE, "rate": POSITIVE}
+    ranges: ClassVar[Ranges] = within(height=POSITIVE, rate=POSITIVE)
     height: Number
     rate: Number = 1.0
 
@@ -186,7 +186,7 @@ class Quantisation(Fault):
     """Values are rounded to multiples of `step`."""
 
     severity, choices = "step", False
-    ranges = {"step": POSITIVE}
+    ranges: ClassVar[Ranges] = within(step=POSITIVE)
     step: Number
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
@@ -204,7 +204,7 @@ class Saturation(Fault):
     """Values are limited to between `-limit` and `limit`."""
 
     severity, off, choices = "limit", math.inf, False
-    ranges = {"limit": POSITIVE}
+    ranges: ClassVar[Ranges] = within(limit=POSITIVE)
     limit: Number
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
@@ -216,7 +216,7 @@ class LossOfAuthority(Fault):
     """The share `loss` of the channel has no effect, of an actuator above all."""
 
     severity, choices = "loss", False
-    ranges = {"loss": (0.0, 1.0)}
+    ranges: ClassVar[Ranges] = within(loss=(0.0, 1.0))
     channel: str = field(default="action", kw_only=False)
     loss: Number
 

@@ -43,7 +43,7 @@ def blend(
 
 @blend.defjvp
 def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
-    on, live, possible, lead, trail, bad, good = primals
+    _, live, possible, lead, trail, bad, good = primals
     *_, dlead, dtrail, dbad, dgood = tangents
     gap = jnp.where(possible, bad - good, 0.0)
     begins = jnp.where(jnp.abs(lead) < 1, gap * (1 - jnp.abs(lead)), 0.0)

@@ -1,4 +1,4 @@
-"""What observations and actions pass through on their way between a system and its policy.
+"""The way of observations and actions between a system and its policy, and its links.
 
     channels = Channels(links, period, features)
     states = channels.begin(observation, action, key)
@@ -128,6 +128,10 @@ class Channels(NamedTuple):
         return value, tuple(after)
 
 
+NOTHING_PASSED = Channels((), 1.0, {})
+"""Observations and actions as they are."""
+
+
 def first_refusal(links: Iterable[Link], features: PyTree, owner: str) -> str | None:
     """Return what is wrong with the numbers of the first link that `owner` cannot have; or None.
 
@@ -138,7 +142,7 @@ def first_refusal(links: Iterable[Link], features: PyTree, owner: str) -> str | 
     return next(filter(None, (link.refusal(features, owner) for link in links)), None)
 
 
-class Place(NamedTuple):
+class NamedNumbers(NamedTuple):
     """Numbers that have a name of their own: those at `index` of a part of one side; all if None.
 
     `part` is the name of a leaf, as in `sensordata`; empty where the whole is one array.
@@ -150,7 +154,7 @@ class Place(NamedTuple):
 
 
 class Passing(NamedTuple):
-    """What passes between a system and its policy, as a fault is put in.
+    """The things that pass between a system and its policy, for a fault to be put in.
 
     - `observation`, `action`: forms, as `jax.ShapeDtypeStruct`s.
     - `period`: seconds between two decisions; `duration`: of a simulation.
@@ -162,7 +166,7 @@ class Passing(NamedTuple):
     action: PyTree
     period: float
     duration: float
-    names: Mapping[str, Place] = {}
+    names: Mapping[str, NamedNumbers] = {}
     hidden: tuple[str, ...] = ()
 
     def entries(self, channel: str) -> "Entries":
@@ -178,18 +182,20 @@ class Passing(NamedTuple):
         matched = re.fullmatch(r"(.+?)(?:\[(-?\d+)\])?", channel.strip())
         name, number = (channel, None) if matched is None else matched.groups()
         parts = {side: _named_parts(getattr(self, side)) for side in SIDES}
-        places = {f"{side}.{part}": Place(side, part) for side in SIDES for part in parts[side]}
-        plain = {part: Place(side, part) for side in reversed(SIDES) for part in parts[side]}
-        places = {**places, **plain, **self.names}
+        named = {
+            f"{side}.{part}": NamedNumbers(side, part) for side in SIDES for part in parts[side]
+        }
+        plain = {part: NamedNumbers(side, part) for side in reversed(SIDES) for part in parts[side]}
+        named = {**named, **plain, **self.names}
         if name in SIDES:
             side: Side = name  # pyright: ignore[reportAssignmentType]
             shown = [part for part in parts[side] if part not in self.hidden]
             found = [(part, None) for part in _of_one_kind(parts[side], shown)]
-        elif name in places:
-            side = places[name].side
-            found = [(places[name].part, places[name].index)]
+        elif name in named:
+            side = named[name].side
+            found = [(named[name].part, named[name].index)]
         else:
-            known = [known for known in places if known and not known.endswith(".")]
+            known = [known for known in named if known and not known.endswith(".")]
             raise unknown_name("channel", channel, [*SIDES, *known])
         order = list(parts[side])
         chosen, kinds, size = [], [], 0
@@ -210,7 +216,9 @@ class Passing(NamedTuple):
                     chosen = [(leaf, (index[wanted],))]
                     break
                 wanted -= len(index)
-        whole = all(jnp.issubdtype(kind, jnp.integer) or kind == bool for kind in kinds)
+        whole = all(
+            jnp.issubdtype(kind, jnp.integer) or jnp.issubdtype(kind, jnp.bool_) for kind in kinds
+        )
         names = tuple(part for part, _ in found) if name not in SIDES else ()
         return Entries(side, tuple(chosen), whole, names)
 
@@ -229,7 +237,7 @@ class Entries(NamedTuple):
 
     @property
     def count(self) -> int:
-        """How many they are."""
+        """The number of them."""
         return sum(len(index) for _, index in self.parts)
 
     def take(self, value: PyTree, xp: Any) -> Float[Any, " count"]:

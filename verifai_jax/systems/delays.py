@@ -80,6 +80,10 @@ class Delay(Link):
             )
 
 
+NO_DELAY = Delay()
+"""An observation that is seen at once, an action that takes effect at once."""
+
+
 def as_delay(option: DelayOption, name: str) -> Delay:
     """Read the option `name`.
 

@@ -28,7 +28,7 @@ from verifai_jax.core.waveform import is_waveform, set_durations
 from verifai_jax.systems.base import KnownSignals
 from verifai_jax.systems.blackbox._blackbox import BlackBox, PooledBlackBox, blackbox
 from verifai_jax.systems.channels import Channels, Link, Passing
-from verifai_jax.systems.delays import Delay, DelayOption, as_delay
+from verifai_jax.systems.delays import NO_DELAY, Delay, DelayOption, as_delay
 from verifai_jax.systems.environments.episode import (
     Moment,
     check_features,
@@ -82,8 +82,8 @@ class EpisodeFunction:
     configure: Callable[..., None] | None
     reset: Callable[..., Any] | None
     dt: float | None
-    observation_delay: Delay = Delay()
-    action_delay: Delay = Delay()
+    observation_delay: Delay = NO_DELAY
+    action_delay: Delay = NO_DELAY
     clip: bool = True
     links: tuple[Link, ...] = ()
 

@@ -23,7 +23,7 @@ from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.user_errors import check_called_with
 from verifai_jax.core.waveform import is_waveform
 from verifai_jax.systems.base import Carry, Features, Seed
-from verifai_jax.systems.channels import Channels, Place
+from verifai_jax.systems.channels import NOTHING_PASSED, Channels, NamedNumbers
 from verifai_jax.systems.checkpointing import checkpointed_scan
 from verifai_jax.systems.pytree_checks import (
     as_precise_as,
@@ -72,7 +72,7 @@ class Episode:
     signals: Callable[..., dict[str, Array]]
     steps: int
     dt: float
-    channels: Channels = Channels((), 1.0, {})
+    channels: Channels = NOTHING_PASSED
 
     def next_moment(self, time: Time, state: PyTree, action: PyTree, key: Key[Array, ""]) -> Moment:
         """Return the moment after a step, `over` as a truth value."""
@@ -98,8 +98,8 @@ def rollout(episode: Episode, key: Seed) -> Trace:
 
     The reward of a sample is that of the step which led to it. The first sample at which the
     episode is over is the last valid one. The status is `NONFINITE` if it ends in a state with a
-    NaN, or in an observation that is not finite, and `ERROR` if a delay or a fault has a number that it may
-    not have.
+    NaN, or in an observation that is not finite, and `ERROR` if a delay or a fault has a
+    number that it may not have.
 
     **Raises:** `ValueError` while JAX traces it, for parts that do not fit together.
     """
@@ -168,9 +168,7 @@ def _status(last: Moment, valid: Bool[Array, ""] | bool) -> Int[Array, ""]:
     return jnp.where(valid, status, jnp.int32(Status.ERROR))
 
 
-def _first_moment(
-    episode: Episode, first: Moment, keys: _Keys
-) -> tuple[Moment, Any, Any]:
+def _first_moment(episode: Episode, first: Moment, keys: _Keys) -> tuple[Moment, Any, Any]:
     """Return the first moment and memory in the types that they keep, checked, and no action."""
     first = jax.tree.map(jnp.asarray, first._replace(over=jnp.asarray(first.over, bool)))
     memory = in_working_precision(episode.memory)
@@ -363,13 +361,17 @@ def check_signals_option(signals: object, state: str = "state") -> None:
         )
 
 
-def names_of_entries(signals: SignalsOption) -> dict[str, Place]:
+def names_of_entries(signals: SignalsOption) -> dict[str, NamedNumbers]:
     """Return where an observation has the entries that the option `signals` names."""
     if callable(signals) or signals is None:
         return {}
-    entries = signals if isinstance(signals, Mapping) else dict(zip(signals, range(len(signals))))
+    entries = (
+        signals if isinstance(signals, Mapping) else {name: i for i, name in enumerate(signals)}
+    )
     return {
-        name: Place("observation", at) if isinstance(at, str) else Place("observation", "", (at,))
+        name: NamedNumbers("observation", at)
+        if isinstance(at, str)
+        else NamedNumbers("observation", "", (at,))
         for name, at in entries.items()
     }
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.user_errors import explain_user_error
 from verifai_jax.systems.base import Seed
-from verifai_jax.systems.channels import Channels, Link, Passing, Place
+from verifai_jax.systems.channels import Channels, Link, NamedNumbers, Passing
 from verifai_jax.systems.mujoco.bindings import Bindings, RecordingFeatures
 from verifai_jax.systems.mujoco.model import Location, names, reading
 from verifai_jax.systems.pytree_checks import (
@@ -201,16 +201,16 @@ class Loop:
         if self.controller is None:
             raise ValueError("faults lie between a model and its controller; there is none")
         state, _ = jax.eval_shape(lambda: self.state(jnp.zeros((), jnp.result_type(float)), {}))
-        compiled, places = self.compiled, {}
+        compiled, named = self.compiled, {}
         for kind, path in (("joint", "joint/{}/qpos"), ("sensor", "sensor/{}")):
             for name in names(compiled, kind):
                 where = reading(compiled, path.format(name))
                 index = tuple(int(i) for i in where.index)
-                places[name] = Place("observation", where.array, index)
+                named[name] = NamedNumbers("observation", where.array, index)
         for number, name in enumerate(names(compiled, "actuator")):
-            places.setdefault(name, Place("action", "", (number,)))
+            named.setdefault(name, NamedNumbers("action", "", (number,)))
         control = jax.ShapeDtypeStruct((compiled.nu,), state.time.dtype)
-        return Passing(state, control, self.control_period, self.duration, places, ("time",))
+        return Passing(state, control, self.control_period, self.duration, named, ("time",))
 
     def rest(self) -> Float[Array, " nu"]:
         """Return the control where nothing controls: the keyframe's, or zero."""

@@ -23,8 +23,8 @@ from verifai_jax.core.fingerprint import used_inputs
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import set_durations
 from verifai_jax.systems.base import Features, Seed, System
-from verifai_jax.systems.clock import count_periods
 from verifai_jax.systems.channels import Link, Passing, first_refusal
+from verifai_jax.systems.clock import count_periods
 from verifai_jax.systems.delays import DelayOption, as_delay, joined, links_of
 from verifai_jax.systems.mujoco.bindings import Bound, resolve_bindings
 from verifai_jax.systems.mujoco.loop import Loop, Signals

@@ -160,7 +160,7 @@ class _Rollout:
 
     @property
     def channels(self) -> Channels:
-        """What states pass through to the controller, and controls from it."""
+        """The links of states to the controller, and of controls from it."""
         return Channels(self.loop.links, self.loop.dt * self.loop.steps_per_control, self.features)
 
     def decided(self, state: PyTree, memory: PyTree) -> Any:
