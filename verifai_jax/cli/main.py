@@ -33,6 +33,7 @@ from verifai_jax.cli.exit_codes import (
 )
 from verifai_jax.cli.explain import explain
 from verifai_jax.cli.falsify import falsify
+from verifai_jax.cli.fmea import fmea
 from verifai_jax.cli.fuzz import fuzz
 from verifai_jax.cli.list import list_targets
 from verifai_jax.cli.merge import merge
@@ -59,6 +60,7 @@ COMMANDS = (
     confirm,
     estimate,
     modes,
+    fmea,
     explain,
     repair,
     shrink,

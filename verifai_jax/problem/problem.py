@@ -221,6 +221,24 @@ class Problem(InNotebook):
         own = None if self.nominal is None else fixed
         return replace(self, space=self.space.only(*features, nominal=fixed), nominal=own)
 
+    def with_faults(self, *faults: object, by_simulator: bool = False) -> "Problem":
+        """Return the same problem with faults of its sensors and actuators among its features.
+
+        **Arguments:**
+
+        - `faults`: of `vj.faults`, in the order in which those of one channel apply. What varies of
+          each is a feature under its name, whose nominal value is the weakest, shortest and latest
+          fault.
+        - `by_simulator`: whether the simulator applies them itself, as `vj.faults.on_host` helps
+          it to; for `remote`, and for a `blackbox` of one's own.
+
+        **Raises:** `UnknownNameError` for a channel that the system does not have, with the nearest
+        one; `ValueError` for a name that exists already, a fault that a channel cannot have, and
+        for a system without a loop that is known.
+        """
+        function = lazy_import("verifai_jax.faults.injection", "with_faults")
+        return function(self, faults, by_simulator)
+
     def objective(
         self,
         semantics: Semantics = hard,
