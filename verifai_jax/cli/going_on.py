@@ -35,7 +35,7 @@ _BESIDES = frozenset(
 
 
 class Kept:
-    """What a command has told of its end."""
+    """The end of a command, as it is told here."""
 
     def __init__(self, work: "Unfinished | None") -> None:
         self._work = work

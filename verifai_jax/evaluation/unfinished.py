@@ -50,7 +50,7 @@ class Unfinished:
 
     @property
     def empty(self) -> bool:
-        """Whether no simulation is kept yet."""
+        """True while no simulation is kept."""
         return not self.cache.names() and not any(self.folder.glob("*.rows"))
 
     def part(self, problem: Problem, *mode: object) -> "Part":
@@ -215,6 +215,8 @@ def _arrays(verdicts: Verdicts) -> dict[str, np.ndarray]:
 
 
 def _verdict(arrays: Arrays, row: int) -> Verdicts:
-    fields = {name: arrays[name][row : row + 1] for name in _FIELDS if name in arrays}
+    fields: dict[str, Any] = {
+        name: arrays[name][row : row + 1] for name in _FIELDS if name in arrays
+    }
     messages = [str(arrays["messages"][row])] if "messages" in arrays else None
     return Verdicts(**fields, messages=messages)
