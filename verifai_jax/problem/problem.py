@@ -23,7 +23,8 @@ from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook, text_html
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import ProgramCache, Slot
-from verifai_jax.core.sources import Maker, Sources, made_here, sources_of
+from verifai_jax.core.source_collection import made_here, sources_of
+from verifai_jax.core.sources import Maker, Sources
 from verifai_jax.core.text import is_control, printable
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.user_errors import (

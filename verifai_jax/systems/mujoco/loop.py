@@ -20,7 +20,7 @@ from verifai_jax.core.user_errors import explain_user_error
 from verifai_jax.systems.base import Seed
 from verifai_jax.systems.delays import NO_DELAY, Delay, Line, through
 from verifai_jax.systems.mujoco.bindings import Bindings, RecordingFeatures
-from verifai_jax.systems.mujoco.model import Location, names, reading
+from verifai_jax.systems.mujoco.part_paths import Location, names, reading
 from verifai_jax.systems.pytree_checks import (
     as_precise_as,
     check_like,

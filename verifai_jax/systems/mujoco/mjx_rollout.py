@@ -22,7 +22,8 @@ from verifai_jax.systems.base import Features, Seed
 from verifai_jax.systems.mujoco.bindings import Bindings
 from verifai_jax.systems.mujoco.derived_constants import recompute_constants
 from verifai_jax.systems.mujoco.loop import Loop, Progress, Sample
-from verifai_jax.systems.mujoco.model import MjModel, MjxData, MjxModel, Model, mjx_module
+from verifai_jax.systems.mujoco.model import MjxData, MjxModel, Model, mjx_module
+from verifai_jax.systems.mujoco.part_paths import MjModel
 
 # Values at which MJX looks once, to see whether there is any friction; features may change them.
 _SWITCHES = ("dof_frictionloss", "tendon_frictionloss")
