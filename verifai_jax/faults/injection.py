@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Key, PyTree
 
 from verifai_jax.core.errors import unknown_name
-from verifai_jax.core.keys import as_key
+from verifai_jax.core.keys import IMPLEMENTATION
 from verifai_jax.faults.fault import AtMost, Fault, Moment
 from verifai_jax.faults.kinds import WrongChannel
 from verifai_jax.faults.smoothing import blend
@@ -252,7 +252,7 @@ def _draws(seed: Any, now: Instant, count: int, xp: Any) -> tuple[Any, Any, Any]
     if xp is np:
         rng = np.random.default_rng([*seed, int(now.step)])
         return rng.random(count), rng.standard_normal(count), rng.random()
-    key = jax.random.fold_in(as_key(seed), now.step)
+    key = jax.random.fold_in(jax.random.wrap_key_data(seed, impl=IMPLEMENTATION), now.step)
     each, normal, one = jax.random.split(key, 3)
     return (
         jax.random.uniform(each, (count,)),
