@@ -5,7 +5,7 @@ Each number is fixed, or a domain, which makes it a feature of the problem.
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, TypeAlias
@@ -36,7 +36,7 @@ class Moment(NamedTuple):
     - `time`, `period`: of the instant, and between two instants, in seconds.
     - `first`: whether nothing passed before; `acts`: whether the channel is part of an action.
     - `other`: the numbers of the channel that it reads instead, if it does.
-    - `draws`: uniform and normal random numbers `[n]` and one uniform number, of this instant.
+    - `uniform`: makes so many random numbers of this instant between 0 and 1.
     """
 
     xp: Any
@@ -48,7 +48,7 @@ class Moment(NamedTuple):
     first: Any
     acts: bool
     other: Vector | None
-    draws: tuple[Vector, Vector, Any] | None
+    uniform: Callable[[int], Vector]
 
 
 class FaultFeatures(Struct):

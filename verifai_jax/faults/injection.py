@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Key, PyTree
 
 from verifai_jax.core.errors import unknown_name
-from verifai_jax.core.keys import IMPLEMENTATION
+from verifai_jax.faults.chance import uniform
 from verifai_jax.faults.fault import AtMost, Fault, Moment
 from verifai_jax.faults.kinds import WrongChannel
 from verifai_jax.faults.smoothing import blend
@@ -94,7 +94,7 @@ class Injected(Link):
             return memory
         number = zlib.crc32(self.fault.label.encode())
         if now.xp is np:
-            return (int(key or 0), number), memory
+            return np.array([int(key or 0), number], np.uint32), memory
         key = jax.random.key(0) if key is None else key
         return jax.random.key_data(jax.random.fold_in(key, number))[-2:], memory
 
@@ -113,7 +113,7 @@ class Injected(Link):
         at = Moment(
             xp, number, live, xp.maximum(since, 0.0), now.time, now.period, now.step == 0,
             self.side == "action", None if self.other is None else self.other.take(value, xp),
-            None if seed is None else _draws(seed, now, self.entries.count, xp),
+            lambda count: uniform(seed, now.step, count, xp),
         )  # fmt: skip
         bad, after = self.fault.corrupt(good, memory, at)
         after = after if xp is np else jax.tree.map(_like, after, memory)
@@ -246,19 +246,6 @@ def on_host(
     - `period`: seconds between two observations.
     """
     return OnHost(faults, features, seed, period)
-
-
-def _draws(seed: Any, now: Instant, count: int, xp: Any) -> tuple[Any, Any, Any]:
-    if xp is np:
-        rng = np.random.default_rng([*seed, int(now.step)])
-        return rng.random(count), rng.standard_normal(count), rng.random()
-    key = jax.random.fold_in(jax.random.wrap_key_data(seed, impl=IMPLEMENTATION), now.step)
-    each, normal, one = jax.random.split(key, 3)
-    return (
-        jax.random.uniform(each, (count,)),
-        jax.random.normal(normal, (count,)),
-        jax.random.uniform(one),
-    )
 
 
 def _like(new: Any, old: Any) -> Any:
