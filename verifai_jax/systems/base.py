@@ -9,9 +9,11 @@ All else has a default here: a system offers more by overriding it.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import jax
+import numpy as np
 from jaxtyping import Array, Int, Key, PyTree
 
 from verifai_jax.core.compilation import XlaOptimization
@@ -79,12 +81,13 @@ class System(ForUsers):
     - `likely`: the engine that is likely the fastest on a CPU.
     - `derived`: how a verb made this system of the one that it was given, as plain data for the
       record of a run; None for a system of a person's own.
+    - `constants`: numbers and texts of the model by name, by which two models can be compared.
     """
 
     _internal = frozenset((
         "abstract", "backend", "backends", "black_box", "can_fold", "can_refine",
-        "can_simulate_batch", "can_simulate_each", "derived", "effort", "exact_step", "fold",
-        "forward_up_to", "known_signals", "lanes", "likely", "links", "may_draw", "passing",
+        "can_simulate_batch", "can_simulate_each", "constants", "derived", "effort", "exact_step",
+        "fold", "forward_up_to", "known_signals", "lanes", "likely", "links", "may_draw", "passing",
         "refined", "renewed", "reverse_hint", "simulate_batch", "simulate_each", "switches",
         "traced_factor", "unroll", "why_error", "why_not", "with_backend", "with_links",
     ))  # fmt: skip
@@ -103,6 +106,7 @@ class System(ForUsers):
     backend: str | None = None
     likely: str | None = None
     derived: Mapping[str, Any] | None = None
+    constants: Mapping[str, str | np.ndarray] = MappingProxyType({})
 
     def __call__(self, features: Features, key: Seed = None) -> Trace:
         """Simulate once, the same trace for the same features and key."""

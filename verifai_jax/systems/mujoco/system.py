@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Key, PyTree
 
 from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import suggests_options, unknown_name
+from verifai_jax.core.errors import require, suggests_options, unknown_name
 from verifai_jax.core.fingerprint import used_inputs
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import set_durations
@@ -73,6 +73,22 @@ class MuJoCo(System):
     def notes(self) -> tuple[str, ...]:
         """Sentences on what was changed in the model, and on a controller that runs in Python."""
         return (*self.loop.bindings.model.notes, *self.loop.said.values())
+
+    @property
+    def constants(self) -> dict[str, str | np.ndarray]:
+        """Options and arrays of the model by name, without what MuJoCo computes of the others."""
+        mujoco, compiled = require("mujoco", extra="mujoco"), self.loop.compiled
+        found: dict[str, str | np.ndarray] = {}
+        for name in dir(compiled.opt):
+            value = getattr(compiled.opt, name)
+            if isinstance(value, int | float | np.ndarray) and not name.startswith("_"):
+                kinds = getattr(mujoco, f"mjt{name.capitalize()}", None)
+                found[f"option/{name}"] = np.asarray(value) if kinds is None else kinds(value).name
+        for name in dir(compiled):
+            value = getattr(compiled, name) if name[-1] != "0" else None
+            if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+                found[name] = value
+        return found
 
     def why_slow_to_compile(self, gradient: bool) -> str:
         """Say why MJX compiles this model for minutes, and what is cheaper; empty if it is quick.
