@@ -71,7 +71,7 @@ def effect_of(
     severity = {
         f"{name}.{graded[name]}": float(columns[f"{name}.{graded[name]}"]) for name in found.faults
     }
-    onset = max(
+    onset = min(
         float(columns.get(f"{name}.onset", faults[name].numbers["onset"]))  # pyright: ignore[reportArgumentType]
         for name in found.faults
     )
