@@ -154,6 +154,13 @@ class Fault:
         return {n: value for n, value in self.numbers.items() if isinstance(value, Domain)}
 
     @property
+    def grade(self) -> str:
+        """The number that varies and says how bad the fault is."""
+        return next(
+            n for n in (self.severity, "duration", "onset", *self.domains) if n in self.domains
+        )
+
+    @property
     def feature(self) -> FaultFeatures | None:
         """The feature that the fault is; None for one of which nothing varies."""
         if not self.domains:
@@ -206,6 +213,11 @@ class AtMost:
             raise ValueError(f"AtMost needs a list of faults; got {self.faults!r}")
         check_name("the name of AtMost", self.name)
         object.__setattr__(self, "faults", faults)
+
+    @property
+    def label(self) -> str:
+        """The name of the feature."""
+        return self.name
 
     @property
     def feature(self) -> FaultFeatures:
