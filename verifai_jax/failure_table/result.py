@@ -169,9 +169,8 @@ class FailureTable(Drawn, InNotebook):
                 line += f", {each.verdict}\n    from {_severity(each)}; breaks {each.broken} "
                 line += f"{format_seconds(each.delay, 3)} after the onset"
                 if each.shown_by:
-                    line += (
-                        f"; {each.shown_by} shows it after {format_seconds(each.shown_after, 3)}"
-                    )
+                    shown = format_seconds(each.shown_after, 3)
+                    line += f";\n    {each.shown_by} shows it after {shown}"
             lines.append(line)
         if not self.healthy:
             lines.append("  note: the nominal features break the property without any fault")

@@ -13,6 +13,7 @@ from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.failure_table.effects import Found
 from verifai_jax.falsification import falsify
 from verifai_jax.faults.fault import Fault
+from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.binomial import clopper_pearson
 from verifai_jax.store.cache import Cache
@@ -47,6 +48,7 @@ class Rows:
         self.rng, self.seed, self.executor = np.random.default_rng(seed), seed, executor
         self.nominal = Nominal.of(problem)
         self.groups: dict[str, Int[np.ndarray, " k"]] = dict(self.nominal.groups)
+        self.draws = depends_on_key(problem)
         self._evaluate = Evaluator(problem, 512, seed=seed, executor=executor)
         self._count = 0
 
@@ -146,4 +148,6 @@ class Rows:
             high = np.where(fails, shares[each, first], high)
             low = np.where(fails, shares[each, np.maximum(first - 1, 0)], low)
         starts[:, index] = home[index] + high[:, None] * away[:, 0]
-        return np.concatenate([ordered(starts[fails]), failing[:TRIED]])
+        # Where chance decides, a few failing points are tried many times.
+        tried = np.resize(failing, (8 * TRIED, len(home))) if self.draws else failing[:TRIED]
+        return np.concatenate([ordered(starts[fails]), tried])
