@@ -193,7 +193,7 @@ def test_chance_is_of_the_row_and_of_the_name(simulate, all_of_them):
     again = jax.jit(alone.system)(
         alone.space.coerce({"push": 0.5, "x_noise": {"std": 0.5, **numbers}}), KEY
     )
-    np.testing.assert_array_equal(again["seen"], once["seen"])
+    np.testing.assert_allclose(again["seen"], once["seen"], rtol=1e-4)
     lost = np.asarray(simulate("packets", loss=0.5, **numbers)["seen"])[:20]
     repeated = np.mean(lost[1:] == lost[:-1])
     assert 0.15 < repeated < 0.85

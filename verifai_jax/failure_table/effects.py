@@ -44,7 +44,6 @@ def effect_of(
     run: Run | None,
     found: Found,
     faults: Mapping[str, Fault],
-    graded: Mapping[str, str],
     verdicts: Mapping[int, str],
 ) -> Effect:
     """Return what is known of a fault or a pair, without probabilities.
@@ -52,7 +51,7 @@ def effect_of(
     **Arguments:**
 
     - `run`: with the candidates as rows.
-    - `faults`: all of them by name, `graded`: the number of each that is its severity.
+    - `faults`: all of them by name.
     - `verdicts`: of the confirmation, by row.
     """
     rows = range(found.first, found.first + len(found.candidates))
@@ -68,10 +67,9 @@ def effect_of(
         return effect
     again = run.replay(row)
     columns = again.columns()
-    severity = {
-        f"{name}.{graded[name]}": float(columns[f"{name}.{graded[name]}"]) for name in found.faults
-    }
-    onset = max(
+    numbers = [f"{name}.{faults[name].grade}" for name in found.faults]
+    severity = {number: float(columns[number]) for number in numbers}
+    onset = min(
         float(columns.get(f"{name}.onset", faults[name].numbers["onset"]))  # pyright: ignore[reportArgumentType]
         for name in found.faults
     )

@@ -1,6 +1,5 @@
 """The result of `fmea`: a row for each fault, and for each pair that fails where neither does."""
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -163,17 +162,16 @@ class FailureTable(Drawn, InNotebook):
             line = f"  {each.name:<{width}}  {each.probability:z.2g} "
             line += f"({each.low:z.2g} to {each.high:z.2g})"
             if not each.fails:
-                lines.append(f"{line}, no failure in {each.simulations:,} simulations")
-                continue
-            if each.row is None:
-                lines.append(f"{line}: fails under random keys that are few")
-                continue
-            line += f", from {_severity(each)}: breaks {each.broken}"
-            if math.isfinite(each.delay):
-                line += f" {format_seconds(each.delay, 3)} after its onset"
-            if each.shown_by:
-                line += f"; {each.shown_by} shows it after {format_seconds(each.shown_after, 3)}"
-            lines.append(f"{line}; {each.verdict}")
+                line += f", no failure in {each.simulations:,} samples"
+            elif each.row is None:
+                line += ", fails under few random keys"
+            else:
+                line += f", {each.verdict}\n    from {_severity(each)}; breaks {each.broken} "
+                line += f"{format_seconds(each.delay, 3)} after the onset"
+                if each.shown_by:
+                    shown = format_seconds(each.shown_after, 3)
+                    line += f";\n    {each.shown_by} shows it after {shown}"
+            lines.append(line)
         if not self.healthy:
             lines.append("  note: the nominal features break the property without any fault")
         return "\n".join(lines)

@@ -5,7 +5,7 @@ Each number is fixed, or a domain, which makes it a feature of the problem.
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, TypeAlias
@@ -36,7 +36,7 @@ class Moment(NamedTuple):
     - `time`, `period`: of the instant, and between two instants, in seconds.
     - `first`: whether nothing passed before; `acts`: whether the channel is part of an action.
     - `other`: the numbers of the channel that it reads instead, if it does.
-    - `draws`: uniform and normal random numbers `[n]` and one uniform number, of this instant.
+    - `uniform`: makes so many random numbers of this instant between 0 and 1.
     """
 
     xp: Any
@@ -48,7 +48,7 @@ class Moment(NamedTuple):
     first: Any
     acts: bool
     other: Vector | None
-    draws: tuple[Vector, Vector, Any] | None
+    uniform: Callable[[int], Vector]
 
 
 class FaultFeatures(Struct):
@@ -154,6 +154,13 @@ class Fault:
         return {n: value for n, value in self.numbers.items() if isinstance(value, Domain)}
 
     @property
+    def grade(self) -> str:
+        """The number that varies and says how bad the fault is."""
+        return next(
+            n for n in (self.severity, "duration", "onset", *self.domains) if n in self.domains
+        )
+
+    @property
     def feature(self) -> FaultFeatures | None:
         """The feature that the fault is; None for one of which nothing varies."""
         if not self.domains:
@@ -206,6 +213,11 @@ class AtMost:
             raise ValueError(f"AtMost needs a list of faults; got {self.faults!r}")
         check_name("the name of AtMost", self.name)
         object.__setattr__(self, "faults", faults)
+
+    @property
+    def label(self) -> str:
+        """The name of the feature."""
+        return self.name
 
     @property
     def feature(self) -> FaultFeatures:

@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Array, Key, PyTree
 
 from verifai_jax.core.errors import unknown_name
-from verifai_jax.core.keys import as_key
+from verifai_jax.faults.chance import uniform
 from verifai_jax.faults.fault import AtMost, Fault, Moment
 from verifai_jax.faults.kinds import WrongChannel
 from verifai_jax.faults.smoothing import blend
-from verifai_jax.features import Domain, FeatureSpace
+from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.channels import Channels, Entries, Instant, Link, Passing, Side
 
@@ -94,7 +94,7 @@ class Injected(Link):
             return memory
         number = zlib.crc32(self.fault.label.encode())
         if now.xp is np:
-            return (int(key or 0), number), memory
+            return np.array([int(key or 0), number], np.uint32), memory
         key = jax.random.key(0) if key is None else key
         return jax.random.key_data(jax.random.fold_in(key, number))[-2:], memory
 
@@ -113,7 +113,7 @@ class Injected(Link):
         at = Moment(
             xp, number, live, xp.maximum(since, 0.0), now.time, now.period, now.step == 0,
             self.side == "action", None if self.other is None else self.other.take(value, xp),
-            None if seed is None else _draws(seed, now, self.entries.count, xp),
+            lambda count: uniform(seed, now.step, count, xp),
         )  # fmt: skip
         bad, after = self.fault.corrupt(good, memory, at)
         after = after if xp is np else jax.tree.map(_like, after, memory)
@@ -159,51 +159,50 @@ def inject(fault: Fault, passing: Passing, choice: tuple[str, int] | None = None
 
 def with_faults(problem: Problem, faults: Sequence[object], by_simulator: bool = False) -> Problem:
     """Return a problem with faults; see `Problem.with_faults`."""
-    chosen: list[tuple[Fault, tuple[str, int] | None]] = []
-    features: dict[str, Domain] = dict(problem.space.domains)
-
-    def add(name: str, domain: Domain | None) -> None:
-        if name in features or name in [fault.label for fault, _ in chosen]:
-            raise ValueError(
-                f"there is a feature or a fault {name!r} already: give the fault another name=..."
-            )
-        if domain is not None:
-            features[name] = domain
-
-    for each in faults:
-        if not isinstance(each, Fault | AtMost):
-            raise ValueError(f"with_faults takes faults, such as vj.faults.Bias; got {each!r}")
-        if isinstance(each, AtMost):
-            add(each.name, each.feature)
-        for number, fault in enumerate(each.faults if isinstance(each, AtMost) else [each]):
-            add(fault.label, fault.feature)
-            chosen.append((fault, (each.name, number + 1) if isinstance(each, AtMost) else None))
+    chosen, features = _each(faults), {}
     if not chosen:
         raise ValueError("with_faults needs at least one fault; got none")
-    system = problem.system
+    names, space = [*problem.space.domains], problem.space
+    for each in (*(e for e in faults if isinstance(e, AtMost)), *(fault for fault, _ in chosen)):
+        if each.label in names:
+            raise ValueError(
+                f"there is a feature or a fault {each.label!r} already: give the fault another "
+                "name=..."
+            )
+        names.append(each.label)
+        if each.feature is not None:
+            features[each.label] = each.feature
+    system, nominal = problem.system, problem.nominal
     if not by_simulator:
-        passing = system.passing(problem.space.feature_form)
+        passing = system.passing(space.feature_form)
         system = system.with_links(tuple(inject(f, passing, choice) for f, choice in chosen))
-    space = FeatureSpace(features, problem.space.where)
-    nominal = problem.nominal
     if nominal is not None:
-        new = {
-            name: domain for name, domain in features.items() if name not in problem.space.domains
-        }
-        nominal = {**nominal, **{name: domain.nominal for name, domain in new.items()}}
+        nominal = {**nominal, **{name: domain.nominal for name, domain in features.items()}}
+    space = FeatureSpace({**space.domains, **features}, space.where)
     return replace(problem, space=space, system=system, nominal=nominal)
+
+
+def _each(faults: Sequence[object]) -> list[tuple[Fault, tuple[str, int] | None]]:
+    """Return each fault, with the feature that chooses it and its number there, if one does."""
+    found = []
+    for each in faults:
+        if isinstance(each, AtMost):
+            found += [(fault, (each.name, i)) for i, fault in enumerate(each.faults, 1)]
+        elif isinstance(each, Fault):
+            found.append((each, None))
+        else:
+            raise ValueError(f"with_faults takes faults, such as vj.faults.Bias; got {each!r}")
+    return found
 
 
 class OnHost:
     """Faults in the loop of a simulator of one's own; made by `on_host`."""
 
     def __init__(
-        self, faults: Sequence[Fault | AtMost], features: PyTree, seed: int, period: float
+        self, faults: Sequence[object], features: PyTree, seed: int, period: float
     ) -> None:
-        self._faults, self._features = tuple(faults), features
-        self._seed, self._period = seed, period
-        self._links: dict[str, tuple[Link, ...]] = {}
-        self._states: dict[str, Any] = {}
+        self._faults, self._given = _each(faults), (features, seed, period)
+        self._loops: dict[Side, tuple[Channels, Any]] = {}
 
     def observation(self, time: float, value: PyTree) -> PyTree:
         """Return what the policy sees at `time` seconds; to be called once at each instant."""
@@ -214,21 +213,18 @@ class OnHost:
         return self._through("action", time, value)
 
     def _through(self, side: Side, time: float, value: PyTree) -> PyTree:
-        channels = Channels(self._links.get(side, ()), self._period, self._features, np)
-        if side not in self._links:
-            form = jax.tree.map(np.asarray, value)
-            empty = {"observation": (), "action": (), side: form}
-            passing = Passing(**empty, period=self._period, duration=np.inf)
-            links = []
-            for each in self._faults:
-                several = isinstance(each, AtMost)
-                for number, fault in enumerate(each.faults if several else [each]):
-                    choice = (each.name, number + 1) if several else None
-                    links += [(fault, choice)] if fault.channel.startswith(side) else []
-            self._links[side] = tuple(inject(fault, passing, choice) for fault, choice in links)
-            channels = channels._replace(links=self._links[side])
-            self._states[side] = channels.begin(None, None, self._seed)
-        value, self._states[side] = channels._through(side, self._states[side], value, time)
+        if side not in self._loops:
+            features, seed, period = self._given
+            forms = {"observation": (), "action": (), side: jax.tree.map(np.asarray, value)}
+            passing = Passing(**forms, period=period, duration=np.inf)
+            own = [each for each in self._faults if each[0].channel.startswith(side)]
+            links = tuple(inject(fault, passing, choice) for fault, choice in own)
+            channels = Channels(links, period, features, np)
+            self._loops[side] = channels, channels.begin(None, None, seed)
+        channels, states = self._loops[side]
+        pass_on = channels.observation if side == "observation" else channels.action
+        value, states = pass_on(states, value, time)
+        self._loops[side] = channels, states
         return value
 
 
@@ -246,19 +242,6 @@ def on_host(
     - `period`: seconds between two observations.
     """
     return OnHost(faults, features, seed, period)
-
-
-def _draws(seed: Any, now: Instant, count: int, xp: Any) -> tuple[Any, Any, Any]:
-    if xp is np:
-        rng = np.random.default_rng([*seed, int(now.step)])
-        return rng.random(count), rng.standard_normal(count), rng.random()
-    key = jax.random.fold_in(as_key(seed), now.step)
-    each, normal, one = jax.random.split(key, 3)
-    return (
-        jax.random.uniform(each, (count,)),
-        jax.random.normal(normal, (count,)),
-        jax.random.uniform(one),
-    )
 
 
 def _like(new: Any, old: Any) -> Any:

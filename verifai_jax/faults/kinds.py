@@ -8,9 +8,12 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
+from verifai_jax.faults.chance import normal
 from verifai_jax.faults.fault import Fault, Moment, Number, Ranges, Vector, ends, within
 from verifai_jax.faults.smoothing import straight
 
+FEW = 16
+"""Values of a line up to which each is an array of its own."""
 POSITIVE = (0.0, math.inf)
 ANY = (-math.inf, math.inf)
 
@@ -100,8 +103,7 @@ class ClockJitter(Fault):
         return _line(zero, ends(self.jitter)[1] / period)
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
-        assert at.draws is not None
-        return _late(good, memory, at.draws[2] * at.number["jitter"], at)
+        return _late(good, memory, at.uniform(1)[0] * at.number["jitter"], at)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,8 +119,7 @@ class PacketLoss(Fault):
         return zero
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
-        assert at.draws is not None
-        lost = at.live & (at.draws[2] < at.number["loss"]) & ~at.first
+        lost = at.live & (at.uniform(1)[0] < at.number["loss"]) & ~at.first
         held = at.xp.where(lost, memory, good)
         if at.xp is np or good.dtype.kind != "f":
             return held, held
@@ -161,8 +162,8 @@ class Noise(Fault):
     std: Number
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
-        assert at.draws is not None
-        return good + at.number["std"] * at.draws[1], memory
+        noise = normal(at.uniform(len(good)), at.xp)
+        return good + at.number["std"] * noise, memory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,9 +176,9 @@ class Spikes(Fault):
     rate: Number = 1.0
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
-        assert at.draws is not None
-        sign = at.xp.where(at.draws[1] < 0, -1.0, 1.0)
-        hit = at.draws[0] < at.number["rate"] * at.period
+        chance = at.uniform(2 * len(good))
+        sign = at.xp.where(chance[len(good) :] < 0.5, -1.0, 1.0)
+        hit = chance[: len(good)] < at.number["rate"] * at.period
         return at.xp.where(hit, good + sign * at.number["height"], good), memory
 
 
@@ -253,25 +254,41 @@ KINDS: tuple[type[Fault], ...] = (
 
 
 def _line(zero: Vector, periods: float) -> Any:
-    """Return the last values of something at first, the newest at index 0."""
+    """Return the last values of something at first, the newest at index 0.
+
+    A few are arrays of their own: they move up without a copy, where an array of them all is
+    written anew at each step.
+    """
     count = math.ceil(periods - 1e-6) + 1
+    if count <= FEW:
+        return (zero,) * count
     return zero[None] * np.zeros((count, 1), zero.dtype)
 
 
 def _late(good: Vector, line: Any, seconds: Any, at: Moment) -> tuple[Vector, Any]:
     """Return the value of some seconds ago, in whole periods, and the line with the newest."""
-    xp = at.xp
-    pushed = xp.concatenate([good[None], line[:-1]])
-    # Before the first observation there was none other; before the first action there was none.
-    line = pushed if at.acts else xp.where(at.first, good[None] + 0 * pushed, pushed)
-    latest = line.shape[0] - 1
+    xp, few = at.xp, isinstance(line, tuple)
+    line = (good, *line[:-1]) if few else xp.concatenate([good[None], line[:-1]])
+    if not at.acts:
+        # Before the first observation there was none other; before the first action, no action.
+        line = jax.tree.map(lambda values: xp.where(at.first, good, values), line)
+    latest = len(line) - 1
+
+    def value(index: Any) -> Any:
+        if not few:
+            return line[index]
+        chosen = line[0]
+        for i, earlier in enumerate(line[1:], 1):
+            chosen = xp.where(index == i, earlier, chosen)
+        return chosen
+
     periods = xp.clip(seconds / at.period, 0, latest)
-    value = line[xp.round(periods).astype(np.int32)]
+    whole = value(xp.round(periods).astype(np.int32))
     if xp is np or good.dtype.kind != "f" or not latest:
-        return value, line
+        return whole, line
     left = xp.clip(xp.floor(periods).astype(np.int32), 0, latest - 1)
     share = periods - left
-    return straight(value, line[left] * (1 - share) + line[left + 1] * share), line
+    return straight(whole, value(left) * (1 - share) + value(left + 1) * share), line
 
 
 def _still(value: Any) -> Any:

@@ -202,6 +202,8 @@ class Passing(NamedTuple):
         for part, index in found:
             form = parts[side][part]
             index = index if index is not None else tuple(range(int(np.prod(form.shape))))
+            if not index:
+                continue
             chosen.append((order.index(part), index))
             kinds.append(form.dtype)
             size += len(index)
