@@ -219,7 +219,10 @@ class Translator:
                 self.code.store(out.at(i), each)
             return
         i = self.code.name("i")
-        each = Element(value.at(i), value.kind, value.uniform) if one is None else one
+        if one is None:
+            assert isinstance(value, Memory)
+            one = Element(value.at(i), value.kind, value.uniform)
+        each = one
         text = each.text if out.uniform or not each.uniform else f"wide({each.text})"
         head = f"for (int {i} = 0; {i} < {value.size}; {i}++)"
         self.line(f"{head} {out.at(i)} = {text};", out.uniform)
