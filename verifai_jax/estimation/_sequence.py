@@ -209,10 +209,10 @@ class _Stage:
         assert self.run is not None
         rows = self.run.table.all
         known = rows["status"].eq("ok").to_numpy()
-        places = self.problem.space.points(rows)
+        starts = self.problem.space.points(rows)
         u, inside = self.points(arrivals, 0)
         gaps, near = map(
-            np.asarray, KDTree(places[:, self.columns]).query(u[:, self.columns], p=np.inf)
+            np.asarray, KDTree(starts[:, self.columns]).query(u[:, self.columns], p=np.inf)
         )
         proper = inside & known[near]
         failing = rows["violated"].to_numpy(bool)[near] & proper
@@ -235,7 +235,7 @@ class _Stage:
         tried = np.flatnonzero(failing)[:CONFIRMED]
         if not len(tried):
             return estimate, [], notes
-        u[tried] = np.where(self.columns, u[tried], places[near[tried]])
+        u[tried] = np.where(self.columns, u[tried], starts[near[tried]])
         again = self.evaluate(u[tried])
         paths = self.paths(u[tried], _Arrivals({}, [arrivals.paths[i] for i in tried]))
         found = np.flatnonzero(again.violated & again.proper)

@@ -33,7 +33,7 @@ class PartEstimate:
 
     def __str__(self) -> str:
         weighed = self.effective < 0.999 * self.samples
-        worth = f", worth {self.effective:,.0f}" if weighed else ""
+        worth = f", worth {self.effective:z,.0f}" if weighed else ""
         lost = f", {self.without:,} of them without a verdict" if self.without else ""
         return (
             f"{self.name:<16} {format_percent(self.probability)} ({format_percent(self.low)} to "
