@@ -40,7 +40,9 @@ if TYPE_CHECKING:
     from verifai_jax.counterexamples import replay_counterexamples as replay_counterexamples
     from verifai_jax.counterexamples import shrink as shrink
     from verifai_jax.estimation import Estimate as Estimate
+    from verifai_jax.estimation import SequenceEstimate as SequenceEstimate
     from verifai_jax.estimation import estimate as estimate
+    from verifai_jax.estimation import sequence as sequence
     from verifai_jax.failure_modes import Mode as Mode
     from verifai_jax.failure_modes import Modes as Modes
     from verifai_jax.failure_modes import modes as modes

@@ -56,7 +56,8 @@ class Evaluator:
       left out.
     - `guidance`: what is computed for a search in addition to the robustness.
     - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
-    - `keep_traces`: whether verdicts come with traces; in this process.
+    - `keep_traces`: whether verdicts come with traces, in this process; or names of signals that
+      they are to have in addition to those of the formulas.
     - `given`: whether rows of features that somebody gave (`given_rows`) may be among the points.
     - `engine`: `"native"`, or `"auto"` where it decides by `budget`, the simulations of the run,
       whether rows are simulated by native code; see `evaluation.native_engine`.
@@ -76,7 +77,7 @@ class Evaluator:
         executor: "Executor | None" = None,
         target: str | None = None,
         guidance: Guidance = NOTHING,
-        keep_traces: bool = False,
+        keep_traces: bool | tuple[str, ...] = False,
         given: bool = False,
         ends_raising: bool = False,
         engine: Wanted = "xla",
@@ -103,15 +104,16 @@ class Evaluator:
             from verifai_jax.evaluation import host_engine
 
             self.engine = self._host = host_engine.HostEngine(
-                problem, precision, journal, guidance=guidance, keep_traces=keep_traces,
-                given=self.given,
+                problem, precision, journal, guidance=guidance, given=self.given,
+                keep_traces=keep_traces is not False,
             )  # fmt: skip
         else:
-            guidance = guidance._replace(trace=keep_traces)
+            others = keep_traces if isinstance(keep_traces, tuple) else ()
+            guidance = guidance._replace(trace=keep_traces is not False, signals=others)
             self.engine = compiled = engine_for(
                 problem, batch, gradient, precision, clauses, guidance, self.given
             )
-            if engine != "xla" and precision == "float32" and not keep_traces:
+            if engine != "xla" and precision == "float32" and keep_traces is False:
                 from verifai_jax.evaluation import native_engine
 
                 self.engine = self._native = native_engine.NativeEngine(compiled, engine, budget)

@@ -170,7 +170,7 @@ class Series(Leaf):
 
 @dataclass(frozen=True)
 class SeriesValue:
-    """What a program has of a `TimeSeries`: `getSample()` returns the value of this step."""
+    """The value of a `TimeSeries` in a program: `getSample()` returns that of this step."""
 
     steps: tuple[Any, ...]
 
