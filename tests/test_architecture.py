@@ -268,7 +268,7 @@ def test_files_of_tests_have_names_of_their_own():
     assert sorted(names) == sorted(set(names))
 
 
-def test_tests_import_no_private_names_but_those_of_searches():
+def test_tests_import_no_private_names():
     """A test goes through what a room calls public, so that it survives a change inside."""
     found = []
     for file in sorted((ROOT / "tests").rglob("*.py")):
