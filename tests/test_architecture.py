@@ -24,6 +24,7 @@ LAYERS = (
         "certification",
         "analysis",
         "compositional",
+        "requirements",
     },
     {"failure_modes"},
     {"sweeps", "augmentation", "checking"},

@@ -1,0 +1,12 @@
+"""What simulations and searches say of requirements, for the questions that `mtl` asks.
+
+`vj.mtl.mine`, `lint`, `kill`, `distinguish` and `examples` take a problem instead of recordings.
+"""
+
+from verifai_jax.requirements.by_search import distinguish_by_search, mine_by_search, simulated
+
+__all__ = ["distinguish_by_search", "mine_by_search", "simulated"]
+
+
+def __dir__() -> list[str]:
+    return list(__all__)
