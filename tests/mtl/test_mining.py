@@ -156,3 +156,11 @@ def test_a_gap_and_periods_that_differ_are_refused():
         mtl.mine("always x > ?d", [trace(x=[1.0, 2.0]), trace(x=[1.0, np.nan])])
     with pytest.raises(ValueError, match=r"periods of 0\.1 s, 0\.2 s: resample"):
         mtl.mine("always[0, ?T] x > 0", [trace(x=[1.0]), trace(0.2, x=[1.0])])
+
+
+def test_a_front_is_drawn(tmp_path):
+    mined = mtl.mine("always[0, ?T] x > ?d", trace(x=[5.5, 6.1, 4.2, 9.7, 3.0]))
+    mined.plot(tmp_path / "front.png")
+    assert (tmp_path / "front.png").stat().st_size > 1000
+    with pytest.raises(ValueError, match="no front to draw"):
+        mtl.mine("always x > ?d", trace(x=[5.5, 6.1])).plot()

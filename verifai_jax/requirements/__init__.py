@@ -1,6 +1,6 @@
 """What simulations and searches say of requirements, for the questions that `mtl` asks.
 
-`vj.mtl.mine`, `lint`, `kill`, `distinguish` and `examples` take a problem instead of recordings.
+`vj.mtl.mine` takes a problem instead of recordings, and so does `vj.mtl.kill`.
 """
 
 from verifai_jax.requirements.by_search import distinguish_by_search, mine_by_search, simulated

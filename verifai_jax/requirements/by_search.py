@@ -1,8 +1,8 @@
 """Traces of a problem that answer a question about formulas: from its prior, and by falsification.
 
-    simulated(problem)                                  # 64 traces from the prior
-    mine_by_search(read_parametric("always x > ?d"), problem)
-    distinguish_by_search(a, b, problem)                # a trace on which they differ, or None
+simulated(problem)                                  # 64 traces from the prior
+mine_by_search(read_parametric("always x > ?d"), problem)
+distinguish_by_search(a, b, problem)                # a trace on which they differ, or None
 """
 
 from collections.abc import Mapping
