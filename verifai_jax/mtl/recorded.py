@@ -1,4 +1,4 @@
-"""What a formula is asked about: recordings as traces, files or tables, or a problem's simulations.
+"""Recordings that a formula is asked about: traces, files, tables, or simulations of a problem.
 
 as_recordings(["drive-1.csv", trace, frame])
 as_recordings(problem)                          # 64 simulations from its prior
@@ -28,7 +28,7 @@ class Simulated(Protocol):
 
 Recording: TypeAlias = Union[Trace, str, Path, "pd.DataFrame"]
 """One recording: a trace, the path of a file, or a table."""
-Recordings: TypeAlias = Union[Recording, Sequence[Recording], Simulated]
+Recordings: TypeAlias = Recording | Sequence[Recording] | Simulated
 """One recording or several, or a problem that is simulated."""
 
 

@@ -5,8 +5,9 @@ mine_by_search(read_parametric("always x > ?d"), problem)
 distinguish_by_search(a, b, problem)                # a trace on which they differ, or None
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
+
+import numpy as np
 
 from verifai_jax.core.trace import Trace
 from verifai_jax.falsification import falsify
@@ -30,8 +31,7 @@ def simulated(problem: Problem, count: int = SIMULATED, seed: int = 0) -> tuple[
     **Raises:** as `falsify`; `ValueError` where no simulation has a verdict.
     """
     run = falsify(problem, "uniform", count, seed=seed, confirm=False, progress=False)
-    table = run.table.all
-    rows = [int(row) for row in table.index[table["rho"].notna()]]
+    rows = np.flatnonzero(~np.isnan(run.table.all["rho"].to_numpy())).tolist()
     if not rows:
         raise ValueError(f"no simulation of problem {problem.name!r} has a verdict")
     return _traces(run, rows)
@@ -69,34 +69,16 @@ def mine_by_search(
     return replace(mined, searched=unbroken)
 
 
-def distinguish_by_search(
-    one: Formula, other: Formula, problem: Problem, budget: int = 2000, seed: int = 0
-) -> Trace | None:
-    """Search for a simulation on which exactly one of two formulas holds; None if none is found."""
-    run = _searched(problem, one.iff(other), budget, seed, stop_after=1)
-    failing = _failing(run)
-    return _traces(run, failing[:1])[0] if failing else None
-
-
-def _searched(
-    problem: Problem, formula: Formula, budget: int, seed: int, stop_after: int | None = None
-) -> Run:
-    spec: Mapping[str, Formula] = {"asked": formula}
-    return falsify(
-        replace(problem, spec=spec, priority=None),
-        "auto",
-        budget,
-        seed=seed,
-        stop_after=stop_after,
-        confirm=False,
-        progress=False,
-    )
+def _searched(problem: Problem, formula: Formula, budget: int, seed: int) -> Run:
+    asking = replace(problem, spec={"asked": formula}, priority=None)
+    return falsify(asking, "auto", budget, seed=seed, confirm=False, progress=False)
 
 
 def _failing(run: Run) -> list[int]:
     """Return the rows of counterexamples, the least robust first."""
     table = run.table.all
-    return [int(row) for row in table[table["violated"]].sort_values("rho").index]
+    order = np.argsort(table["rho"].to_numpy(), kind="stable")
+    return order[table["violated"].to_numpy()[order].astype(bool)].tolist()
 
 
 def _traces(run: Run, rows: list[int]) -> tuple[Trace, ...]:
