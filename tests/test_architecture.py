@@ -13,7 +13,7 @@ LAYERS = (
     {"core", "store", "statistics", "_version"},
     {"features", "mtl", "systems", "search", "clusters", "native_code"},
     {"rl", "problem", "perception", "events", "scenes", "blocks"},
-    {"evaluation", "policies"},
+    {"evaluation", "policies", "faults"},
     {"falsification"},
     {
         "comparison",
@@ -26,7 +26,7 @@ LAYERS = (
         "compositional",
         "requirements",
     },
-    {"failure_modes"},
+    {"failure_modes", "failure_table"},
     {"sweeps", "augmentation", "checking"},
     {"plotting"},
     {"reports"},

@@ -249,14 +249,21 @@ class Rounds:
         """
         with self.watch.on(CONFIRM):
             compiled = confirmer.compile_seconds
-            found = confirmer.check_round(columns, len(self.table))
+            rows, found = confirmer.check_round(columns, len(self.table))
             self.watch.move(confirmer.compile_seconds - compiled, COMPILE)
-        columns["verdict"] = found.verdict
+        count = len(columns["violated"])
+        columns["verdict"] = np.full(count, "", object)
+        columns["verdict"][rows] = found.verdict
         if self.problem.black_box:
-            columns["rho_again"] = found.rho.get("again", np.full(len(found), np.nan))
+            columns["rho_again"] = np.full(count, np.nan)
+            columns["rho_again"][rows] = found.rho.get("again", np.nan)
         self.checks = confirmer.check_names or self.checks
         refused, greatest = found.refuse()
-        return columns["violated"] & ~refused, np.where(refused, greatest, objective)
+        if not refused.any():
+            return columns["violated"], objective
+        claimed, objective = columns["violated"].copy(), objective.copy()
+        claimed[rows[refused]], objective[rows[refused]] = False, greatest[refused]
+        return claimed, objective
 
     @contextmanager
     def _searching(self) -> Iterator[None]:

@@ -21,6 +21,7 @@ from verifai_jax.core.forks import returning_once
 from verifai_jax.core.notebook import ForUsers
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.user_errors import format_user_error
+from verifai_jax.systems.channels import Link, Passing
 
 KnownSignals: TypeAlias = tuple[str, ...] | Mapping[str, int] | None
 """Names of signals, or names with their numbers of components, 1 for a scalar; None if unknown."""
@@ -86,9 +87,9 @@ class System(ForUsers):
     _internal = frozenset((
         "abstract", "backend", "backends", "black_box", "can_fold", "can_refine",
         "can_simulate_batch", "can_simulate_each", "constants", "derived", "effort", "exact_step",
-        "fold", "forward_up_to", "known_signals", "lanes", "likely", "may_draw", "refined",
-        "renewed", "reverse_hint", "simulate_batch", "simulate_each", "switches", "traced_factor",
-        "unroll", "why_error", "why_not", "with_backend",
+        "fold", "forward_up_to", "known_signals", "lanes", "likely", "links", "may_draw", "passing",
+        "refined", "renewed", "reverse_hint", "simulate_batch", "simulate_each", "switches",
+        "traced_factor", "unroll", "why_error", "why_not", "with_backend", "with_links",
     ))  # fmt: skip
 
     black_box: bool = False
@@ -214,6 +215,26 @@ class System(ForUsers):
         """
         return None
 
+    def passing(self, features: Features) -> Passing:
+        """Return what passes between the system and its policy, where faults can be.
+
+        **Arguments:**
+
+        - `features`: `jax.ShapeDtypeStruct`s.
+
+        **Raises:** `ValueError` for a system that has no policy or controller that is known here.
+        """
+        raise ValueError(
+            f"{self!r} has no loop of which observations and actions are known, so that no fault "
+            "can be put in it: make the system by vj.ode, mujoco, brax, gymnax, gymnasium or "
+            "playground, or apply the faults in the simulator and say with_faults(..., "
+            "by_simulator=True)"
+        )
+
+    def with_links(self, links: tuple[Link, ...]) -> "System":
+        """Return the same system with faults between it and its policy; see `passing`."""
+        raise NotImplementedError(f"{self!r} has no with_links(links)")
+
     def may_draw(self, features: Features) -> bool:
         """Return whether a simulation of a host system may depend on its random key.
 
@@ -331,6 +352,12 @@ class FunctionSystem(System):
         if self._offers("why_not"):
             return self._method("why_not")(backend)
         return super().why_not(backend)
+
+    def passing(self, features: Features) -> Passing:
+        return self._method("passing")(features)
+
+    def with_links(self, links: tuple[Link, ...]) -> System:
+        return as_system(self._method("with_links")(links))
 
     def may_draw(self, features: Features) -> bool:
         return self._method("may_draw")(features)
