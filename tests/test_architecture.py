@@ -24,6 +24,7 @@ LAYERS = (
         "certification",
         "analysis",
         "compositional",
+        "requirements",
     },
     {"failure_modes", "failure_table"},
     {"sweeps", "augmentation", "checking"},

@@ -10,6 +10,7 @@ from verifai_jax.mtl.evaluate import End, IntervalError
 from verifai_jax.mtl.expression import Expression, signal
 from verifai_jax.mtl.formula import FALSE, TRUE, Formula
 from verifai_jax.mtl.grammar import FormulaSyntaxError
+from verifai_jax.mtl.mining import Mined, mine
 from verifai_jax.mtl.normalization import anneal, normalize
 from verifai_jax.mtl.operators import (
     always,
@@ -30,11 +31,11 @@ from verifai_jax.mtl.setting import HorizonError, SamplingError
 
 __all__ = [
     "FALSE", "TRUE", "End", "Explanation", "Expression", "Formula", "FormulaSyntaxError",
-    "HorizonError", "IntervalError", "Online", "SamplingError", "Semantics", "SmoothingError",
-    "TimeColumnError", "always", "anneal", "boolean", "draw", "eventually", "explain", "hard",
-    "historically", "latex", "next_", "nnf", "normalize", "once", "online", "parse", "prev",
-    "read", "resample", "robustness", "robustness_signal", "satisfied", "signal", "simplify",
-    "since", "smooth", "smoothing_error", "until",
+    "HorizonError", "IntervalError", "Mined", "Online", "SamplingError", "Semantics",
+    "SmoothingError", "TimeColumnError", "always", "anneal", "boolean", "draw", "eventually",
+    "explain", "hard", "historically", "latex", "mine", "next_", "nnf", "normalize", "once",
+    "online", "parse", "prev", "read", "resample", "robustness", "robustness_signal",
+    "satisfied", "signal", "simplify", "since", "smooth", "smoothing_error", "until",
 ]  # fmt: skip
 
 
