@@ -25,6 +25,9 @@ DECIMAL_COMMAS = r"^\s*[-+]?\d*(,\d*)?([eE][-+]?\d+)?\s*$"
 THOUSANDS = r"^\s*[-+]?(\d{1,3}|[1-9]\d{0,2},\d{3})\s*$"
 """Numbers in which a comma, where there is one, may stand between thousands, `1,500`."""
 
+ENDINGS = (".csv", ".parquet")
+"""Endings of files that are recordings."""
+
 
 class TimeColumnError(ValueError):
     """A recording without the column of its sample times.
