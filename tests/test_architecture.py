@@ -13,7 +13,7 @@ LAYERS = (
     {"core", "store", "statistics", "_version"},
     {"features", "mtl", "systems", "search", "clusters", "native_code"},
     {"rl", "problem", "perception", "events", "scenes", "blocks"},
-    {"evaluation", "policies"},
+    {"evaluation", "policies", "faults"},
     {"falsification"},
     {
         "comparison",
@@ -25,7 +25,7 @@ LAYERS = (
         "analysis",
         "compositional",
     },
-    {"failure_modes"},
+    {"failure_modes", "failure_table"},
     {"sweeps", "augmentation", "checking"},
     {"plotting"},
     {"reports"},

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from verifai_jax import blocks as blocks
     from verifai_jax import clusters as clusters
     from verifai_jax import events as events
+    from verifai_jax import faults as faults
     from verifai_jax import mtl as mtl
     from verifai_jax import perception as perception
     from verifai_jax import policies as policies
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
     from verifai_jax.failure_modes import Mode as Mode
     from verifai_jax.failure_modes import Modes as Modes
     from verifai_jax.failure_modes import modes as modes
+    from verifai_jax.failure_table import FailureTable as FailureTable
+    from verifai_jax.failure_table import fmea as fmea
     from verifai_jax.falsification import ErrorTable as ErrorTable
     from verifai_jax.falsification import Replay as Replay
     from verifai_jax.falsification import Run as Run

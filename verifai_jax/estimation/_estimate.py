@@ -216,6 +216,7 @@ def _result(
         precision=precision,
         backend=backend,
         seconds=seconds,
+        stopped=limit_state.ended,
         drawn=answer.drawn,
     )
 

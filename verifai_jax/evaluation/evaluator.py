@@ -8,6 +8,8 @@ evaluator takes the engine that suits the problem, compiled or on the host, or s
 workers of an executor. Each simulation has a random key of its own, by its number.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -19,6 +21,7 @@ from verifai_jax.core.progress import count_done
 from verifai_jax.evaluation.engine import Engine, Wanted, engine_for
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.raising import ALIKE, Raising
+from verifai_jax.evaluation.unfinished import Part, present
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 
@@ -119,6 +122,8 @@ class Evaluator:
         self._padded_to = power_of_two(batch) if ends_raising else 1
         self.key: Key[Array, ""] = run_keys(seed)[1]
         self.simulations = 0
+        self._mode = (precision, gradient, clauses, given, seed)
+        self._kept: Part | None = None
 
     @property
     def compile_seconds(self) -> float:
@@ -176,7 +181,12 @@ class Evaluator:
         count, parts = len(u), []
         if self._sender is not None and count:
             self.simulations = start + count
-            verdicts = self._sender.evaluate(u, self.key, start, temperature)
+            verdicts = self._recall_or(
+                u,
+                start,
+                temperature,
+                partial(self._sender.evaluate, u, self.key, start, temperature),
+            )
             count_done(count)
             self._check_raising(verdicts)
             return verdicts
@@ -190,15 +200,16 @@ class Evaluator:
             points = u if block.stop - block.start >= count else u[block]
             if points.dtype != self._dtype:
                 points = np.asarray(points, self._dtype)
+            first_row = start + begin
             if self._host is not None:
-                verdicts = self._host.evaluate(
-                    points, self.key, start + begin, some,
+                simulate = partial(
+                    self._host.evaluate, points, self.key, first_row, some,
                     padded_to=max(padded_to, self._padded_to), keep_traces=keep_traces,
                     journals=journals,
                 )  # fmt: skip
             else:
-                verdicts = self.engine.evaluate(points, self.key, start + begin, some)
-            parts.append(verdicts)
+                simulate = partial(self.engine.evaluate, points, self.key, first_row, some)
+            parts.append(self._recall_or(points, first_row, some, simulate))
             count_done(len(points))
             self._check_raising(parts[-1])
             begin = block.stop
@@ -206,6 +217,29 @@ class Evaluator:
         if not parts:
             return Verdicts.nothing(len(self.problem.formulas), self.problem.space.dim)
         return Verdicts.concatenate(parts)
+
+    def _recall_or(
+        self,
+        points: Float[Any, "n d"],
+        first: int,
+        temperature: Float[np.ndarray, " n"] | float,
+        simulate: Callable[[], Verdicts],
+    ) -> Verdicts:
+        """Return the verdicts of work that goes on where an earlier process was killed."""
+        work = present()
+        if work is None:
+            return simulate()
+        if self._kept is None or self._kept.of is not work:
+            self._kept = work.part(self.problem, *self._mode)
+        if self._host is not None and not self._host.system.can_simulate_batch:
+            # One by one, which is worth more the longer a simulation takes.
+            self._host.journal = self._kept.journal
+            verdicts = simulate()
+            self._kept.settle()
+            return verdicts
+        return self._kept.recall_or(
+            np.asarray(points), np.arange(first, first + len(points)), temperature, simulate
+        )
 
     def submit(self, u: Float[Any, "n d"], first: int) -> "Pending":
         """Send points to the workers of the executor; `result` of what it returns waits for them.

@@ -149,8 +149,7 @@ def modes(
         held = _under_keys(simulated, limit_state)
         divided = _divide(limit_state, held, rng, answer, _failures_of(source), problem.black_box)
     bound = answer.prior.upper_bound(confidence)
-    listed, rest, run, unexplained = (), 0.0, None, (0.0, 1.0)
-    notes = list(answer.notes)
+    listed, rest, run, unexplained, notes = (), 0.0, None, (0.0, 1.0), list(answer.notes)
     if limit_state.own_chance:
         notes.insert(
             0,
@@ -189,6 +188,7 @@ def modes(
         seconds=time.perf_counter() - started,
         sources=sources.settled(begun).to_json(),
         changed=changed,
+        stopped=limit_state.ended,
     )
 
 

@@ -276,13 +276,14 @@ class FeatureSpace(PointMaps, ForUsers):
             for name, domain in self.root.fields
             if name not in features and domain.held_at is None
         ]
-        missing = [name for name in others if name not in (nominal or {})]
+        nominal = self.completed(nominal or {})
+        missing = [name for name in others if name not in nominal]
         if missing:
             raise ValueError(
                 f"features that do not vary need a nominal value; {', '.join(missing)} "
                 f"{'has' if len(missing) == 1 else 'have'} none"
             )
-        return self.fixed(**{name: (nominal or {})[name] for name in others})
+        return self.fixed(**{name: nominal[name] for name in others})
 
     def refined(self, factor: int) -> "tuple[FeatureSpace, Callable[[dict], dict]]":
         """Return the space with finer signals, and a map of features to it.

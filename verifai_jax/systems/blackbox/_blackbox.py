@@ -33,6 +33,7 @@ from verifai_jax.systems.base import (
 )
 from verifai_jax.systems.blackbox.trace_form import SignalNames, TraceForm
 from verifai_jax.systems.blackbox.workers import Pool
+from verifai_jax.systems.channels import Link, Passing
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +94,21 @@ class _RowByRow(System):
         """True for a simulator that says that its step is part of the system."""
         return as_system(self.simulation.function).exact_step
 
+    def passing(self, features: Features) -> Passing:
+        """Return what passes in the loop of the simulator, if it has one that is known."""
+        return as_system(self.simulation.function).passing(features)
+
+    def with_links(self, links: tuple[Link, ...]) -> System:
+        """Return the same simulator with faults in its loop."""
+        simulation = replace(
+            self.simulation, function=_bare(as_system(self.simulation.function).with_links(links))
+        )
+        return self._with(simulation)
+
+    def _with(self, simulation: Simulation) -> System:
+        """Return the same system with another simulation."""
+        raise NotImplementedError
+
 
 @dataclass(frozen=True, eq=False)
 class BlackBox(_RowByRow):
@@ -106,6 +122,9 @@ class BlackBox(_RowByRow):
         - `key`: a JAX random key, or an integer seed.
         """
         return self.simulation(plain_leaves(features), seed_of(key))
+
+    def _with(self, simulation: Simulation) -> System:
+        return BlackBox(simulation)
 
     @property
     def can_refine(self) -> bool:
@@ -142,6 +161,11 @@ class PooledBlackBox(_RowByRow):
     ) -> Iterator[tuple[int, Outcome]]:
         """Simulate each row in a worker; see `System.simulate_each`."""
         return self.pool.outcomes(features, seeds)
+
+    def _with(self, simulation: Simulation) -> System:
+        pool = self.pool
+        options = (pool.workers, pool.timeout, pool.retries, pool.fresh)
+        return PooledBlackBox(simulation, Pool(simulation, simulation.function, *options))
 
     def renewed(self) -> "PooledBlackBox":
         """Return the same simulator in worker processes of its own."""
@@ -369,10 +393,13 @@ def _plain(leaf: object) -> Any:
 
 
 def _finer(function: Callable[..., Trace], factor: int) -> Callable[..., Trace]:
-    finer = as_system(function).refined(factor)
-    return finer.function if isinstance(finer, FunctionSystem) else finer
+    return _bare(as_system(function).refined(factor))
 
 
 def _renewed(function: Callable[..., Trace]) -> Callable[..., Trace]:
-    made = as_system(function).renewed()
-    return made.function if isinstance(made, FunctionSystem) else made
+    return _bare(as_system(function).renewed())
+
+
+def _bare(system: System) -> Callable[..., Trace]:
+    """Return the function of a system that was made of one, which errors speak of."""
+    return system.function if isinstance(system, FunctionSystem) else system

@@ -56,7 +56,7 @@ def rollout(loop: Loop, features: Features, key: Seed) -> Trace:
         sensordata=blank.sensordata,
     )
 
-    progress = loop.initial_progress()
+    progress = loop.initial_progress(features, key)
     arrays = {name: jnp.zeros(shape, physics.qpos.dtype) for name, shape in loop.shapes.items()}
     form: Sample = jax.eval_shape(
         lambda: loop.sample(jnp.int32(0), arrays, progress, features)[0],
@@ -130,7 +130,7 @@ def rollout(loop: Loop, features: Features, key: Seed) -> Trace:
         signals,
         dt=loop.control_period,
         valid=progress.age + 1 if ends else None,
-        status=jnp.where(loop.delay.valid(features), status, jnp.int32(Status.ERROR)),
+        status=jnp.where(loop.channels(features).valid(), status, jnp.int32(Status.ERROR)),
         held=ends,
         finite=loop.finite_signals(),
     )
