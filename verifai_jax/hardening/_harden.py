@@ -29,12 +29,12 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import reproducible_settings
 from verifai_jax.core.progress import say_done, shows_progress
 from verifai_jax.features import Categorical
-from verifai_jax.hardening.arms import FunctionArms, Mix, TaskArms
-from verifai_jax.hardening.collecting import Collected, collect
+from verifai_jax.hardening.arms import Arms, Mix
+from verifai_jax.hardening.collecting import Collected, collect, end_if_interrupted
 from verifai_jax.hardening.mixture import HardeningError, Start, mixture_of
 from verifai_jax.hardening.result import BASELINE, HARDENED, Hardening
 from verifai_jax.problem.problem import Problem
-from verifai_jax.rl import Algorithm, evaluate
+from verifai_jax.rl import Algorithm, Task, evaluate
 from verifai_jax.search import Search
 from verifai_jax.statistics.confidence_sequences import safe_at
 from verifai_jax.store.cache import Cache, locked_cache
@@ -68,6 +68,19 @@ class Plan:
     episodes: int
     baseline: bool
     seed: int
+
+    def __post_init__(self) -> None:
+        for name in ("rounds", "further_steps", "added", "episodes"):
+            check_count(name, getattr(self, name))
+        check_count("seed", self.seed, 0)
+        for name in ("p", "confidence"):
+            check_fraction(name, getattr(self, name))
+        for name in ("own", "failing", "tolerance"):
+            check_fraction(name, getattr(self, name), zero=True)
+        if self.own + self.failing > 1:
+            raise ValueError(
+                f"own and failing are shares of all episodes; got {self.own} + {self.failing} > 1"
+            )
 
     def seed_for(self, purpose: int, stage: int = 0) -> int:
         """Return the seed of a purpose, of which no two share their samples."""
@@ -153,21 +166,12 @@ def harden(
     """
     made = _as_study(study, problem, algorithm, p)
     trainer, values = made.trainer, dict(hyperparameters or {})
-    first_steps = trainer.steps if steps is None else check_count("steps", steps)
+    first_steps = check_count("steps", trainer.steps if steps is None else steps)
     further = max(1, first_steps // 4) if further_steps is None else further_steps
     plan = Plan(
-        check_count("rounds", rounds), first_steps, check_count("further_steps", further),
-        made.p if p is None else p, confidence, samples, attack, attack_simulations,
-        check_count("added", added), own, failing, tolerance, episodes, baseline, seed,
+        rounds, first_steps, further, made.p if p is None else p, confidence, samples, attack,
+        attack_simulations, added, own, failing, tolerance, episodes, baseline, seed,
     )  # fmt: skip
-    for name, share in (("p", plan.p), ("confidence", confidence)):
-        check_fraction(name, share)
-    for name, share in (("own", own), ("failing", failing), ("tolerance", tolerance)):
-        check_fraction(name, share, zero=True)
-    if own + failing > 1:
-        raise ValueError(f"own and failing are shares of all episodes; got {own} + {failing} > 1")
-    check_count("episodes", episodes)
-    check_count("seed", seed, 0)
     untrained = made.problem(trainer.untrained_policy(trainer.algorithm_name(values)))
     untrained.check()
     with locked_cache(folder, KIND) as cache:
@@ -197,18 +201,10 @@ class Work:
         self.arms_named = (HARDENED, BASELINE) if plan.baseline else (HARDENED,)
         stages = [plan.steps + stage * plan.further_steps for stage in range(plan.rounds + 1)]
         trainer, space = study.trainer, untrained.space
-        if isinstance(trainer, FunctionTrainer):
-            self.task = trainer.evaluation_task
-            self.arms: TaskArms | FunctionArms = FunctionArms(
-                study, values, stages, plan.seed, cache, space, self.arms_named
-            )
-        else:
-            configured = trainer.configuration(values, plan.seed).task
-            self.task = configured if trainer.nominal is None else trainer.nominal
-            mixture = mixture_of(configured, untrained, start)
-            self.arms = TaskArms(
-                trainer, values, stages, plan.seed, cache, mixture, self.arms_named
-            )
+        configured = trainer.configuration(values, plan.seed).task
+        self.task = configured if trainer.nominal is None else trainer.nominal
+        mixture = mixture_of(configured, untrained, start)
+        self.arms = Arms(trainer, values, stages, plan.seed, cache, mixture, self.arms_named)
         self.stages = stages
         self.points = np.zeros((0, space.dim), np.float32)
         self.rows: list[dict[str, Any]] = []
@@ -244,6 +240,7 @@ class Work:
             attack_simulations=plan.attack_simulations, tie=plan.p, progress=False,
             remember=self.cache.remember,
         )  # fmt: skip
+        end_if_interrupted(certificates)
         for number, (arm, policy) in enumerate(zip(self.arms_named, policies, strict=True)):
             self.policies[arm, stage] = policy
             self.returns[arm, stage] = self._returns(policy)
@@ -274,10 +271,11 @@ class Work:
             )  # fmt: skip
             return {name: np.asarray(value) for name, value in found._asdict().items()}
 
-        found = Collected(**self.cache.remember(f"collected/{stage}", compute))
+        known = self.cache.remember(f"collected/{stage}", compute)
+        found = Collected(known["points"], known["sources"], int(known["simulations"]))
         self.points = np.concatenate([self.points, found.points])
         row = self.rows[-len(self.arms_named)]
-        row["added"], row["cost"] = len(found.points), row["cost"] + int(found.simulations)
+        row["added"], row["cost"] = len(found.points), row["cost"] + found.simulations
         if len(found.points):
             columns = space.rows(space.features_at(found.points))
             self.added.append(pd.DataFrame(columns).assign(round=stage, source=found.sources))
@@ -289,8 +287,6 @@ class Work:
         self.arms.mix(stage + 1, mixes)
 
     def _returns(self, policy: Any) -> np.ndarray:
-        if self.task is None:
-            return np.full(1, np.nan)
         seed, episodes = self.plan.seed_for(RETURNS), self.plan.episodes
         return np.asarray(evaluate(self.task, policy, seed=seed, episodes=episodes), np.float64)
 
@@ -317,20 +313,20 @@ class Work:
                 confidence=plan.confidence, budget=16 * plan.samples,
                 seed=plan.seed_for(COMPARED), progress=False,
             )  # fmt: skip
+            end_if_interrupted(comparison)
             if comparison.regression:
                 notes.append(
                     "the paired comparison shows that the policy of round "
                     f"{chosen[HARDENED]} fails more often, so that the first one is returned"
                 )
                 chosen[HARDENED] = 0
-        if self.task is None:
-            notes.append("returns are not known: a function that trains needs nominal= for them")
         finalists = [start, *(self.policies[arm, at] for arm, at in chosen.items())]
         final = certify(
             self.study.problem, finalists, p=plan.p, confidence=plan.confidence,
             samples=4 * plan.samples, seed=plan.seed_for(FINAL), attack_simulations=0,
             tie=plan.p, progress=False, remember=self.cache.remember,
         )  # fmt: skip
+        end_if_interrupted(final)
         return Hardening(
             problem=self.untrained.name,
             table=pd.DataFrame(self.rows),
@@ -358,6 +354,14 @@ def _as_study(
     algorithm: Algorithm | None,
     p: float | None,
 ) -> Study:
+    trainer = given.trainer if isinstance(given, Study) else given
+    is_function = callable(trainer) and not isinstance(trainer, Task | type)
+    if is_function or isinstance(trainer, FunctionTrainer):
+        name = getattr(trainer, "name", getattr(trainer, "__name__", "it"))
+        raise HardeningError(
+            f"harden says where the episodes of a training begin, which it cannot for the function "
+            f"{name}: give a task and one of the algorithms of verifai_jax.rl"
+        )
     if isinstance(given, Study):
         if problem is not None or algorithm is not None:
             raise ValueError("a Study has a problem and algorithms; give no others")
@@ -366,12 +370,10 @@ def _as_study(
         raise HardeningError(
             "harden needs problem=, a function from a policy to the Problem of its closed loop"
         )
-    if isinstance(given, Trainer):
-        if algorithm is not None:
-            raise ValueError("a Trainer has algorithms; give no other")
-        trainer = given
-    else:
+    if not isinstance(trainer, Trainer):
         trainer = Trainer(given) if algorithm is None else Trainer(given, algorithm)
+    elif algorithm is not None:
+        raise ValueError("a Trainer has algorithms; give no other")
     space = {"steps": Categorical(trainer.steps)}
     return Study(trainer.name, space, trainer, problem, p=0.01 if p is None else p)
 

@@ -8,7 +8,7 @@ samples; that table has rules, and its worst rows are shrunk. The attack's failu
 the search's own proposal, so that their neighbourhoods stand for it.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import numpy as np
@@ -68,6 +68,7 @@ def collect(
     uniform = np.asarray(space.points_at(space.sample(jax.random.key(seed), table)))
     points_to_run = np.concatenate([known, uniform])
     run = falsify(problem, PointList(points_to_run), len(points_to_run), seed=seed, progress=False)
+    end_if_interrupted(run)
     simulations, confirmed = run.simulations, run.table.counterexamples
     if shrunk and len(confirmed):
         worst = np.linspace(0, len(confirmed) - 1, shrunk).astype(int)
@@ -76,6 +77,7 @@ def collect(
                 small = shrink(run, int(row), budget=SHRINKING, others=False, progress=False)
             except ValueError:
                 continue  # No nominal features, or a failure of its own random key alone.
+            end_if_interrupted(small)
             add(small.u[None], "shrunk")
             simulations += small.simulations
     if len(confirmed):
@@ -90,3 +92,14 @@ def collect(
         kept = confirmed.iloc[: added - len(sources)]
         add(space.points(kept), "counterexample")
     return Collected(np.concatenate(points), np.array(sources, np.str_), simulations)
+
+
+class _Stopped(Protocol):
+    @property
+    def stopped(self) -> str | None: ...
+
+
+def end_if_interrupted(result: _Stopped) -> None:
+    """Raise again the Ctrl-C that a result ended early by: part of it is no round's number."""
+    if result.stopped == "interrupted":
+        raise KeyboardInterrupt

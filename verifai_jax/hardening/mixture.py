@@ -9,7 +9,7 @@ training serves all rounds, whatever was found in them.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -120,7 +120,7 @@ class MixtureTask:
 
     def started(self, key: Key[Array, ""], u: Float[Array, " d"]) -> State:
         """Start an episode with the features at a point of the unit cube."""
-        start = self.task.start if self.starting is None else self.starting
+        start = cast(Any, self.task).start if self.starting is None else self.starting
         return start(key, self.space.unflatten(u))
 
     def step(

@@ -104,7 +104,7 @@ class Hardening(Drawn, InNotebook):
 
     def summary(self) -> str:
         """Write what was gained, what was lost and what it cost."""
-        rounds = int(self.table["round"].max())
+        rounds = len(self.table["round"].unique()) - 1
         sure = f"{100 * self.options['confidence']:zg} %"
         lines = [
             f"{self.problem}: hardened in {rounds} round{'s' * (rounds != 1)} "
@@ -131,8 +131,8 @@ class Hardening(Drawn, InNotebook):
         own = self.table.loc[self.table["arm"] == HARDENED]
         added = [f"{count} of kind {source}" for source, count in self._sources.items()]
         lines.append(
-            f"  added {', '.join(added) or 'nothing'}; {int(own['steps'].max()):,} environment "
-            f"steps, {int(own['cost'].sum()):,} simulations, {self.seconds:z.0f} s"
+            f"  added {', '.join(added) or 'nothing'}; {max(own['steps']):,} environment "
+            f"steps, {sum(own['cost']):,} simulations, {self.seconds:z.0f} s"
         )
         return "\n".join([*lines, *(f"  note: {note}" for note in self.notes)])
 
