@@ -115,12 +115,14 @@ class Hardening(Drawn, InNotebook):
             named.append((f"randomised (round {self.chosen[BASELINE]})", self.baseline, BASELINE))
         for name, one, arm in named:
             lines.append(f"  {name + ':':<9} {_chance(one)}; {self._return(arm)}")
-        lines.append(f"  the intervals hold together with {sure}, on samples trained on by none")
+        lines.append(
+            f"  the intervals hold together with {sure}, on samples that nothing was trained on"
+        )
         before, after = self.before.rate, self.after.rate
         if before is not None and after is not None and self.chosen[HARDENED]:
             by_bounds = before.low / after.high if after.high else float("inf")
             lines.append(
-                f"  the failure probability is {self.times_safer:z.3g} times lower, "
+                f"  the failure probability before is {self.times_safer:z.3g} times that after, "
                 f"{by_bounds:z.3g} times at least by the intervals"
             )
         if self.comparison is not None:

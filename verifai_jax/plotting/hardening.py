@@ -25,13 +25,14 @@ def plot_hardening(result: Hardening, path: str | Path | None = None) -> Figure:
         spread = [rate - 100 * rows["failure_low"], 100 * rows["failure_high"] - rate]
         left.errorbar(at, rate, spread, color=color, marker="o", ms=4, label=arm, capsize=2)
         right.plot(at, rows["return"], color=color, marker="o", ms=4, label=arm)
-    left.axhline(100 * result.options["p"], color=BOUND, linewidth=0.8, linestyle=":")
+    left.axhline(100 * result.options["p"], color=BOUND, linewidth=0.8, linestyle=":", label="p")
     left.set_yscale("symlog", linthresh=0.1)
     left.set_ylim(bottom=0)
     left.set_ylabel("failure probability (%)")
     right.set_ylabel("mean return")
     for axes in (left, right):
         axes.set_xlabel("round")
+        axes.xaxis.get_major_locator().set_params(integer=True)
         axes.legend(frameon=False, fontsize=8)
         tidy(axes)
     figure.suptitle(result.problem, fontsize=10)
