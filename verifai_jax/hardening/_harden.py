@@ -90,7 +90,7 @@ class Plan:
 
 @suggests_options
 @reproducible_settings()
-@shows_progress("hardening", "rounds")
+@shows_progress("hardening")
 def harden(
     study: Study | Trainer | object,
     problem: Callable[[Any], Problem] | None = None,
@@ -216,9 +216,9 @@ class Work:
         """Play rounds until the certificate holds or the budget ends."""
         began, plan, stopped = time.perf_counter(), self.plan, "budget"
         for stage in range(plan.rounds + 1):
+            # The verbs of a round count their simulations in the same line.
+            say_done(0, figures=f"round {stage} of {plan.rounds}")
             certificates = self._stage(stage)
-            row = self.rows[-len(self.arms_named)]
-            say_done(stage, plan.rounds, f"{row['failures']} of {row['simulations']} fail")
             if certificates[0].verdict == safe_at(plan.p) and self._keeps_return(HARDENED, stage):
                 stopped = "certified"
                 break
