@@ -250,7 +250,7 @@ class Gradient(Search[GradientState]):
         # A goal of a single clause needs none; it is the same for all rows.
         several = jnp.any(state.known & (state.clauses[:, 1] > NOTHING))
         halvings = jnp.where(several, HALVINGS, 0)
-        solve = jax.vmap(_minimax, in_axes=(0, 0, 0, 0, None, None))
+        solve = jax.vmap(minimax_direction, in_axes=(0, 0, 0, 0, None, None))
         tried = solve(clauses, gradients, point, box, free, halvings)
         stays = jnp.max(jnp.abs(tried - point), axis=1, initial=0.0) < 1e-6
         flip = jax.vmap(_flip, in_axes=(0, 0, 0, 0, None))
@@ -394,7 +394,7 @@ def _rows(chosen: Bool[Array, " n"], new: Array, old: Array) -> Array:
     return jnp.where(chosen.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
 
 
-def _minimax(
+def minimax_direction(
     clauses: Float[Array, " clauses"],
     gradients: Float[Array, "clauses d"],
     point: Float[Array, " d"],
