@@ -168,7 +168,7 @@ class _Rows(Journal):
 
 
 def present() -> Unfinished | None:
-    """Return the work whose simulations are kept now; None where nobody wants that."""
+    """Return the work whose simulations are kept now, or None if there is none."""
     return _PRESENT.get()
 
 
