@@ -184,7 +184,7 @@ class HostEngine:
         **Arguments:**
 
         - `features`: `[n, ...]` each.
-        - `seeds`: of the simulations.
+        - `seeds`: the seeds of the simulations.
         - `keys`: that the seeds are made of, which a system needs that simulates batches.
         """
         with in_precision(self.precision):

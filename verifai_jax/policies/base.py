@@ -43,7 +43,8 @@ class Actions:
 
     - `kind`: one of `ACTIONS`.
     - `low`, `high`: bounds of each entry of the action; for `clip`, `scale` and `tanh`.
-    - `counts`: of several choices the number of each, in the order of the outputs; for `argmax`.
+    - `counts`: the number of options of each of several choices, in the order of the outputs; for
+      `argmax`.
 
     **Raises:** `UnknownNameError` for another kind; `PolicyError` for bounds that are missing or
     do not fit.
@@ -155,7 +156,8 @@ class Policy:
         **Arguments:**
 
         - `observation`: one observation, or a batch for a network of vectors.
-        - `memory`: of a policy that remembers; `initial_memory` at the start of an episode.
+        - `memory`: the memory of a policy that remembers; `initial_memory` at the start of an
+          episode.
 
         **Raises:** `TypeError` for a memory that is missing, or that it does not have.
         """

@@ -392,10 +392,10 @@ def gymnasium(
     - `policy`: `observation -> action`, or an object with a method `act` that is one, such as an
       `rl.Policy`. An argument `features` gets the features of the instant. One that remembers
       something has a method `reset()`, called before each episode.
-    - `steps`: of the episode at most. The trace has a sample after the reset and after each step;
-      the last valid one is that at which the environment terminates or is truncated (by its own
-      time limit, too). Each sample has the action that is taken there, and the reward of the step
-      that led there.
+    - `steps`: the maximum number of steps of the episode. The trace has a sample after the reset
+      and after each step; the last valid one is that at which the environment terminates or is
+      truncated (by its own time limit, too). Each sample has the action that is taken there, and
+      the reward of the step that led there.
     - `signals`: names of all entries of the observation, or `{name: index or key of it}`; `action`
       and `reward` come along. Or a function `(env, observation, action, reward, features) -> dict`.
       When left out: `observation`, `action` and `reward`.

@@ -211,8 +211,8 @@ def policy_function(policy: object, memory: PyTree = None) -> Decide:
     - `policy`: a function of the observation, or of `(observation, key)` for a random one; or an
       object with a method `act` that is one, such as `rl.Policy`. It is given a key if that many
       arguments have no default, and the features of the instant if one is called `features`.
-    - `memory`: of a policy with memory at first. It is then called with `(observation, memory)` or
-      `(observation, memory, key)` and returns `(action, memory)`.
+    - `memory`: the memory of a policy with memory at first. It is then called with `(observation,
+      memory)` or `(observation, memory, key)` and returns `(action, memory)`.
 
     **Raises:** `ValueError` for something that cannot be called so.
     """

@@ -199,7 +199,7 @@ def loop_options(
 
     **Arguments:**
 
-    - `delays`: of observations and of actions.
+    - `delays`: the delays of observations and of actions.
     - `configured`, `started`: what `configure`, and a function `initial`, is called with first.
 
     **Raises:** `ValueError` for an option that cannot be used.
