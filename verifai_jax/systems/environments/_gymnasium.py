@@ -2,7 +2,6 @@
 
     gymnasium("CartPole-v1", policy, steps=200, signals=("x", "x_dot", "theta", "theta_dot"),
               features=("masspole", "length"), reset=start)
-    gymnasium("Pendulum-v1", policy, steps=200, workers=4, timeout=10.0)
     gymnasium(make_my_environment, policy, steps=500, configure=place_obstacles)
 
 One trace is one episode: it is never reset within.
