@@ -45,6 +45,7 @@ class Actions:
     - `low`, `high`: bounds of each entry of the action; for `clip`, `scale` and `tanh`.
     - `counts`: the number of options of each of several choices, in the order of the outputs; for
       `argmax`.
+    - `shape`: the shape of an action with bounds; a vector when left out.
 
     **Raises:** `UnknownNameError` for another kind; `PolicyError` for bounds that are missing or
     do not fit.
@@ -54,6 +55,7 @@ class Actions:
     low: tuple[float, ...] = ()
     high: tuple[float, ...] = ()
     counts: tuple[int, ...] = ()
+    shape: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         check_names("action", [self.kind], ACTIONS)
@@ -82,10 +84,11 @@ class Actions:
         if self.kind == "outputs":
             return outputs
         low, high = (np.asarray(bounds, outputs.dtype) for bounds in (self.low, self.high))
-        if self.kind == "clip":
-            return jnp.clip(outputs, low, high)
-        unit = jnp.tanh(outputs) if self.kind == "tanh" else outputs
-        return jnp.clip((high + low) / 2 + (high - low) / 2 * unit, low, high)
+        if self.kind != "clip":
+            unit = jnp.tanh(outputs) if self.kind == "tanh" else outputs
+            outputs = (high + low) / 2 + (high - low) / 2 * unit
+        action = jnp.clip(outputs, low, high)
+        return action.reshape(*action.shape[:-1], *self.shape) if self.shape else action
 
 
 @jax.tree_util.register_dataclass
