@@ -84,10 +84,11 @@ class Actions:
         if self.kind == "outputs":
             return outputs
         low, high = (np.asarray(bounds, outputs.dtype) for bounds in (self.low, self.high))
-        if self.kind != "clip":
+        if self.kind == "clip":
+            action = jnp.clip(outputs, low, high)
+        else:
             unit = jnp.tanh(outputs) if self.kind == "tanh" else outputs
-            outputs = (high + low) / 2 + (high - low) / 2 * unit
-        action = jnp.clip(outputs, low, high)
+            action = jnp.clip((high + low) / 2 + (high - low) / 2 * unit, low, high)
         return action.reshape(*action.shape[:-1], *self.shape) if self.shape else action
 
 
