@@ -200,7 +200,6 @@ def save_counterexamples(
     ordered = claimed.sort_values("rho", kind="stable")
     points = problem.space.points(ordered)
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     paths: dict[Path, None] = {}
     for index in _spread(points, max_count):
         row = int(ordered.index[index])
