@@ -86,7 +86,7 @@ class SavedCounterexample:
             words = ["verifai-jax", "replay-counterexamples", self.target, str(path)]
             content["reproduce"] = shlex.join(words)
         with replacing(path) as partial:
-            partial.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+            partial.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", "utf-8")
         return path
 
     @classmethod
@@ -96,7 +96,7 @@ class SavedCounterexample:
         **Raises:** `CorpusError` for anything else.
         """
         try:
-            content = json.loads(path.read_text())
+            content = json.loads(path.read_text(encoding="utf-8-sig"))
         except (OSError, ValueError, RecursionError) as error:
             raise CorpusError(f"{path} cannot be read: {one_line(format_error(error))}") from None
         form = content.get("format") if isinstance(content, dict) else None
