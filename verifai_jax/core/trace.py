@@ -21,7 +21,7 @@ from jax.core import Tracer
 from jax.errors import TracerArrayConversionError
 from jaxtyping import Array, Bool, Int, Real
 
-from verifai_jax.core.checks import check_name, is_number
+from verifai_jax.core.checks import check_count, check_name, is_number
 from verifai_jax.core.gaps import known_times, with_gaps
 from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook
@@ -82,7 +82,7 @@ class Trace(InNotebook):
     **Raises:** `ValueError` for no signals, an empty trace, signals of different lengths, a clock
     that is missing, given twice, not positive or not finite, `valid` below 1 or beyond the samples,
     or a status that is none, and for masked sample times; `TypeError` for signals that hold no
-    real numbers.
+    real numbers, and for notes that are not counts by text.
     """
 
     _internal = frozenset((
@@ -108,6 +108,7 @@ class Trace(InNotebook):
             raise ValueError("a trace needs at least one signal; got none")
         for name in self.signals:
             check_name("the name of a signal", name, lines=True)
+        _check_notes(self.notes)
         signals = {name: with_gaps(name, signal) for name, signal in self.signals.items()}
         object.__setattr__(self, "signals", signals)
         lengths = {}
@@ -295,6 +296,20 @@ class Trace(InNotebook):
             if name == "status" and int(code) != Status.OK:
                 text += f", status {Status(int(code)).name.lower()}"
         return text
+
+
+def _check_notes(notes: object) -> None:
+    """Refuse notes that are not counts by text.
+
+    **Raises:** `TypeError`, and `ValueError` for a count below zero.
+    """
+    wanted = 'notes must be counts by text, such as {"the solver fell back to Euler": 3}'
+    if not isinstance(notes, Mapping):
+        raise TypeError(f"{wanted}; got {type(notes).__name__}")
+    for note, times in notes.items():
+        if not isinstance(note, str):
+            raise TypeError(f"{wanted}; got the text {note!r}")
+        check_count(f"the count of note {note!r}", times, 0)
 
 
 def check_code(name: str, value: Any, wanted: str) -> int | None:

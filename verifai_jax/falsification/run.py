@@ -439,7 +439,8 @@ class Run(InNotebook):
         """Write the run to a folder: its record, table and state; returns the folder.
 
         **Raises:** `FolderInUse` where another process writes there; `ValueError` where it is the
-        run's own folder, and somebody has gone on with the run there.
+        run's own folder, and somebody has gone on with the run there; `OSError` for what the file
+        system refuses, such as a full disk: what the folder held before stays.
         """
         return lazy_import("verifai_jax.falsification.run_folder", "save_run")(self, Path(path))
 

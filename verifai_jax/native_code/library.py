@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt32
 
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.cores import available_cores
 from verifai_jax.core.devices import cache_folder
 from verifai_jax.core.remembered import remembered_as
@@ -158,7 +159,8 @@ def is_approved(name: str) -> bool | None:
 def approve(name: str, agrees: bool) -> None:
     """Note whether a library computes what XLA does, for later processes."""
     try:
-        _write(_folder() / f"{name}.agrees", (b"no", b"yes")[agrees])
+        with replacing(_folder() / f"{name}.agrees") as partial:
+            partial.write_bytes((b"no", b"yes")[agrees])
     except (OSError, Unavailable):
         return  # It is compared again.
 
@@ -209,12 +211,6 @@ def _compile(folder: Path, name: str, source: str, quickly: bool) -> Path:
         # At once, or not at all: another process may be compiling the same.
         os.replace(made, path)
         return path
-
-
-def _write(path: Path, data: bytes) -> None:
-    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-        file.write(data)
-    os.replace(file.name, path)
 
 
 def _compiler() -> Path | None:

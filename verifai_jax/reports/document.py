@@ -104,7 +104,6 @@ def write_report(
                 "a report is on a run, a sweep, an estimate, a comparison, a transfer or a "
                 f"judgement; got {kind}"
             )
-    path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as partial:
         partial.write_text(render(page), encoding="utf-8", newline="\n")
     claims = json.dumps(page.claims, indent=2, allow_nan=False)
