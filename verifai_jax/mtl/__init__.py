@@ -18,10 +18,12 @@ from verifai_jax.mtl.normalization import anneal, normalize
 from verifai_jax.mtl.operators import (
     always,
     eventually,
+    fall,
     historically,
     next_,
     once,
     prev,
+    rise,
     since,
     until,
 )

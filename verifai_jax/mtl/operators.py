@@ -16,6 +16,7 @@ from verifai_jax.mtl.formula import (
     Next,
     Once,
     Prev,
+    build,
     formula,
 )
 
@@ -53,6 +54,16 @@ def since(left: Formulaic, right: Formulaic, a: float = 0.0, b: float = math.inf
 def next_(operand: Formulaic) -> Formula:
     """Require `operand` at the next sample."""
     return Next(formula(operand))
+
+
+def rise(operand: Formulaic) -> Formula:
+    """Require `operand` at this sample and not at the previous one; false at the first sample."""
+    return build("rise", (formula(operand),))
+
+
+def fall(operand: Formulaic) -> Formula:
+    """Require `operand` at the previous sample and not at this one; false at the first sample."""
+    return build("fall", (formula(operand),))
 
 
 def prev(operand: Formulaic, weak: bool = False) -> Formula:
