@@ -4,6 +4,7 @@
 """
 
 import math
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 @command()
 @click.argument("formula")
-@click.argument("recording", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("recording", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--dt", type=float, help="Sampling period in seconds, instead of a column of times.")
 @click.option("--time", default="time", show_default=True, help="Column of sample times.")
 @click.option("--resample", "period", type=float, help="Period in seconds to resample to.")
@@ -41,6 +42,13 @@ if TYPE_CHECKING:
 @click.option("--compat", type=click.Choice(["pymtl"]), help="Right-open windows, as in py-mtl.")
 @click.option("--const", "constants", multiple=True, metavar="NAME=NUMBER")
 @click.option("--define", "definitions", multiple=True, metavar="NAME=FORMULA")
+@click.option(
+    "--export-c",
+    "header",
+    type=click.Path(path_type=Path),
+    metavar="FILE.h",
+    help="Write FORMULA as a monitor in C instead, for samples --dt seconds apart.",
+)
 @click.option("--explain", is_flag=True, help="Say which predicate decides, and when.")
 @PLOT
 @fleet_options
@@ -56,6 +64,7 @@ def monitor(
     compat: Literal["pymtl"] | None,
     constants: tuple[str, ...],
     definitions: tuple[str, ...],
+    header: Path | None,
     explain: bool,
     plot: Path | None,
     report: Path | None,
@@ -70,6 +79,8 @@ def monitor(
 
     With - as RECORDING, lines of CSV are read from the standard input as they come, until the
     verdict is certain whatever follows: tail -f log.csv | verifai-jax monitor FORMULA -
+
+    With --export-c FILE.h nothing is judged: FORMULA becomes a monitor in C.
     """
     import jax
 
@@ -80,6 +91,16 @@ def monitor(
         raise click.UsageError("--explain and --plot do not go with --compat")
     numbers = {name: _number(name, value) for name, value in split_pairs("--const", constants)}
     named = dict(split_pairs("--define", definitions))
+    if header is not None:
+        if recording or dt is None:
+            raise click.UsageError("--export-c goes with --dt SECONDS, and with no RECORDING")
+        name = re.sub(r"\W", "_", header.stem)
+        header.write_text(mtl.export_c(mtl.parse(formula, numbers, named), dt, name))
+        click.echo(f"monitor {header}")
+        give_result(formula=formula, header=str(header))
+        return
+    if not recording:
+        raise click.UsageError("give a RECORDING to judge, or --export-c FILE.h")
     if is_fleet(formula, recording, report, junit):
         if plot is not None or compat is not None:
             raise click.UsageError("--plot and --compat go with one formula on one recording")

@@ -6,6 +6,8 @@ from verifai_jax.mtl._online import Online, online
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl._robustness import robustness, robustness_signal, satisfied
 from verifai_jax.mtl._smoothing_error import SmoothingError, smoothing_error
+from verifai_jax.mtl.c_monitor import export_c
+from verifai_jax.mtl.counting import durations
 from verifai_jax.mtl.evaluate import End, IntervalError
 from verifai_jax.mtl.expression import Expression, signal
 from verifai_jax.mtl.formula import FALSE, TRUE, Formula
@@ -16,12 +18,17 @@ from verifai_jax.mtl.mining import Mined, mine
 from verifai_jax.mtl.normalization import anneal, normalize
 from verifai_jax.mtl.operators import (
     always,
+    during,
     eventually,
+    fall,
     historically,
     next_,
     once,
+    phase,
     prev,
+    rise,
     since,
+    sometime_during,
     until,
 )
 from verifai_jax.mtl.plot import draw
@@ -31,15 +38,17 @@ from verifai_jax.mtl.resampling import resample
 from verifai_jax.mtl.rewriting import nnf, simplify
 from verifai_jax.mtl.semantics import Semantics, boolean, hard, smooth
 from verifai_jax.mtl.setting import HorizonError, SamplingError
+from verifai_jax.mtl.watching import Watch, watch
 
 __all__ = [
     "FALSE", "TRUE", "End", "Explanation", "Expression", "Formula", "FormulaSyntaxError",
     "HorizonError", "IntervalError", "Judgement", "Mined", "Online", "Requirement",
-    "SamplingError", "Semantics", "SmoothingError", "TimeColumnError", "always", "anneal",
-    "boolean", "draw", "eventually", "explain", "hard", "historically", "judge", "latex", "mine",
-    "next_", "nnf", "normalize", "once", "online", "parse", "prev", "read", "read_requirements",
-    "resample", "robustness", "robustness_signal", "satisfied", "signal", "simplify", "since",
-    "smooth", "smoothing_error", "until",
+    "SamplingError", "Semantics", "SmoothingError", "TimeColumnError", "Watch", "always",
+    "anneal", "boolean", "draw", "durations", "during", "eventually", "explain", "export_c",
+    "fall", "hard", "historically", "judge", "latex", "mine", "next_", "nnf", "normalize",
+    "once", "online", "parse", "phase", "prev", "read", "read_requirements", "resample", "rise",
+    "robustness", "robustness_signal", "satisfied", "signal", "simplify", "since", "smooth",
+    "smoothing_error", "sometime_during", "until", "watch",
 ]  # fmt: skip
 
 

@@ -40,6 +40,7 @@ _FUNCTIONS: dict[str, Callable[..., Values]] = {
     "sqrt": np.sqrt,
     "sin": np.sin,
     "cos": np.cos,
+    "exp": np.exp,
     "min": lambda *values: _joined(values, -1),
     "max": lambda *values: _joined(values, 1),
 }
