@@ -6,12 +6,15 @@ from verifai_jax.mtl._online import Online, online
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl._robustness import robustness, robustness_signal, satisfied
 from verifai_jax.mtl._smoothing_error import SmoothingError, smoothing_error
+from verifai_jax.mtl.distinguishing import Distinction, distinguish
 from verifai_jax.mtl.evaluate import End, IntervalError
 from verifai_jax.mtl.expression import Expression, signal
+from verifai_jax.mtl.findings import Finding, Findings
 from verifai_jax.mtl.formula import FALSE, TRUE, Formula
 from verifai_jax.mtl.grammar import FormulaSyntaxError
 from verifai_jax.mtl.judgement import Judgement
 from verifai_jax.mtl.judging import judge
+from verifai_jax.mtl.linting import lint
 from verifai_jax.mtl.mining import Mined, mine
 from verifai_jax.mtl.normalization import anneal, normalize
 from verifai_jax.mtl.operators import (
@@ -33,13 +36,13 @@ from verifai_jax.mtl.semantics import Semantics, boolean, hard, smooth
 from verifai_jax.mtl.setting import HorizonError, SamplingError
 
 __all__ = [
-    "FALSE", "TRUE", "End", "Explanation", "Expression", "Formula", "FormulaSyntaxError",
-    "HorizonError", "IntervalError", "Judgement", "Mined", "Online", "Requirement",
-    "SamplingError", "Semantics", "SmoothingError", "TimeColumnError", "always", "anneal",
-    "boolean", "draw", "eventually", "explain", "hard", "historically", "judge", "latex", "mine",
-    "next_", "nnf", "normalize", "once", "online", "parse", "prev", "read", "read_requirements",
-    "resample", "robustness", "robustness_signal", "satisfied", "signal", "simplify", "since",
-    "smooth", "smoothing_error", "until",
+    "FALSE", "TRUE", "Distinction", "End", "Explanation", "Expression", "Finding", "Findings",
+    "Formula", "FormulaSyntaxError", "HorizonError", "IntervalError", "Judgement", "Mined",
+    "Online", "Requirement", "SamplingError", "Semantics", "SmoothingError", "TimeColumnError",
+    "always", "anneal", "boolean", "distinguish", "draw", "eventually", "explain", "hard",
+    "historically", "judge", "latex", "lint", "mine", "next_", "nnf", "normalize", "once", "online",
+    "parse", "prev", "read", "read_requirements", "resample", "robustness", "robustness_signal",
+    "satisfied", "signal", "simplify", "since", "smooth", "smoothing_error", "until",
 ]  # fmt: skip
 
 
