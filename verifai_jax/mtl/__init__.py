@@ -8,6 +8,7 @@ from verifai_jax.mtl._robustness import robustness, robustness_signal, satisfied
 from verifai_jax.mtl._smoothing_error import SmoothingError, smoothing_error
 from verifai_jax.mtl.distinguishing import Distinction, distinguish
 from verifai_jax.mtl.evaluate import End, IntervalError
+from verifai_jax.mtl.exemplary import Examples, examples
 from verifai_jax.mtl.expression import Expression, signal
 from verifai_jax.mtl.findings import Finding, Findings
 from verifai_jax.mtl.formula import FALSE, TRUE, Formula
@@ -16,6 +17,7 @@ from verifai_jax.mtl.judgement import Judgement
 from verifai_jax.mtl.judging import judge
 from verifai_jax.mtl.linting import lint
 from verifai_jax.mtl.mining import Mined, mine
+from verifai_jax.mtl.mutation import Mutant, Mutants, mutants
 from verifai_jax.mtl.normalization import anneal, normalize
 from verifai_jax.mtl.operators import (
     always,
@@ -36,13 +38,14 @@ from verifai_jax.mtl.semantics import Semantics, boolean, hard, smooth
 from verifai_jax.mtl.setting import HorizonError, SamplingError
 
 __all__ = [
-    "FALSE", "TRUE", "Distinction", "End", "Explanation", "Expression", "Finding", "Findings",
-    "Formula", "FormulaSyntaxError", "HorizonError", "IntervalError", "Judgement", "Mined",
-    "Online", "Requirement", "SamplingError", "Semantics", "SmoothingError", "TimeColumnError",
-    "always", "anneal", "boolean", "distinguish", "draw", "eventually", "explain", "hard",
-    "historically", "judge", "latex", "lint", "mine", "next_", "nnf", "normalize", "once", "online",
-    "parse", "prev", "read", "read_requirements", "resample", "robustness", "robustness_signal",
-    "satisfied", "signal", "simplify", "since", "smooth", "smoothing_error", "until",
+    "FALSE", "TRUE", "Distinction", "End", "Examples", "Explanation", "Expression", "Finding",
+    "Findings", "Formula", "FormulaSyntaxError", "HorizonError", "IntervalError", "Judgement",
+    "Mined", "Mutant", "Mutants", "Online", "Requirement", "SamplingError", "Semantics",
+    "SmoothingError", "TimeColumnError", "always", "anneal", "boolean", "distinguish", "draw",
+    "eventually", "examples", "explain", "hard", "historically", "judge", "latex", "lint", "mine",
+    "mutants", "next_", "nnf", "normalize", "once", "online", "parse", "prev", "read",
+    "read_requirements", "resample", "robustness", "robustness_signal", "satisfied", "signal",
+    "simplify", "since", "smooth", "smoothing_error", "until",
 ]  # fmt: skip
 
 

@@ -142,7 +142,7 @@ def free_difference(
 
     - `like`: recordings whose values the signals may have too.
     """
-    free = FreeTraces.of([one, other], like, dt, duration)
+    free = FreeTraces.of([one, other], like, dt, duration, end)
 
     def apart(values: HostValues) -> Values:
         a, b = values(one)[0], values(other)[0]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl.bounds import predicates_of, signal_bounds
@@ -60,6 +60,7 @@ class FreeTraces:
         like: Sequence[Trace] = (),
         dt: float | None = None,
         duration: float | None = None,
+        end: End = "hold",
     ) -> "FreeTraces":
         """Return the free traces that formulas can tell apart.
 
@@ -73,7 +74,8 @@ class FreeTraces:
         dt, length, instants = _clock(formulas, dt, duration)
         names = dict.fromkeys(name for f in formulas for name in f.signals())
         levels = {name: _levels(name, formulas, like) for name in names}
-        return cls(levels, {n: _width(n, formulas, like) for n in names}, dt, length, instants)
+        widths = {name: _width(name, formulas, like) for name in names}
+        return cls(levels, widths, dt, length, instants, end)
 
     @property
     def scales(self) -> dict[str, float]:
@@ -165,12 +167,6 @@ class FreeTraces:
         return Trace(signals, dt=self.dt)
 
 
-def one_sided(values: HostValues, formula: Formula) -> bool | None:
-    """Return the truth that a formula has at all samples of all lanes; None if it has both."""
-    truth: Bool[np.ndarray, "time lanes"] = values.truth(formula) > 0
-    return bool(truth.flat[0]) if truth.all() or not truth.any() else None
-
-
 def _clock(
     formulas: Sequence[Formula], dt: float | None, duration: float | None
 ) -> tuple[float, int, tuple[int, ...]]:
@@ -216,6 +212,9 @@ def _levels(
         for leaf in predicates_of(formula):
             if name in leaf.signals():
                 joint.update(_numbers(leaf))
+                if not any(one == leaf for one, _ in signal_bounds(leaf, name)):
+                    # A norm or a square has its bounds on either side, and within.
+                    limits.update(s * n for n in _numbers(leaf) for s in (-1, -0.75, 0.75, 1))
                 several = [other for other in leaf.signals() if other != name]
                 for other in several:
                     own = [constant_value(e) for _, es in signal_bounds(leaf, other) for e in es]
@@ -228,9 +227,18 @@ def _levels(
     if not limits:
         limits = joint | {-number for number in joint} | {0.0}
     known = np.array(sorted(limits))
+    if name in states_of(formulas) and not np.any(known % 1):
+        return np.unique([*known - 1, *known, *known + 1])
     spread = float(np.ptp(known)) or 0.2 * float(np.abs(known).max()) or 1.0
     beyond = [known[0] - spread, known[0] - spread / 4, known[-1] + spread / 4, known[-1] + spread]
     return np.unique([*known, *(known[1:] + known[:-1]) / 2, *beyond])
+
+
+def states_of(formulas: Sequence[Formula]) -> set[str]:
+    """Return the signals that are states, such as modes and flags: they equal a value or do not."""
+    leaves = (leaf for formula in formulas for leaf in predicates_of(formula))
+    equal = (f for f in leaves if f.compared is None or f.compared[1] in ("==", "!="))
+    return {name for leaf in equal for name in leaf.signals()}
 
 
 def _numbers(leaf: Formula) -> list[float]:

@@ -29,7 +29,6 @@ from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.mtl.recorded import Recordings, named_traces
 from verifai_jax.mtl.requirements import Requirement, Requirements, requirements_of
 from verifai_jax.mtl.rewriting import nnf, replaced
-from verifai_jax.mtl.tree import postorder
 from verifai_jax.mtl.units import plain_unit, unit_of, units_of
 
 FAR, NEVER = 3.0, 0.5
@@ -98,7 +97,9 @@ class _Linter:
     def findings(self) -> list[Finding]:
         """Return what all checks find, one finding for each kind and part."""
         found = [*self._signals(), *self._judged(), *self._dimensions()]
-        self.asked = _asked(self.formula, self.recordings[0].values.dt if self.recordings else 0.0)
+        dt = self.recordings[0].values.dt if self.recordings else 0.0
+        spans = self.formula.asked(dt).items()
+        self.asked = {part: span for part, span in spans if isinstance(part, Formula)}
         found += [*self._first_sample(), *self._implications(), *self._without_effect()]
         if self.recordings:
             idle = {f.part for f in found if f.kind == "vacuous"}
@@ -286,20 +287,19 @@ class _Linter:
                     f"abs({compared[0]} - {compared[2]}) <= 0.1.",
                 )  # fmt: skip
                 continue
-            nearest, spread = float(np.abs(margins).min()), float(np.ptp(margins))
+            nearest, spread = float(np.abs(margins).min()), self._spread(leaf)
             wanted = NEVER if never and leaf not in negative else FAR
-            if nearest > wanted * (spread or self._constant(leaf)):
+            if nearest > wanted * spread:
                 yield self._far(leaf, never, nearest)
 
-    def _constant(self, leaf: Formula) -> float:
-        """Return how far a bound of a signal that never changes may be, so that nothing is said."""
-        sizes = [
-            float(np.abs(e.values.signals[n]).max())
-            for e in self.recordings
-            for n in leaf.signals()
-        ]
-        # Flags, modes and counts are often constant.
-        return max(sizes) if max(sizes) > 3 or max(sizes) % 1 else math.inf
+    def _spread(self, leaf: Formula) -> float:
+        """Return how far the margin of a predicate moves in the recordings."""
+        every = np.concatenate([np.ravel(each.values(leaf)) for each in self.recordings])
+        spread = float(np.ptp(every[np.isfinite(every)]))
+        names = leaf.signals()
+        sizes = [np.abs(e.values.signals[n]).max() for e in self.recordings for n in names]
+        # Flags, modes and counts are often constant, so that a bound next to one says nothing.
+        return spread or (float(max(sizes)) if max(sizes) > 3 or max(sizes) % 1 else math.inf)
 
     def _far(self, leaf: Formula, never: bool, nearest: float) -> Finding:
         ranges = []
@@ -307,7 +307,9 @@ class _Linter:
             own = np.concatenate([np.ravel(e.values.signals[name]) for e in self.recordings])
             unit = f" {self.units[name]}" if name in self.units else ""
             ranges.append(f"{name} is from {np.nanmin(own):z.4g} to {np.nanmax(own):z.4g}{unit}")
-        said = f"{leaf} {'never holds' if never else 'always holds'} in {self._all}, and never by "
+        each = self._all.replace("any", "all")
+        said = f"never holds in {self._all}" if never else f"always holds in {each}"
+        said = f"{leaf} {said}, and never by "
         return self._found(
             "never holds" if never else "never near", leaf,
             f"{said}less than {nearest:z.3g}: {listed(ranges)}",
@@ -402,24 +404,6 @@ class _Linter:
 
 def _implied(formula: Formula) -> bool:
     return surface(formula)[0] == "implies" if formula.operands() else False
-
-
-def _asked(formula: Formula, dt: float) -> dict[Formula, tuple[float, float]]:
-    """Return from when to when each part is asked, in seconds, if the formula is asked at 0."""
-    spans = {formula: (0.0, 0.0)}
-    for part in reversed(list(postorder(formula))):
-        if not isinstance(part, Formula):
-            continue
-        first, last = spans[part]
-        near, far = part.span(dt) if part.side else (0.0, 0.0)
-        ahead = part.side == "ahead"
-        window = (first + near, last + far) if ahead else (first - far, last - near)
-        left = (first, last + far) if ahead else (first - far, last)
-        for index, below in enumerate(part.valued()):
-            own = left if isinstance(part, ast.Witness) and index == 0 else window
-            known = spans.get(below, own)
-            spans[below] = min(own[0], known[0]), max(own[1], known[1])
-    return spans
 
 
 def _written(formula: Formula) -> dict[Formula, tuple[str, tuple[Formula, ...]]]:
