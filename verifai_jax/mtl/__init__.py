@@ -36,16 +36,17 @@ from verifai_jax.mtl.resampling import resample
 from verifai_jax.mtl.rewriting import nnf, simplify
 from verifai_jax.mtl.semantics import Semantics, boolean, hard, smooth
 from verifai_jax.mtl.setting import HorizonError, SamplingError
+from verifai_jax.mtl.templating import Template, templates
 
 __all__ = [
     "FALSE", "TRUE", "Distinction", "End", "Examples", "Explanation", "Expression", "Finding",
     "Findings", "Formula", "FormulaSyntaxError", "HorizonError", "IntervalError", "Judgement",
     "Mined", "Mutant", "Mutants", "Online", "Requirement", "SamplingError", "Semantics",
-    "SmoothingError", "TimeColumnError", "always", "anneal", "boolean", "distinguish", "draw",
-    "eventually", "examples", "explain", "hard", "historically", "judge", "latex", "lint", "mine",
-    "mutants", "next_", "nnf", "normalize", "once", "online", "parse", "prev", "read",
+    "SmoothingError", "Template", "TimeColumnError", "always", "anneal", "boolean", "distinguish",
+    "draw", "eventually", "examples", "explain", "hard", "historically", "judge", "latex", "lint",
+    "mine", "mutants", "next_", "nnf", "normalize", "once", "online", "parse", "prev", "read",
     "read_requirements", "resample", "robustness", "robustness_signal", "satisfied", "signal",
-    "simplify", "since", "smooth", "smoothing_error", "until",
+    "simplify", "since", "smooth", "smoothing_error", "templates", "until",
 ]  # fmt: skip
 
 

@@ -85,7 +85,7 @@ class FreeTraces:
     def drawn(self, rng: np.random.Generator, lanes: int = LANES) -> Signals:
         """Draw piecewise constant signals: some never change, others do at every third sample."""
         # A long clock has fewer traces, so that the memory is bounded.
-        lanes = max(KEPT, min(lanes, 2**21 // self.length))
+        lanes = max(KEPT, min(lanes, 2**19 // self.length))
         shape = (self.length, lanes)
         rates = np.array([0, 1, 2, 4, 8, self.length / 3]) / self.length
         return {
