@@ -48,9 +48,9 @@ def test(
     - `budget`: simulations at most.
     - `max_failure_probability`: accept failures that are as rare, or rarer; the test passes only
       where independent samples show it. No counterexample is accepted when left out.
-    - `seed`: of the search and the samples.
+    - `seed`: the seed of the search and the samples.
     - `search`: for counterexamples.
-    - `confidence`: of what is said of the failure probability.
+    - `confidence`: the confidence of statements about the failure probability.
     - `corpus`: folder of saved counterexamples, from the root of the project; by default
       `counterexamples`, or pytest's setting `vj_corpus`.
     - `rename`: new names of features that older files of the corpus have.

@@ -36,7 +36,7 @@ def monitor_stream(
 
     **Arguments:**
 
-    - `lines`: of CSV; the first has the names.
+    - `lines`: the lines of CSV; the first has the names.
     - `time`: the column of sample times in seconds, or of dates (ISO 8601).
     - `dt`: the sampling period in seconds, instead of a column of times.
     - `show`: what prints a line.

@@ -79,7 +79,7 @@ def shrink(
       choices 1, and by indices in integers. Every control point of a signal and every component of
       a vector is a coordinate of its own.
     - `budget`: simulations at most; a gradient counts as one.
-    - `seed`: of the random candidates.
+    - `seed`: the seed of the random candidates.
     - `others`: whether other counterexamples of the run are looked at too.
     - `stay`: whether every real feature stays on the side of nominal on which the row has it, so
       that failures of several kinds are shrunk each by itself.
@@ -262,7 +262,7 @@ class _Search:
 
         - `first` `[m, d]`: points that are returned at any rate.
         - `alike`: whether only failures with as few departures as the least one count.
-        - `cosine`: of the angle between directions, at most.
+        - `cosine`: the cosine of the angle between directions, at most.
         """
         failures, nominal = self.failures(), self.candidates.nominal
         if self.by == "count" and alike:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 class Run(InNotebook):
     """The result of a falsification: its table, its record, and what follows from them.
 
-    - `name`: of the problem.
+    - `name`: the name of the problem.
     - `formulas`: their texts by name.
     - `table`: one row a simulation.
     - `search`: its repr.
@@ -51,7 +51,7 @@ class Run(InNotebook):
       from what came of them.
     - `simulate_seconds`: the part of `run_seconds` that simulations took, and their rows to be put
       into the table. What is left is that of callbacks and checkpoints.
-    - `version`: of verifai_jax.
+    - `version`: the version of verifai_jax.
     - `prior`: whether the rows are independent samples of the feature space.
     - `origin`: where the rows come from, an `origin.Origin`, which says why they are no such
       samples: `"first"` (rows that were given came before the samples), `"given"` (all rows were),
@@ -277,7 +277,7 @@ class Run(InNotebook):
 
         **Arguments:**
 
-        - `rows`: of the table, all counterexamples when left out.
+        - `rows`: the rows of the table, all counterexamples when left out.
 
         **Returns:** by the numbers of the rows `log_density`, the natural logarithm of the prior's
         density (of a constrained space without the share that is accepted), and for each column
@@ -397,7 +397,8 @@ class Run(InNotebook):
         **Arguments:**
 
         - `folder`: it is made where there is none.
-        - `options`: of `counterexamples.save_counterexamples`: `max_count`, `shrink`, `budget`.
+        - `options`: the options of `counterexamples.save_counterexamples`: `max_count`, `shrink`,
+          `budget`.
 
         **Raises:** `ValueError` for a run without its problem or without a counterexample.
         """
@@ -418,9 +419,9 @@ class Run(InNotebook):
 
         **Arguments:**
 
-        - `path`: of the HTML file.
-        - `options`: of `reports.write_report`: `units` and `reasons` of features, `traces`,
-          `studies`, `modes`.
+        - `path`: the path of the HTML file.
+        - `options`: the options of `reports.write_report`: `units` and `reasons` of features,
+          `traces`, `studies`, `modes`.
 
         **Returns:** the path.
         """

@@ -89,8 +89,8 @@ class Running:
 
     - `rounds`: its rounds, not compiled yet.
     - `ends`: the conditions that end it.
-    - `choice`: of its backend.
-    - `seed`: of its search and its simulations.
+    - `choice`: the choice of its backend.
+    - `seed`: the seed of its search and its simulations.
     - `target`: name of the problem on the command line.
     - `notes`: on what is likely a mistake.
     - `lasting`: notes that are still true when the run goes on.

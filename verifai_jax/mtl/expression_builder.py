@@ -41,7 +41,7 @@ class ExpressionBuilder:
 
     **Arguments:**
 
-    - `text`: of the formula.
+    - `text`: the text of the formula.
     - `constants`, `known`: numbers and formulas by name.
     - `reads`: whether a text is a formula; by default no text is offered in an error.
     """

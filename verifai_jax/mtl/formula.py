@@ -377,7 +377,7 @@ def build(word: str, operands: Iterable[Formula], interval: Interval = EVERYTHIN
 
     **Arguments:**
 
-    - `word`: of the operator, a key of `OPERATORS`.
+    - `word`: the name of the operator, a key of `OPERATORS`.
     - `operands`: as many as the operator takes.
     - `interval`: for an operator that takes one.
     """

@@ -119,10 +119,10 @@ def mine(
     - `text`: a formula with one or two parameters `?name`, for numbers or ends of intervals.
     - `recordings`: traces, files or tables; or a `Problem`, whose tightest values that a search
       does not break are found, which proves nothing.
-    - `share`: of the recordings that are to satisfy it.
+    - `share`: the share of the recordings that are to satisfy it.
     - `end`: what comes after the last sample, `"hold"` or `"truncate"`.
     - `constants`, `definitions`: as of `parse`; a constant can fix a parameter's value.
-    - `confidence`: of the interval for the rate of recordings that break it.
+    - `confidence`: the confidence of the interval for the rate of recordings that break it.
     - `budget`, `seed`: simulations of the search at most, and its seed, for a problem.
 
     **Raises:** `FormulaSyntaxError`; `ValueError` for more than two parameters, one in which the

@@ -28,7 +28,7 @@ class Requirement:
     - `id`: by which tables and reports name it.
     - `formula`: what is required.
     - `text`: the sentence that the formula stands for.
-    - `unit`: of its robustness.
+    - `unit`: the unit of its robustness.
     - `source`: a standard or a document, with its number.
     """
 

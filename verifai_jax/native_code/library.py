@@ -108,7 +108,7 @@ def library_name(fingerprint: str | None) -> str:
 
     **Arguments:**
 
-    - `fingerprint`: of the program; None if it has none.
+    - `fingerprint`: the fingerprint of the program; None if it has none.
 
     **Raises:** `Unavailable` where there is no compiler, no cache folder, or no fingerprint.
     """

@@ -229,9 +229,9 @@ class Problem(InNotebook):
 
         **Arguments:**
 
-        - `faults`: of `vj.faults`, in the order in which those of one channel apply. What varies of
-          each is a feature under its name, whose nominal value is the weakest, shortest and latest
-          fault.
+        - `faults`: the faults of `vj.faults`, in the order in which those of one channel apply.
+          What varies of each is a feature under its name, whose nominal value is the weakest,
+          shortest and latest fault.
         - `by_simulator`: whether the simulator applies them itself, as `vj.faults.on_host` helps
           it to; for `remote`, and for a `blackbox` of one's own.
 

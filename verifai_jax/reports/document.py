@@ -49,8 +49,9 @@ def write_report(
 
     - `result`: a run, a sweep, an estimate, a comparison, a transfer or a judgement. The failures
       of a run that has its problem are simulated again.
-    - `path`: of the HTML file; the claims go to the same name with the ending `.claims.json`.
-    - `units`: of features, by name.
+    - `path`: the path of the HTML file; the claims go to the same name with the ending
+      `.claims.json`.
+    - `units`: the units of features, by name.
     - `reasons`: why a feature has the range that it has, by name.
     - `traces`: rows of a run that are simulated beforehand at most; 24 by default, 5 for a black
       box that takes long.
@@ -58,7 +59,8 @@ def write_report(
       system is a black box that takes long.
     - `modes`: simulations spent on all ways of failing of a run and their probabilities, as
       `vj.modes` finds them; none when left out.
-    - `problem`: of an estimate, or the baseline of a comparison, for its property and prior.
+    - `problem`: the problem of an estimate, or the baseline of a comparison, for its property and
+      prior.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     **Returns:** the path of the HTML file.

@@ -67,7 +67,7 @@ def property_content(texts: Mapping[str, str], problem: Problem | None) -> list[
 
     **Arguments:**
 
-    - `texts`: of the formulas by name.
+    - `texts`: the texts of the formulas by name.
     - `problem`: for what else is known; None if it is not.
     """
     rows = [
