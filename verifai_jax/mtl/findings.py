@@ -1,4 +1,4 @@
-"""What is suspicious about formulas, as sentences and as a table."""
+"""Findings on formulas that are suspicious, as sentences and as a table."""
 
 import functools
 from collections.abc import Iterable, Iterator
@@ -33,7 +33,7 @@ class Finding(NamedTuple):
 
 @dataclass(frozen=True)
 class Findings(InNotebook):
-    """What is suspicious about formulas; `str()` writes it, and it is true if there is anything.
+    """Findings on formulas; `str()` writes them, and they are false where there are none.
 
     - `recordings`: how many were looked at.
     - `unread`: signals of the recordings that no formula reads.

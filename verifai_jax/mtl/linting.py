@@ -1,4 +1,4 @@
-"""Whether formulas say what somebody means: what is suspicious about them, in sentences.
+"""Suspicious formulas: whether they say what somebody means.
 
     found = lint("always (speed > 120 -> eventually[0, 5] brake > 0)", ["drive-1.csv"])
     print(found)                    # the left side never holds in the recording; ...
