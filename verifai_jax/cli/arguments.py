@@ -189,6 +189,26 @@ PARAMETER_CHOICE = all_of(
 """Options of `synthesize` and `repair`: keywords of both functions."""
 
 
+NAMES = all_of(
+    click.option("--const", "constants", multiple=True, metavar="NAME=NUMBER"),
+    click.option("--define", "definitions", multiple=True, metavar="NAME=FORMULA"),
+)
+"""Names that a formula may use."""
+
+
+def read_names(
+    constants: tuple[str, ...], definitions: tuple[str, ...]
+) -> tuple[dict[str, float], dict[str, str]]:
+    """Return the constants and the definitions of `NAMES`; a usage error names what is none."""
+    numbers = {}
+    for name, value in split_pairs("--const", constants):
+        try:
+            numbers[name] = float(value)
+        except ValueError:
+            raise click.UsageError(f"--const {name} must be a number; got {value!r}") from None
+    return numbers, dict(split_pairs("--define", definitions))
+
+
 @contextlib.contextmanager
 def on_cluster(address: str | None) -> "Iterator[Executor | None]":
     """Connect to the cluster at an address, if one is given."""

@@ -34,6 +34,7 @@ from verifai_jax.cli.exit_codes import (
 from verifai_jax.cli.explain import explain
 from verifai_jax.cli.falsify import falsify
 from verifai_jax.cli.fmea import fmea
+from verifai_jax.cli.formula import formula
 from verifai_jax.cli.fuzz import fuzz
 from verifai_jax.cli.going_on import WORDS
 from verifai_jax.cli.list import list_targets
@@ -57,6 +58,7 @@ COMMANDS = (
     replay,
     analyze,
     monitor,
+    formula,
     doctor,
     confirm,
     estimate,

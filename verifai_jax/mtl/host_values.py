@@ -53,6 +53,8 @@ class HostValues:
     - `dt`: sampling period in seconds, for which `stride` samples stand.
     - `end`: what comes after the last sample, `"hold"` or `"truncate"`.
     - `lanes`: number of lane axes.
+    - `blend`: share of the sum of all operands that `&` and `|` add to the one that decides: a
+      search then sees an operand that gets better while another one decides. 0 for the robustness.
     """
 
     signals: Mapping[str, Values]
@@ -60,6 +62,7 @@ class HostValues:
     end: End = "hold"
     stride: int = 1
     lanes: int = 0
+    blend: float = 0.0
     _padded: dict[int, dict[str, Values]] = field(default_factory=dict)
     _known: dict[tuple[Formula, bool, int], Values] = field(default_factory=dict)
 
@@ -148,7 +151,10 @@ class HostValues:
             case ast.Not():
                 return -below[0]
             case ast.Join():
-                return _joined(below, f.sign)
+                joined = _joined(below, f.sign)
+                if self.blend and not boolean:
+                    joined = joined + self.blend * sum(np.clip(v, -1e9, 1e9) for v in below)
+                return joined
             case ast.Window():
                 return _window(
                     below[0], *self._span(f.interval), f.sign, top, hold, f.side == "back"

@@ -9,9 +9,8 @@ on a recording with NumPy, what they share once.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -25,15 +24,11 @@ from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.mtl.judgement import Judgement, Row
-from verifai_jax.mtl.recording import ENDINGS, read
+from verifai_jax.mtl.recorded import Recording, Recordings, named_recordings
+from verifai_jax.mtl.recording import read
 from verifai_jax.mtl.requirements import Requirement, Requirements, requirements_of
 from verifai_jax.mtl.resampling import Method
 from verifai_jax.mtl.setting import check_horizon
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-Source: TypeAlias = "str | Path | Trace | pd.DataFrame"
 
 
 class Reading(NamedTuple):
@@ -49,7 +44,7 @@ class Reading(NamedTuple):
 
 def judge(
     formulas: Requirements,
-    recordings: "Source | Iterable[Source] | Mapping[str, Source]",
+    recordings: Recordings,
     *,
     time: str = "time",
     dt: float | None = None,
@@ -69,7 +64,7 @@ def judge(
 
     - `formulas`: one, a sequence, or a dictionary by identifier; `read_requirements` reads a file.
     - `recordings`: paths of files, of folders (all recordings in and below them), traces or data
-      frames: one, a sequence, or a dictionary by name.
+      frames: one, a sequence, or a dictionary by name; or a problem, which is simulated.
     - `time`, `dt`, `resample_to`, `method`: as `read` takes them; a trace is resampled too.
     - `end`: as for `robustness`.
     - `explain`: whether to find the predicate and the instant that decide.
@@ -93,7 +88,7 @@ def judge(
         if ended is not None:
             ended(index, found)
 
-    named = _named(recordings)
+    named = named_recordings(recordings)
     if executor is None:
         for index, (name, source) in enumerate(named):
             keep(index, judge_recording(requirements, name, source, reading))
@@ -109,31 +104,8 @@ def judge(
     return Judgement(requirements, tuple(row for index in sorted(rows) for row in rows[index]))
 
 
-def _named(recordings: Any) -> Iterator[tuple[str, Any]]:
-    """Yield recordings with their names; files of a folder in the order of their paths."""
-    if isinstance(recordings, Mapping):
-        yield from ((str(name), source) for name, source in recordings.items())
-        return
-    alone = isinstance(recordings, str | Path | Trace) or hasattr(recordings, "columns")
-    several: Any = [recordings] if alone else recordings
-    for index, source in enumerate(several, 1):
-        if not isinstance(source, str | Path):
-            yield f"recording {index}", source
-            continue
-        path = Path(source)
-        if not path.exists():
-            raise FileNotFoundError(f"there is no recording {path}")
-        if not path.is_dir():
-            yield str(path), path
-            continue
-        files = [each for each in sorted(path.rglob("*")) if each.suffix.lower() in ENDINGS]
-        if not files:
-            raise ValueError(f"there is no recording ({', '.join(ENDINGS)}) in {path}")
-        yield from ((str(file), file) for file in files)
-
-
 def judge_recording(
-    requirements: Sequence[Requirement], name: str, source: Any, reading: Reading
+    requirements: Sequence[Requirement], name: str, source: Recording, reading: Reading
 ) -> list[Row]:
     """Return a row for each requirement on one recording; workers call it, too."""
     try:
@@ -142,7 +114,7 @@ def judge_recording(
         return [Row(name, each.id, error=one_line(str(error))) for each in requirements]
 
 
-def _trace(source: Any, reading: Reading) -> Trace:
+def _trace(source: Recording, reading: Reading) -> Trace:
     wanted = {"resample_to": reading.resample_to, "method": reading.method}
     if not isinstance(source, Trace):
         return read(source, time=reading.time, dt=reading.dt, **wanted)
