@@ -31,6 +31,7 @@ LAYERS = (
     {"hardening"},
     {"plotting"},
     {"reports"},
+    {"traceability"},
     {"cli", "testing"},
 )
 """Rooms from the ground up: each may import itself and the layers below its own."""

@@ -87,4 +87,4 @@ def monitor_fleet(
 
 def _is_file(formula: str) -> bool:
     """Return whether a word names a file of requirements, also one of a form that is refused."""
-    return Path(formula).suffix.lower() in (".toml", ".csv", ".yaml", ".yml")
+    return Path(formula).suffix.lower() in (".toml", ".csv", ".yaml", ".yml", ".reqif")

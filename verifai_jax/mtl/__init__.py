@@ -26,7 +26,7 @@ from verifai_jax.mtl.operators import (
 )
 from verifai_jax.mtl.plot import draw
 from verifai_jax.mtl.recording import TimeColumnError, read
-from verifai_jax.mtl.requirements import Requirement, read_requirements
+from verifai_jax.mtl.requirements import Requirement, read_requirements, write_requirements
 from verifai_jax.mtl.resampling import resample
 from verifai_jax.mtl.rewriting import nnf, simplify
 from verifai_jax.mtl.semantics import Semantics, boolean, hard, smooth
@@ -39,7 +39,7 @@ __all__ = [
     "boolean", "draw", "eventually", "explain", "hard", "historically", "judge", "latex", "mine",
     "next_", "nnf", "normalize", "once", "online", "parse", "prev", "read", "read_requirements",
     "resample", "robustness", "robustness_signal", "satisfied", "signal", "simplify", "since",
-    "smooth", "smoothing_error", "until",
+    "smooth", "smoothing_error", "until", "write_requirements",
 ]  # fmt: skip
 
 

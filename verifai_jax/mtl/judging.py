@@ -165,18 +165,18 @@ def _judged(
 ) -> list[Row]:
     trace = trace.trim()
     dt, stride, fine = period(trace), trace.stride, trace.finely()
-    wanted = dict.fromkeys(n for each in requirements for n in each.formula.signals())
+    wanted = dict.fromkeys(n for each in requirements for n in each.formalized.signals())
     known: dict[str, Any] = {n: np.asarray(fine.signals[n]) for n in wanted if n in fine.signals}
     signals = {n: _lengthened(np.asarray(s)) for n, s in numbers_of_signals(known).items()}
     shapes = tuple((n, s.shape) for n, s in signals.items())
     truncated = reading.end == "truncate"
     make = functools.partial(_Group, shapes, dt, "truncate" if truncated else "hold", stride)
     faults = {
-        each.id: _fault(each.formula, trace, dt, reading.end, make((each.formula,)))
+        each.id: _fault(each.formalized, trace, dt, reading.end, make((each.formalized,)))
         for each in requirements
     }
     sound = [each for each in requirements if not faults[each.id]]
-    group = make(tuple(each.formula for each in sound))
+    group = make(tuple(each.formalized for each in sound))
     valid = jnp.asarray(fine.length) if truncated else None
     values = [float(v) for v in _values(group, "hard", signals, valid)] if sound else []
     truths = [value > 0 for value in values]
@@ -187,12 +187,12 @@ def _judged(
     clock = np.asarray(fine.clock())
     for each, value, holds in zip(sound, values, truths, strict=True):
         if math.isnan(value):
-            missing = f"no verdict: {first_nan(each.formula, trace)}"
+            missing = f"no verdict: {first_nan(each.formalized, trace)}"
             rows[each.id] = Row(name, each.id, error=missing)
             continue
         instant, why = math.nan, ""
         if reading.explain:
-            instant, why = _decision(make((each.formula,)), signals, valid, clock)
+            instant, why = _decision(make((each.formalized,)), signals, valid, clock)
         rows[each.id] = Row(name, each.id, "holds" if holds else "fails", value, instant, why)
     return [rows[each.id] for each in requirements]
 
