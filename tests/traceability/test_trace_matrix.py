@@ -193,8 +193,6 @@ def test_links_that_are_missing():
         vj.trace_matrix([problem, problem])
     with pytest.raises(ValueError, match="two requirements 'A' differ"):
         vj.trace_matrix(problem, requirements=[Requirement("A"), Requirement("A", text="t")])
-    with pytest.raises(ValueError, match="requirements must be a file or Requirements"):
-        problem_of("A", requirements=["A"])
 
 
 def test_claims_of_another_form_are_named(tmp_path):
