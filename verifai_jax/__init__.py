@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from verifai_jax.counterexamples import explain as explain
     from verifai_jax.counterexamples import replay_counterexamples as replay_counterexamples
     from verifai_jax.counterexamples import shrink as shrink
+    from verifai_jax.error_budgets import ErrorBudget as ErrorBudget
+    from verifai_jax.error_budgets import error_budget as error_budget
     from verifai_jax.estimation import Estimate as Estimate
     from verifai_jax.estimation import SequenceEstimate as SequenceEstimate
     from verifai_jax.estimation import estimate as estimate

@@ -129,7 +129,7 @@ class Comparison(InNotebook):
         **Arguments:**
 
         - `path`: of the HTML file.
-        - `options`: of `reports.write_report`: `problem`, `units`, `reasons`.
+        - `options`: of `reports.write_report`: `problem`, `units`, `reasons`, `errors`.
 
         **Returns:** the path.
         """

@@ -177,7 +177,7 @@ class Estimate(Drawn, InNotebook):
         **Arguments:**
 
         - `path`: of the HTML file.
-        - `options`: of `reports.write_report`: `problem`, `units`, `reasons`.
+        - `options`: of `reports.write_report`: `problem`, `units`, `reasons`, `errors`.
 
         **Returns:** the path.
         """

@@ -24,7 +24,16 @@ from verifai_jax.mtl.setting import as_formula
 
 ENDINGS = (".toml", ".yaml", ".yml", ".csv", ".reqif")
 """Endings of files of requirements."""
-FIELDS: tuple[str, ...] = ("id", "formula", "text", "unit", "source", "rationale", "severity", "links")
+FIELDS: tuple[str, ...] = (
+    "id",
+    "formula",
+    "text",
+    "unit",
+    "source",
+    "rationale",
+    "severity",
+    "links",
+)
 """What an entry may say; each has an `id`, and a `formula` where recordings are judged by it."""
 
 
