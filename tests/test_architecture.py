@@ -26,11 +26,12 @@ LAYERS = (
         "compositional",
         "requirements",
     },
-    {"failure_modes", "failure_table"},
+    {"failure_modes", "failure_table", "error_budgets"},
     {"sweeps", "augmentation", "checking"},
     {"hardening"},
     {"plotting"},
     {"reports"},
+    {"traceability"},
     {"cli", "testing"},
 )
 """Rooms from the ground up: each may import itself and the layers below its own."""

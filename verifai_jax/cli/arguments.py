@@ -131,6 +131,14 @@ REPORT = click.option(
 )
 """File of the evidence report on a result."""
 
+ERRORS = click.option(
+    "--errors",
+    type=click.IntRange(1),
+    metavar="PAIRS",
+    help="Say how wrong the number can be, by so many pairs of simulations for each part.",
+)
+"""Simulations by which the parts of an error are measured."""
+
 EVEN_IF_CHANGED = click.option(
     "--even-if-changed",
     is_flag=True,

@@ -48,6 +48,7 @@ from verifai_jax.cli.report import report
 from verifai_jax.cli.shrink import shrink
 from verifai_jax.cli.sweep import sweep
 from verifai_jax.cli.synthesize import synthesize
+from verifai_jax.cli.trace import trace
 from verifai_jax.core.errors import unknown_name
 
 COMMANDS = (
@@ -73,6 +74,7 @@ COMMANDS = (
     replay_counterexamples,
     compare,
     report,
+    trace,
     new,
 )
 """The sub-commands. Their files import nothing heavy until a command runs."""

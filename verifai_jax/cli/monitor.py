@@ -73,8 +73,8 @@ def monitor(
 ) -> None:
     """Compute the robustness of FORMULA on a recorded trace, RECORDING.csv or .parquet.
 
-    FORMULA may also be a file of requirements (.toml or .csv), and RECORDING a folder, or several:
-    every requirement is judged on every recording.
+    FORMULA may also be a file of requirements (.toml, .yaml, .csv or .reqif), and RECORDING a
+    folder, or several: every requirement is judged on every recording.
 
     With - as RECORDING, lines of CSV are read from the standard input as they come, until the
     verdict is certain whatever follows: tail -f log.csv | verifai-jax monitor FORMULA -

@@ -95,4 +95,4 @@ def load_requirements(
 
 def _is_file(formula: str) -> bool:
     """Return whether a word names a file of requirements, also one of a form that is refused."""
-    return Path(formula).suffix.lower() in (".toml", ".csv", ".yaml", ".yml")
+    return Path(formula).suffix.lower() in (".toml", ".csv", ".yaml", ".yml", ".reqif")

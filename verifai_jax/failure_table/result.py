@@ -136,7 +136,7 @@ class FailureTable(Drawn, InNotebook):
 
         **Arguments:**
 
-        - `path`: of the file.
+        - `path`: the path of the file.
 
         **Raises:** `OSError` that names the file, for whatever the file system refuses.
         """

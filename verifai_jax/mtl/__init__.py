@@ -38,7 +38,7 @@ from verifai_jax.mtl.operators import (
 )
 from verifai_jax.mtl.plot import draw
 from verifai_jax.mtl.recording import TimeColumnError, read
-from verifai_jax.mtl.requirements import Requirement, read_requirements
+from verifai_jax.mtl.requirements import Requirement, read_requirements, write_requirements
 from verifai_jax.mtl.resampling import resample
 from verifai_jax.mtl.rewriting import nnf, simplify
 from verifai_jax.mtl.semantics import Semantics, boolean, hard, smooth
@@ -56,6 +56,7 @@ __all__ = [
     "normalize", "once", "online", "parse", "phase", "prev", "read", "read_requirements",
     "resample", "rise", "robustness", "robustness_signal", "satisfied", "signal", "simplify",
     "since", "smooth", "smoothing_error", "sometime_during", "templates", "until", "watch",
+    "write_requirements",
 ]  # fmt: skip
 
 

@@ -49,7 +49,7 @@ four-thousandth, which single precision still tells from none."""
 class Examples(Drawn, InNotebook):
     """Traces that satisfy a formula, barely satisfy it, and break it; None where none was found.
 
-    - `robustness`: of each by its name.
+    - `robustness`: the robustness of each by its name.
     """
 
     formula: Formula
@@ -98,7 +98,7 @@ def examples(
       out.
     - `dt`, `duration`: of the traces, in seconds; they follow from the windows when left out.
     - `end`: what comes after the last sample, `"hold"` or `"truncate"`.
-    - `seed`: of the search.
+    - `seed`: the seed of the search.
 
     **Raises:** `FormulaSyntaxError`; `ValueError` for windows that need a clock of too many
     samples, and for a formula without signals.

@@ -128,7 +128,7 @@ class FreeTraces:
 
         **Arguments:**
 
-        - `score`: of `[lanes]` traces.
+        - `score`: the score of `[lanes]` traces.
         - `enough`: a score that ends the search.
 
         **Returns:** its signals `[time]`, and its score.

@@ -150,7 +150,7 @@ def _row(
     reading: Reading,
 ) -> Row:
     """Judge one requirement on one recording."""
-    formula = requirement.formula
+    formula = requirement.formalized
     for signal in formula.signals():
         if signal not in trace.signals:
             raise missing_name("the recording", "signal", signal, trace.signals)

@@ -53,8 +53,8 @@ def lint(
     - `formulas`: one, a sequence, or a dictionary by identifier; `read_requirements` reads a file.
     - `signals`: recordings (traces, files, folders, tables), or a problem, which is simulated 64
       times. What only data tells is left out without any.
-    - `units`: of signals by name, in addition to those that recordings and names (`speed (m/s)`,
-      `speed_kmh`) have.
+    - `units`: the units of signals by name, in addition to those that recordings and names (`speed
+      (m/s)`, `speed_kmh`) have.
     - `end`: what comes after the last sample, `"hold"` or `"truncate"`.
 
     **Raises:** `FormulaSyntaxError`; as `read` for what cannot be read.

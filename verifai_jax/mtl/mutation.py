@@ -139,7 +139,7 @@ def mutants(
     - `signals`: recordings (traces, files, folders, tables), or a problem, which is simulated 64
       times. Without any all mutants survive, each with an example of a trace that would kill it.
     - `end`: what comes after the last sample, `"hold"` or `"truncate"`.
-    - `seed`: of the free traces that are tried.
+    - `seed`: the seed of the free traces that are tried.
 
     **Raises:** `FormulaSyntaxError`; as `read`; `ValueError` for a recording without the signals or
     with gaps where they matter.

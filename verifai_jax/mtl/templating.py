@@ -31,7 +31,7 @@ class Template:
     - `expression`: the formula as text, in which names stand for `constants`.
     - `source`: a standard or a paper, with its number.
     - `signals`: units of the signals by name; `"1"` for flags and ratios.
-    - `unit`: of the robustness, where it has one.
+    - `unit`: the unit of the robustness, where it has one.
     - `example`: whether the source gives the form alone, and the numbers are examples.
     """
 
@@ -75,7 +75,7 @@ def templates(words: str = "", domain: str | None = None) -> tuple[Template, ...
 
     - `words`: looked for in all that a template says, whatever their case; all templates when left
       out.
-    - `domain`: of the templates; every one when left out.
+    - `domain`: the domain of the templates; every one when left out.
 
     **Raises:** `UnknownNameError` for a domain without templates.
     """
