@@ -26,7 +26,7 @@ LAYERS = (
         "compositional",
         "requirements",
     },
-    {"failure_modes", "failure_table"},
+    {"failure_modes", "failure_table", "trials"},
     {"sweeps", "augmentation", "checking"},
     {"hardening"},
     {"plotting"},

@@ -47,6 +47,7 @@ from verifai_jax.cli.report import report
 from verifai_jax.cli.shrink import shrink
 from verifai_jax.cli.sweep import sweep
 from verifai_jax.cli.synthesize import synthesize
+from verifai_jax.cli.trials import trials
 from verifai_jax.core.errors import unknown_name
 
 COMMANDS = (
@@ -71,6 +72,7 @@ COMMANDS = (
     replay_counterexamples,
     compare,
     report,
+    trials,
     new,
 )
 """The sub-commands. Their files import nothing heavy until a command runs."""
