@@ -26,7 +26,7 @@ LAYERS = (
         "compositional",
         "requirements",
     },
-    {"failure_modes", "failure_table", "error_budgets"},
+    {"failure_modes", "failure_table", "error_budgets", "trials"},
     {"sweeps", "augmentation", "checking"},
     {"hardening"},
     {"plotting"},

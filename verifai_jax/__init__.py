@@ -138,6 +138,10 @@ if TYPE_CHECKING:
     from verifai_jax.systems.remote import remote as remote
     from verifai_jax.traceability import TraceMatrix as TraceMatrix
     from verifai_jax.traceability import trace_matrix as trace_matrix
+    from verifai_jax.trials import RealTrials as RealTrials
+    from verifai_jax.trials import compare_trials as compare_trials
+    from verifai_jax.trials import real_trials as real_trials
+    from verifai_jax.trials import trial_protocol as trial_protocol
 
 # Imported when first used (PEP 562), so that importing this package takes milliseconds.
 __getattr__, __dir__, __all__ = _attach(__name__, "__version__")

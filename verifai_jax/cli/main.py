@@ -49,6 +49,7 @@ from verifai_jax.cli.shrink import shrink
 from verifai_jax.cli.sweep import sweep
 from verifai_jax.cli.synthesize import synthesize
 from verifai_jax.cli.trace import trace
+from verifai_jax.cli.trials import trials
 from verifai_jax.core.errors import unknown_name
 
 COMMANDS = (
@@ -75,6 +76,7 @@ COMMANDS = (
     compare,
     report,
     trace,
+    trials,
     new,
 )
 """The sub-commands. Their files import nothing heavy until a command runs."""
