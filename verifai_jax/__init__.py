@@ -134,6 +134,9 @@ if TYPE_CHECKING:
     from verifai_jax.systems.ode import ode as ode
     from verifai_jax.systems.ode import sin_cos as sin_cos
     from verifai_jax.systems.remote import remote as remote
+    from verifai_jax.verification import Verification as Verification
+    from verifai_jax.verification import load_verification as load_verification
+    from verifai_jax.verification import verify as verify
 
 # Imported when first used (PEP 562), so that importing this package takes milliseconds.
 __getattr__, __dir__, __all__ = _attach(__name__, "__version__")

@@ -6,7 +6,7 @@ What an operation does is in the tables of `elementwise.py`, `arrays.py` and `co
 by the name of JAX's primitive.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import jax
@@ -26,6 +26,8 @@ Equation: TypeAlias = Any
 Program: TypeAlias = Any
 """A `Jaxpr` or a `ClosedJaxpr`."""
 Rule: TypeAlias = Callable[["Interpreter", Equation, list[Value]], list[Value]]
+
+Known: TypeAlias = Callable[["Interpreter", list[Value]], list[Value]]
 
 RULES: dict[str, Rule] = {}
 """What each primitive does with sets, by its name."""
@@ -52,10 +54,11 @@ class Interpreter:
 
     - `boxes`: size of the batch.
     - `features`: number of symbols that stand for features.
+    - `known`: rules for functions with a derivative of their own, by the text of their program.
     """
 
-    def __init__(self, boxes: int, features: int) -> None:
-        self.boxes, self.features = boxes, features
+    def __init__(self, boxes: int, features: int, known: Mapping[str, Known] | None = None) -> None:
+        self.boxes, self.features, self.known = boxes, features, known or {}
 
     def program(
         self, program: Program, constants: Sequence[ArrayLike], inputs: Sequence[Value]
