@@ -86,14 +86,34 @@ def _sides(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     **Returns:** `[boxes, numbers, numbers]`, each column a side, and `[boxes, numbers]`.
     """
     scale = np.abs(noise).sum(2)
-    inverse = 1 / np.where(scale > 0, scale, 1.0)
-    unit = noise * inverse[:, :, None]
-    # The longest directions first: those are kept as they are.
-    order = np.argsort(-np.square(unit).sum(1), axis=1)
-    sorted_unit = np.take_along_axis(unit, order[:, None, :], axis=2)
-    turned, _ = np.linalg.qr(sorted_unit)
-    lengths = np.abs(turned.transpose(0, 2, 1) @ unit).sum(2)
-    sides = turned * lengths[:, None, :] * scale[:, :, None]
-    # Only nearly orthogonal: what the projection on the sides leaves is of the order of rounding.
-    missed = np.abs(np.eye(noise.shape[1]) - turned @ turned.transpose(0, 2, 1)).sum(2)
+    count = noise.shape[1]
+    unit = noise / np.where(scale > 0, scale, 1.0)[:, :, None]
+    own = np.arange(count)
+    unit[:, own, own - count] += scale == 0
+    rows = np.arange(len(unit))
+    rest, own_sides, turned = unit, np.empty_like(unit[:, :, :count]), np.empty_like(unit[:, :, :count])
+    for k in range(count):
+        # The longest of what is not spanned yet.
+        longest = np.argmax(np.square(rest).sum(1), axis=1)
+        side = rest[rows, :, longest]
+        side = side / np.linalg.norm(side, axis=1, keepdims=True)
+        turned[:, :, k] = side
+        whole = unit[rows, :, longest]
+        own_sides[:, :, k] = whole / np.linalg.norm(whole, axis=1, keepdims=True)
+        rest = rest - side[:, :, None] * (side[:, None] @ rest)
+    # Sides as they are lose nothing of what they carry, orthogonal ones less of what is new.
+    skewed = _around(unit, own_sides, np.linalg.inv(own_sides))
+    straight = _around(unit, turned, turned.transpose(0, 2, 1))
+    better = np.abs(skewed[0]).sum((1, 2)) <= np.abs(straight[0]).sum((1, 2))
+    sides = np.where(better[:, None, None], skewed[0], straight[0]) * scale[:, :, None]
+    missed = np.where(better[:, None], skewed[1], straight[1])
     return sides, scale * (missed + 2.0**-45) * 2
+
+
+def _around(
+    unit: np.ndarray, frame: np.ndarray, inverse: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sides along a frame, and what an inverse that is not exact misses."""
+    lengths = np.abs(inverse @ unit).sum(2)
+    missed = np.abs(np.eye(unit.shape[1]) - frame @ inverse).sum(2)
+    return frame * lengths[:, None, :], missed
