@@ -11,7 +11,7 @@ PACKAGE = ROOT / "verifai_jax"
 
 LAYERS = (
     {"core", "store", "statistics", "_version"},
-    {"features", "mtl", "systems", "search", "clusters", "native_code"},
+    {"features", "mtl", "systems", "search", "clusters", "native_code", "sets"},
     {"rl", "problem", "perception", "events", "scenes", "blocks"},
     {"evaluation", "policies", "faults"},
     {"falsification"},
@@ -25,6 +25,7 @@ LAYERS = (
         "analysis",
         "compositional",
         "requirements",
+        "verification",
     },
     {"failure_modes", "failure_table", "error_budgets", "trials"},
     {"sweeps", "augmentation", "checking"},

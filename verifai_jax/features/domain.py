@@ -268,6 +268,11 @@ class Domain(ForUsers, abc.ABC):
         return (False,) * (self.size - len(inner)) + inner
 
     @property
+    def monotone(self) -> bool:
+        """True if each number of a value rises with one coordinate alone, or is constant."""
+        return False
+
+    @property
     def tuning(self) -> "Tuning | None":
         """The domain as tools that tune hyper-parameters have it; None for one that they lack."""
         return None
