@@ -27,7 +27,8 @@ class Step(NamedTuple):
 
 class LogDensities(NamedTuple):
     """Natural logarithms of the prior's density: of a failure, of the row at which its search
-    began, and of the likeliest features."""
+    began, and of the likeliest features.
+    """
 
     failure: float
     start: float

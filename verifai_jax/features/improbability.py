@@ -36,7 +36,7 @@ SLIGHT = 0.02
 """Departure of the ends of a box from its middle: what breaks ties between values as likely."""
 REACH, NODES = 5.4, 2161
 """Normal scores between which distributions are tabulated, as far as float32 coordinates reach."""
-STEEP = 1e-6
+STEEP = 1e-13
 """Least rise from node to node of a departure that can be inverted."""
 
 
