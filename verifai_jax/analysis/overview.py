@@ -156,7 +156,7 @@ def analyze(
     **Arguments:**
 
     - `source`: a run, its table, or a DataFrame with feature columns.
-    - `seed`: of all that is drawn at random.
+    - `seed`: the seed of everything that is drawn at random.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     **Returns:** an `Analysis`.

@@ -45,13 +45,14 @@ class Augmentation(InNotebook):
       `hard_error`, the measures of the task, and `why` fewer inputs were added than asked for.
     - `added`: features of all inputs that were added, with `arm`, `seed`, and the `wrongness` of
       the base network.
-    - `error_tables`: of each seed, where an arm needs one: features, `rho`, `violated`, `status`.
-    - `weights`: of each arm and seed, and of the base networks; of a resumed study only those in
-      dictionaries, lists and tuples, since others are not stored.
+    - `error_tables`: the error tables of each seed, where an arm needs one: features, `rho`,
+      `violated`, `status`.
+    - `weights`: the weights of each arm and seed, and of the base networks; of a resumed study only
+      those in dictionaries, lists and tuples, since others are not stored.
     - `options`: numbers and search that it was called with; `hard` is the size of the hard test.
-    - `confidence`: of each interval by itself.
+    - `confidence`: the confidence of each interval by itself.
     - `complete`: False where it was interrupted.
-    - `version`: of verifai_jax.
+    - `version`: the version of verifai_jax.
     """
 
     task: SupervisedTask

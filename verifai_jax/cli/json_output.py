@@ -62,7 +62,7 @@ def give_result(**values: object) -> None:
 
     **Arguments:**
 
-    - `values`: of anything that `as_plain` knows.
+    - `values`: anything that `as_plain` knows.
     """
     context = click.get_current_context(silent=True)
     if context is not None:

@@ -38,7 +38,7 @@ def replacing(path: str | Path, *, locked: bool = False) -> Iterator[Path]:
 
     **Arguments:**
 
-    - `path`: of the file.
+    - `path`: the path of the file.
     - `locked`: whether its folder is there and has no other writer. Then the file that a killed
       process leaves has a name that does not change, and the next writer takes it.
 
@@ -96,8 +96,8 @@ def unwritable(path: str | Path, error: OSError, more: str = "") -> OSError:
 
     **Arguments:**
 
-    - `path`: of the file or folder.
-    - `error`: of the file system; one of this function will do.
+    - `path`: the path of the file or folder.
+    - `error`: the error of the file system; one of this function will do.
     - `more`: what becomes of the results, as a sentence.
 
     **Returns:** an error of the same kind and `errno`, whose message names the path, the reason

@@ -28,7 +28,7 @@ class CSVLogger:
 
     **Arguments:**
 
-    - `path`: of the file; one that is there is continued.
+    - `path`: the path of the file; one that is there is continued.
 
     **Raises:** `ValueError` for a file that is there and has no column `step`.
     """
@@ -77,7 +77,7 @@ class TensorBoardLogger:
 
     **Arguments:**
 
-    - `folder`: of the event file; each logger begins a file of its own in it.
+    - `folder`: the folder of the event file; each logger begins a file of its own in it.
     - `prefix`: before the names of values, such as `"falsify/"`.
     """
 

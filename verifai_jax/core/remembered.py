@@ -78,8 +78,8 @@ def lower_or_recall(
 
     **Arguments:**
 
-    - `name`: of `remembered_as`; None for a program that is not kept.
-    - `function`: of pytrees; is traced where there is no file.
+    - `name`: the name of `remembered_as`; None for a program that is not kept.
+    - `function`: the function of pytrees; is traced where there is no file.
     - `arguments`: their shapes and types.
     - `form`: the structure of what it returns; left out for tuples, lists and dictionaries of
       arrays.

@@ -71,7 +71,9 @@ class Trace(InNotebook):
       `mtl.resample` keeps there what its clock passes over, and verdicts count it.
     - `notes`: what the producer says of this simulation or recording, with how often it happened,
       `{"the solver fell back to Euler": 3}`. A run adds them up and has them among its notes.
-      They are for the host: JAX's transformations drop them.
+    - `units`: units of signals by name, as their recording has them.
+
+    Notes and units are for the host: JAX's transformations drop them.
 
     A signal with masked or missing samples (`numpy.ma`, `None`, `pandas.NA`) has gaps there: they
     become NaN, and no verdict counts what lies under a mask.
@@ -98,6 +100,7 @@ class Trace(InNotebook):
     finite: tuple[str, ...] = ()
     between: "Trace | None" = None
     notes: Mapping[str, int] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not isinstance(self.signals, Mapping):
@@ -272,7 +275,9 @@ class Trace(InNotebook):
     def __str__(self) -> str:
         width = max(map(len, self.signals))
         lines = [f"trace of {self._span()}"]
-        lines += [f"  {n:<{width}}  {_range(s, self.valid)}" for n, s in self.signals.items()]
+        for name, signal in self.signals.items():
+            unit = self.units.get(name, "")
+            lines.append(f"  {name:<{width}}  {_range(signal, self.valid)} {unit}".rstrip())
         lines += [f"  note: {note}" for note in self.notes]
         return "\n".join(lines)
 
@@ -433,7 +438,7 @@ def _unflatten(static: Any, children: Any) -> Trace:
     names, dt, held, finite = static
     values = tuple(children)
     fields = {"signals": dict(zip(names, values, strict=False))}
-    fields |= {"dt": dt, "held": held, "finite": finite, "notes": {}}
+    fields |= {"dt": dt, "held": held, "finite": finite, "notes": {}, "units": {}}
     fields |= dict(zip(_CHILDREN, values[len(names) :], strict=True))
     for name, value in fields.items():
         object.__setattr__(trace, name, value)

@@ -45,7 +45,7 @@ CLOSE = 1e-4
 class ReplayedCounterexample:
     """One file of a corpus, replayed.
 
-    - `path`: of the file.
+    - `path`: the path of the file.
     - `state`: `"failing"`, `"fixed"`, `"without a verdict"`, `"no longer valid"` or `"of another
       problem"`.
     - `robustness`: the least now; NaN without one.

@@ -46,10 +46,11 @@ class SavedCounterexample:
     - `problem`, `target`: names of the problem, in itself and on the command line.
     - `formulas`: their texts by name.
     - `features`: the columns of the feature space.
-    - `robustness`: of each formula, as simulated.
+    - `robustness`: the robustness of each formula, as simulated.
     - `seed`, `row`: of the run and in its table: they decide the random key of the simulation.
     - `precision`, `backend`: that it was simulated with.
-    - `verdict`: of closer replays of the row that it came from; empty if there were none.
+    - `verdict`: the verdict of closer replays of the row that it came from; empty if there were
+      none.
     - `changed`: what departs from nominal, `[nominal, value]` by coordinate, where it was shrunk.
     - `found`: the search, its budget, the number of simulations, the version, and the `sources`:
       what the model was made of, as a run records it.

@@ -50,8 +50,8 @@ class Evaluator:
     - `gradient`: whether the smooth robustness is differentiated too.
     - `clauses`: whether clauses are evaluated, and differentiated, instead.
     - `precision`: `"float32"` or `"float64"`.
-    - `seed`: of the random keys of simulations; as in `falsify`.
-    - `journal`: of rows in flight, for a problem on the host.
+    - `seed`: the seed of the random keys of simulations; as in `falsify`.
+    - `journal`: the journal of rows in flight, for a problem on the host.
     - `executor`: with `concurrent.futures`' `submit`, whose workers simulate; this process when
       left out.
     - `guidance`: what is computed for a search in addition to the robustness.
@@ -173,7 +173,8 @@ class Evaluator:
         **Arguments:**
 
         - `u`: points of the unit cube, or rows of given features.
-        - `temperature`: of the smooth robustness that is differentiated, one for all or one each.
+        - `temperature`: the temperature of the smooth robustness that is differentiated, one for
+          all or one each.
         - `first`: number of the first simulation; numbers go on from those before when left out.
         - `padded_to`, `keep_traces`, `journals`: as of `HostEngine.evaluate`, for a black box.
 

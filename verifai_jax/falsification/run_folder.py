@@ -262,9 +262,9 @@ def write_checkpoint(
     **Arguments:**
 
     - `checkpoint`: the state of the search, with the number of `rows` that it has seen.
-    - `folder`: of the run.
-    - `rows_checksum`: of these rows.
-    - `record_checksum`: of the record.
+    - `folder`: the folder of the run.
+    - `rows_checksum`: the checksum of these rows.
+    - `record_checksum`: the checksum of the record.
     """
     arrays = {name: _plain(value) for name, value in checkpoint.items()}
     arrays[ROWS_CHECKSUM] = np.array(rows_checksum, np.uint32)

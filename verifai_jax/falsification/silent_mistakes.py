@@ -59,9 +59,9 @@ def nominal_note(problem: Problem, evaluate: Evaluator, search: Search) -> tuple
 
     **Arguments:**
 
-    - `problem`: of the run.
+    - `problem`: the problem of the run.
     - `evaluate`: the run's own, compiled.
-    - `search`: of the run.
+    - `search`: the search of the run.
     """
     if problem.nominal is None or problem.system.backends or search.origin == "given":
         return ()
@@ -114,9 +114,9 @@ def notes_after(
 
     **Arguments:**
 
-    - `table`: of the run.
+    - `table`: the table of the run.
     - `formulas`: texts by name.
-    - `search`: of the run.
+    - `search`: the search of the run.
     - `warm`: whether the search began where an earlier run had ended.
     """
     count = len(table) - table.counts.without_verdict
@@ -142,7 +142,7 @@ def cut_short_note(search: Search, total: int | None, simulated: int) -> tuple[s
 
     **Arguments:**
 
-    - `search`: of the run; it has more points to propose.
+    - `search`: the search of the run; it has more points to propose.
     - `total`: points of the whole search; None if it never ends.
     - `simulated`: points of it that were simulated.
     """

@@ -72,7 +72,7 @@ class Tuning(NamedTuple):
     - `scale`: `"linear"`, `"log"` or `"integer"` for what is uniform between the ends on that
       scale, `"choice"`, or `"other"` for what such tools do not have.
     - `low`, `high`: the ends as they were written, not rounded to float32.
-    - `choices`: of a choice.
+    - `choices`: the options of a choice.
     """
 
     scale: Literal["linear", "log", "integer", "choice", "other"]
@@ -132,7 +132,7 @@ class Domain(ForUsers, abc.ABC):
         **Arguments:**
 
         - `value`: as `from_unit` gives it, or as a person writes it.
-        - `name`: of the feature, for the message.
+        - `name`: the name of the feature, for the message.
 
         **Raises:** `ValueError` for a value outside the domain, or of another kind.
         """
@@ -229,7 +229,7 @@ class Domain(ForUsers, abc.ABC):
 
         **Arguments:**
 
-        - `name`: of the feature.
+        - `name`: the name of the feature.
         """
         return ()
 
@@ -268,6 +268,11 @@ class Domain(ForUsers, abc.ABC):
         return (False,) * (self.size - len(inner)) + inner
 
     @property
+    def monotone(self) -> bool:
+        """True if each number of a value rises with one coordinate alone, or is constant."""
+        return False
+
+    @property
     def tuning(self) -> "Tuning | None":
         """The domain as tools that tune hyper-parameters have it; None for one that they lack."""
         return None
@@ -282,7 +287,7 @@ class Domain(ForUsers, abc.ABC):
 
         **Arguments:**
 
-        - `duration`: of the simulation in seconds.
+        - `duration`: the duration of the simulation in seconds.
         """
         return None
 
@@ -302,8 +307,9 @@ class Domain(ForUsers, abc.ABC):
 
         **Arguments:**
 
-        - `name`: of the feature.
-        - `duration`: of a simulation in seconds, for signals that have none of their own.
+        - `name`: the name of the feature.
+        - `duration`: the duration of a simulation in seconds, for signals that have none of their
+          own.
         """
         return self.coordinates(name)
 

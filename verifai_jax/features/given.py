@@ -43,7 +43,7 @@ def given_features(space: FeatureSpace, rows: Rows, precision: str = "float32") 
 
     **Arguments:**
 
-    - `space`: of the features.
+    - `space`: the space of the features.
     - `rows`: a DataFrame with the columns of a table, a row of one, or dictionaries (one or
       several) that hold features by name or by the columns of a table.
     - `precision`: `"float32"` or `"float64"`, of their real numbers.
@@ -81,7 +81,7 @@ def given_rows(space: FeatureSpace, features: Mapping[str, Any]) -> Float[np.nda
 
     **Arguments:**
 
-    - `space`: of the features.
+    - `space`: the space of the features.
     - `features`: `[n, ...]`, as `given_features` gives them.
 
     **Returns:** the points of the unit cube nearest to the features, and after each the real
@@ -104,7 +104,7 @@ def check_columns(
 
     **Arguments:**
 
-    - `space`: of the features.
+    - `space`: the space of the features.
     - `columns`: by name; others than those of features are ignored.
     - `held`: whether features that the space holds at one value are checked too.
 

@@ -42,10 +42,12 @@ class Hardening(Drawn, InNotebook):
       `seconds`.
     - `added`: features of all points that were trained around, with `round` and `source`.
     - `start`, `policy`: before and after.
-    - `policies`: of each arm and round; `chosen`: the round of each arm.
-    - `certificates`: of the policies before, after, and of the baseline's, if there is one, from
-      samples that nothing was trained on or chosen by. Their intervals hold together.
-    - `comparison`: of before and after in pairs; None if the first policy is returned.
+    - `policies`: the policies of each arm and round; `chosen`: the round of each arm.
+    - `certificates`: the certificates of the policies before, after, and of the baseline's, if
+      there is one, from samples that nothing was trained on or chosen by. Their intervals hold
+      together.
+    - `comparison`: the comparison of before and after in pairs; None if the first policy is
+      returned.
     - `returns`: of `"start"` and the arms' chosen policies, episode by episode in pairs.
     - `stopped`: `"certified"`, `"budget"` or `"max_seconds"`.
     - `options`: numbers that it was called with; `notes` for people; `seconds`; `version`.

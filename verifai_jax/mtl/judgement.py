@@ -106,7 +106,7 @@ class Judgement(InNotebook):
 
         **Arguments:**
 
-        - `shares`: of the recordings, from 0 (the least robustness) to 1 (the greatest).
+        - `shares`: the shares of the recordings, from 0 (the least robustness) to 1 (the greatest).
 
         **Returns:** a row for each requirement: how many recordings have a verdict, how many fail,
         how many have none, and a column for each share, by the recording at that rank.

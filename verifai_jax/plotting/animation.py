@@ -62,7 +62,7 @@ def animate(
     **Arguments:**
 
     - `replay`: what `run.replay` returned.
-    - `path`: of a file to write too; folders are made.
+    - `path`: a file that is written too; folders are made.
     - `camera`: the name of a camera of a MuJoCo model; the one that sees best what moves when left
       out.
     - `size`: width and height of a frame in pixels.

@@ -50,7 +50,7 @@ def film(
     **Arguments:**
 
     - `motion`: what `record` returned.
-    - `path`: of the file; folders are made.
+    - `path`: the path of the file; folders are made.
     - `size`: width and height in pixels; `SIZE` when left out.
     - `camera`: as for `frames`.
     - `fps`: frames a second; `FRAMES_PER_SECOND` when left out.
@@ -86,7 +86,7 @@ def strip(
     **Arguments:**
 
     - `motion`: what `record` returned.
-    - `path`: of the file; folders are made.
+    - `path`: the path of the file; folders are made.
     - `count`: instants.
     - `size`: width and height of each in pixels.
     - `camera`: as for `frames`.

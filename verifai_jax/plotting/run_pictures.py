@@ -49,7 +49,7 @@ def write_replay_pictures(
 
     - `replay`: what `run.replay` returned.
     - `folder`: to write into; it is made where there is none.
-    - `name`: of the files, without an ending; by default that of the row.
+    - `name`: the name of the files, without an ending; by default that of the row.
 
     **Returns:** the paths of the pictures.
     """

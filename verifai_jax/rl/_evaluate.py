@@ -47,7 +47,7 @@ def evaluate(
 
     - `task`: the task. An episode ends where it says so, or at its time limit.
     - `policy`: the policy to measure.
-    - `seed`: of the episodes' starts and of what is random in their steps.
+    - `seed`: the seed of the episodes' starts and of what is random in their steps.
     - `episodes`: their number.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
 

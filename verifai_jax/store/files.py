@@ -56,8 +56,9 @@ def replacing_all(folder: Path, names: Sequence[str]) -> Iterator[Path]:
     **Arguments:**
 
     - `folder`: which is there, and has no other writer.
-    - `names`: of all files and folders that belong together, also those that may be missing. The
-      last one is that without which the others are worth nothing: it goes first and comes last.
+    - `names`: the names of all files and folders that belong together, also those that may be
+      missing. The last one is that without which the others are worth nothing: it goes first and
+      comes last.
 
     **Raises:** `OSError` that names `folder`, for whatever the file system refuses.
     """

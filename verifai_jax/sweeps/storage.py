@@ -54,7 +54,7 @@ class StoredSweep(NamedTuple):
     """The contents of a sweep's folder.
 
     - `record`: table, policies, curves and options; without certificates once it was read.
-    - `space`: of the hyper-parameters, where it is known.
+    - `space`: the space of the hyper-parameters, where it is known.
     - `used`: names of the hyper-parameters of each algorithm; empty if all have all.
     - `failing`: counterexamples of all rows, with a column `row`.
     """
@@ -168,7 +168,7 @@ def read_sweep(description: Mapping[str, Any], folder: Path) -> StoredSweep:
 
     **Arguments:**
 
-    - `description`: of the folder, as `read_description` returns it.
+    - `description`: the description of the folder, as `read_description` returns it.
     - `folder`: the folder.
 
     **Raises:** `SweepFileError` where a file is missing or damaged.
