@@ -125,3 +125,26 @@ def test_no_zero_has_a_sign(problem):
     texts = [str(run), str(run.replay(0)), run._repr_html_(), str(run.replay(0).trace)]
     texts += [str(vj.Box(-0.0, 1)), str(vj.parse("x > -0.0"))]
     assert not [text for text in texts if re.search(r"-0(?![.\d])|-0\.0+(?!\d)", text)]
+
+
+@pytest.mark.thorough
+def test_names_of_others_steer_no_terminal_and_draw_no_warnings(tmp_path):
+    # Right-to-left writing, a clear screen, a character that the font lacks; a long name.
+    name, signal = "a\u202eb \N{SLIGHTLY SMILING FACE} " + "long" * 80, "x\x1b[2J"
+
+    def system(features, key):
+        return vj.Trace({signal: features[name] * jnp.ones(4)}, dt=0.5)
+
+    formula = vj.always(vj.signal(signal) < 0.5)
+    odd = vj.Problem(name, {name: vj.Box(-1, 1)}, system, {name: formula}, nominal={name: -1})
+    run = vj.falsify(odd, "uniform", budget=16, batch=16, progress=False)
+    replay = run.replay(run.best)
+    judged = vj.mtl.judge(formula, replay.trace, progress=False)
+    results = [odd, run, replay, replay.trace, judged, vj.confirm(run, progress=False)]
+    results += [vj.shrink(run, progress=False), vj.mtl.explain(formula, replay.trace)]
+    for text in [*map(str, results), *map(repr, results), run.summary(), judged.summary()]:
+        assert not re.search("[\u202e\x1b]", text)
+    assert vj.parse(str(formula)) == formula  # A formula is what a parser reads.
+    replay.plot(tmp_path / "replay.png")
+    [saved] = run.save_counterexamples(tmp_path, max_count=1)
+    assert len(saved.name) < 100

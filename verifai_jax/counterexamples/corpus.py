@@ -74,7 +74,7 @@ class SavedCounterexample:
         """Name of its file: the problem's, and a digest of what decides the simulation."""
         deciding = [self.problem, self.formulas, self.features, self.seed, self.row]
         text = json.dumps(deciding, sort_keys=True)
-        stem = re.sub(r"\W+", "-", self.problem).strip("-") or "counterexample"
+        stem = re.sub(r"\W+", "-", self.problem).strip("-")[:60] or "counterexample"
         return f"{stem}-{hashlib.sha256(text.encode()).hexdigest()[:10]}.json"
 
     def write(self, folder: Path) -> Path:
