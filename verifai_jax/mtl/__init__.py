@@ -8,6 +8,7 @@ from verifai_jax.mtl._robustness import robustness, robustness_signal, satisfied
 from verifai_jax.mtl._smoothing_error import SmoothingError, smoothing_error
 from verifai_jax.mtl.c_monitor import export_c
 from verifai_jax.mtl.counting import durations
+from verifai_jax.mtl.dense import dense_robustness, dense_signal
 from verifai_jax.mtl.evaluate import End, IntervalError
 from verifai_jax.mtl.expression import Expression, signal
 from verifai_jax.mtl.formula import FALSE, TRUE, Formula
@@ -44,11 +45,12 @@ __all__ = [
     "FALSE", "TRUE", "End", "Explanation", "Expression", "Formula", "FormulaSyntaxError",
     "HorizonError", "IntervalError", "Judgement", "Mined", "Online", "Requirement",
     "SamplingError", "Semantics", "SmoothingError", "TimeColumnError", "Watch", "always",
-    "anneal", "boolean", "draw", "durations", "during", "eventually", "explain", "export_c",
-    "fall", "hard", "historically", "judge", "latex", "mine", "next_", "nnf", "normalize",
-    "once", "online", "parse", "phase", "prev", "read", "read_requirements", "resample", "rise",
-    "robustness", "robustness_signal", "satisfied", "signal", "simplify", "since", "smooth",
-    "smoothing_error", "sometime_during", "until", "watch",
+    "anneal", "boolean", "dense_robustness", "dense_signal", "draw", "durations", "during",
+    "eventually", "explain", "export_c", "fall", "hard", "historically", "judge", "latex",
+    "mine", "next_", "nnf", "normalize", "once", "online", "parse", "phase", "prev", "read",
+    "read_requirements", "resample", "rise", "robustness", "robustness_signal", "satisfied",
+    "signal", "simplify", "since", "smooth", "smoothing_error", "sometime_during", "until",
+    "watch",
 ]  # fmt: skip
 
 

@@ -27,7 +27,7 @@ from verifai_jax.mtl.tree import missing_case, postorder
 
 Values = Float[np.ndarray, "time *lanes"]
 
-_FUNCTIONS: dict[str, Callable[..., Values]] = {
+FUNCTIONS: dict[str, Callable[..., Values]] = {
     "neg": np.negative,
     "+": np.add,
     "-": np.subtract,
@@ -42,6 +42,7 @@ _FUNCTIONS: dict[str, Callable[..., Values]] = {
     "min": lambda *values: _joined(values, -1),
     "max": lambda *values: _joined(values, 1),
 }
+"""The functions of expressions on the host, but for `norm`."""
 
 
 @dataclass
@@ -69,10 +70,10 @@ class HostValues:
         """
         check_trace(trace)
         dt, trace = period(trace), trace.trim()
-        signals = {name: _numbers(signal) for name, signal in trace.signals.items()}
+        signals = {name: numbers(signal) for name, signal in trace.signals.items()}
         if trace.between is not None:
             for name, own in signals.items():
-                inner = _numbers(trace.between.signals[name])
+                inner = numbers(trace.between.signals[name])
                 rows = inner.reshape(trace.length, -1, *own.shape[1:])
                 joined = np.concatenate([own[:, None], rows], axis=1)
                 signals[name] = joined.reshape(-1, *own.shape[1:])
@@ -178,7 +179,7 @@ class HostValues:
                 case Arithmetic("norm", (vector,)):
                     values[id(part)] = np.sqrt(np.sum(values[id(vector)] ** 2, axis=-1))
                 case Arithmetic(name, arguments):
-                    values[id(part)] = _FUNCTIONS[name](*(values[id(a)] for a in arguments))
+                    values[id(part)] = FUNCTIONS[name](*(values[id(a)] for a in arguments))
                 case _:
                     raise missing_case("the value", part)
         return values[id(e)]
@@ -192,7 +193,8 @@ class HostValues:
         return padded[name]
 
 
-def _numbers(signal: object) -> Values:
+def numbers(signal: object) -> Values:
+    """Return a signal in double precision, a truth value as 1 or -1."""
     array = np.asarray(without_wrapping(signal))  # pyright: ignore[reportArgumentType]
     return np.where(array, 1.0, -1.0) if array.dtype == bool else array.astype(float)
 
