@@ -7,6 +7,12 @@ from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl._robustness import robustness, robustness_signal, satisfied
 from verifai_jax.mtl._smoothing_error import SmoothingError, smoothing_error
 from verifai_jax.mtl.c_monitor import export_c
+from verifai_jax.mtl.calibrated import (
+    DomainMonitor,
+    PredictiveMonitor,
+    domain_monitor,
+    predictive_monitor,
+)
 from verifai_jax.mtl.counting import durations
 from verifai_jax.mtl.dense import dense_robustness, dense_signal
 from verifai_jax.mtl.evaluate import End, IntervalError
@@ -42,12 +48,13 @@ from verifai_jax.mtl.setting import HorizonError, SamplingError
 from verifai_jax.mtl.watching import Watch, watch
 
 __all__ = [
-    "FALSE", "TRUE", "End", "Explanation", "Expression", "Formula", "FormulaSyntaxError",
-    "HorizonError", "IntervalError", "Judgement", "Mined", "Online", "Requirement",
-    "SamplingError", "Semantics", "SmoothingError", "TimeColumnError", "Watch", "always",
-    "anneal", "boolean", "dense_robustness", "dense_signal", "draw", "durations", "during",
-    "eventually", "explain", "export_c", "fall", "hard", "historically", "judge", "latex",
-    "mine", "next_", "nnf", "normalize", "once", "online", "parse", "phase", "prev", "read",
+    "FALSE", "TRUE", "DomainMonitor", "End", "Explanation", "Expression", "Formula",
+    "FormulaSyntaxError", "HorizonError", "IntervalError", "Judgement", "Mined", "Online",
+    "PredictiveMonitor", "Requirement", "SamplingError", "Semantics", "SmoothingError",
+    "TimeColumnError", "Watch", "always", "anneal", "boolean", "dense_robustness",
+    "dense_signal", "domain_monitor", "draw", "durations", "during", "eventually", "explain",
+    "export_c", "fall", "hard", "historically", "judge", "latex", "mine", "next_", "nnf",
+    "normalize", "once", "online", "parse", "phase", "predictive_monitor", "prev", "read",
     "read_requirements", "resample", "rise", "robustness", "robustness_signal", "satisfied",
     "signal", "simplify", "since", "smooth", "smoothing_error", "sometime_during", "until",
     "watch",

@@ -103,12 +103,13 @@ class _Dense:
         value = (until if ahead else since)(left, right)
         width = i.end - i.start
         if math.isfinite(width):
-            near = window(right, *((0.0, width) if ahead else (-width, 0.0)), 1)
+            near = window(right, 0.0 if ahead else -width, width if ahead else 0.0, 1)
             value = joined([value, near], -1)
         if i.start == 0:
             return value
-        later = window(value, *(2 * [i.start if ahead else -i.start]), 1)
-        span = (0.0, i.start) if ahead else (-i.start, 0.0)
+        shift = i.start if ahead else -i.start
+        later = window(value, shift, shift, 1)
+        span = min(0.0, shift), max(0.0, shift)
         kept = window(left, *span, -1, open_right=ahead, open_left=not ahead)
         return joined([kept, later], -1)
 

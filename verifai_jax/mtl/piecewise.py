@@ -38,11 +38,11 @@ class Piecewise:
     def map(self, function: Callable[..., Values], *others: "Piecewise") -> "Piecewise":
         """Apply a function that is linear on each piece; all have the same times."""
         with np.errstate(all="ignore"):
-            parts = [
+            point, right, left = (
                 function(*(getattr(f, part) for f in (self, *others)))
                 for part in ("point", "right", "left")
-            ]
-        return Piecewise(self.times, *parts, self.snap)
+            )
+        return Piecewise(self.times, point, right, left, self.snap)
 
     @property
     def steps(self) -> bool:
