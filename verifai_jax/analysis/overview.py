@@ -106,10 +106,10 @@ class Analysis(Drawn):
     def save(self, folder: str | Path) -> Path:
         """Write `report.md` and pictures to a folder; return the path of the report.
 
-        **Raises:** `FileExistsError` where the folder's name is that of a file.
+        **Raises:** `OSError` for what the file system refuses, such as a folder whose name is
+        that of a file.
         """
         path = Path(folder)
-        path.mkdir(parents=True, exist_ok=True)
         lines = [f"# {html.escape(one_line(self.name))}", ""]
         if self.samples is not None:
             self.plot(path / "overview.png")

@@ -133,7 +133,8 @@ def augment(
             complete = False
         result = study.result(chosen, confidence, complete)
     if folder is not None:
-        result.save(folder)
+        with cache.writing(folder):
+            result.save(folder)
     return result
 
 

@@ -88,7 +88,6 @@ def show_result(found: Any, plot: Path | None, *names: str) -> None:
 
 def draw(found: Any, path: Path) -> None:
     """Draw a result into a file, whose folder is made, and say where it is."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     found.plot(path)
     click.echo(f"  picture      {path}")
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from verifai_jax.cli.arguments import PLOT, split_pairs
+from verifai_jax.cli.arguments import NAMES, PLOT, read_names
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result
@@ -40,8 +40,7 @@ if TYPE_CHECKING:
     help="Semantics after the last sample.",
 )
 @click.option("--compat", type=click.Choice(["pymtl"]), help="Right-open windows, as in py-mtl.")
-@click.option("--const", "constants", multiple=True, metavar="NAME=NUMBER")
-@click.option("--define", "definitions", multiple=True, metavar="NAME=FORMULA")
+@NAMES
 @click.option(
     "--export-c",
     "header",
@@ -74,8 +73,8 @@ def monitor(
 ) -> None:
     """Compute the robustness of FORMULA on a recorded trace, RECORDING.csv or .parquet.
 
-    FORMULA may also be a file of requirements (.toml or .csv), and RECORDING a folder, or several:
-    every requirement is judged on every recording.
+    FORMULA may also be a file of requirements (.toml, .yaml, .csv or .reqif), and RECORDING a
+    folder, or several: every requirement is judged on every recording.
 
     With - as RECORDING, lines of CSV are read from the standard input as they come, until the
     verdict is certain whatever follows: tail -f log.csv | verifai-jax monitor FORMULA -
@@ -89,8 +88,7 @@ def monitor(
 
     if (explain or plot is not None) and compat is not None:
         raise click.UsageError("--explain and --plot do not go with --compat")
-    numbers = {name: _number(name, value) for name, value in split_pairs("--const", constants)}
-    named = dict(split_pairs("--define", definitions))
+    numbers, named = read_names(constants, definitions)
     if header is not None:
         if recording or dt is None:
             raise click.UsageError("--export-c goes with --dt SECONDS, and with no RECORDING")
@@ -186,10 +184,3 @@ def _check_signals(formula: "Formula", trace: "Trace", recording: Path) -> None:
             mtl.read(recording, dt=1.0, columns=[name])
         except UnknownNameError:
             raise missing_name(str(recording), "signal", name, trace.signals) from None
-
-
-def _number(name: str, value: str) -> float:
-    try:
-        return float(value)
-    except ValueError:
-        raise click.UsageError(f"--const {name} must be a number; got {value!r}") from None

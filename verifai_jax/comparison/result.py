@@ -129,7 +129,7 @@ class Comparison(InNotebook):
         **Arguments:**
 
         - `path`: the path of the HTML file.
-        - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`.
+        - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`, `errors`.
 
         **Returns:** the path.
         """

@@ -62,7 +62,7 @@ class Candidates:
         self.rho = np.zeros(0)
         self.failing = np.zeros(0, bool)
         self.temperature = 1.0
-        self.differentiable = not problem.black_box
+        self.differentiable = not problem.black_box and 0 in nominal.space.levels
         self.note = ""
         self.without_verdict, self.trouble = 0, ""
 

@@ -87,7 +87,7 @@ class SavedCounterexample:
             words = ["verifai-jax", "replay-counterexamples", self.target, str(path)]
             content["reproduce"] = shlex.join(words)
         with replacing(path) as partial:
-            partial.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+            partial.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", "utf-8")
         return path
 
     @classmethod
@@ -97,7 +97,7 @@ class SavedCounterexample:
         **Raises:** `CorpusError` for anything else.
         """
         try:
-            content = json.loads(path.read_text())
+            content = json.loads(path.read_text(encoding="utf-8-sig"))
         except (OSError, ValueError, RecursionError) as error:
             raise CorpusError(f"{path} cannot be read: {one_line(format_error(error))}") from None
         form = content.get("format") if isinstance(content, dict) else None
@@ -201,7 +201,6 @@ def save_counterexamples(
     ordered = claimed.sort_values("rho", kind="stable")
     points = problem.space.points(ordered)
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     paths: dict[Path, None] = {}
     for index in _spread(points, max_count):
         row = int(ordered.index[index])

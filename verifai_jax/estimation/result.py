@@ -178,7 +178,7 @@ class Estimate(Drawn, InNotebook):
         **Arguments:**
 
         - `path`: the path of the HTML file.
-        - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`.
+        - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`, `errors`.
 
         **Returns:** the path.
         """

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.figure import Drawn
 from verifai_jax.core.notebook import InNotebook, frame_html
@@ -136,8 +137,11 @@ class FailureTable(Drawn, InNotebook):
         **Arguments:**
 
         - `path`: the path of the file.
+
+        **Raises:** `OSError` that names the file, for whatever the file system refuses.
         """
-        self.table.to_csv(path)
+        with replacing(path) as partial:
+            self.table.to_csv(partial)
 
     def replay(self, name: str) -> Any:
         """Simulate the counterexample of a row again, and keep the trace.

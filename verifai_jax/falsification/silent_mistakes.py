@@ -91,7 +91,9 @@ def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
         "the nominal point", jax.jit(lambda: space.flatten(varied)).lower(), "least"
     )
     u = np.asarray(flatten(), np.float32)
-    verdict = engine.evaluate(u[None], evaluate.key, 0)
+    # The engine may be one of rows that carry given features.
+    rows = u[None] if problem.black_box else evaluate.rows_of(u[None])
+    verdict = engine.evaluate(rows, evaluate.key, 0)
     if not verdict.violated[0]:
         return ()
     return (

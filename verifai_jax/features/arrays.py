@@ -84,6 +84,10 @@ class Array(Domain):
     def from_unit(self, u: Float[jax.Array, " size"]) -> PyTree:
         return jax.vmap(self.domain.from_unit)(u.reshape(self.length, self.domain.size))
 
+    @property
+    def monotone(self) -> bool:
+        return self.domain.monotone
+
     def to_unit(self, value: PyTree) -> Float[jax.Array, " size"]:
         return jnp.ravel(jax.vmap(self.domain.to_unit, axis_size=self.length)(value))
 

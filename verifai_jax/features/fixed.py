@@ -52,6 +52,10 @@ class Fixed(Domain):
 
         return self.domain.coerce(jax.tree.map(cast, self.value))
 
+    @property
+    def monotone(self) -> bool:
+        return True
+
     def to_unit(self, value: PyTree) -> Float[Array, "0"]:
         return jnp.zeros(0, jnp.result_type(float))
 

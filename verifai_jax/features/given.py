@@ -22,7 +22,7 @@ from verifai_jax.features.arrays import Array, VariableArray
 from verifai_jax.features.box import Box
 from verifai_jax.features.compound import Struct
 from verifai_jax.features.continuous import Continuous
-from verifai_jax.features.domain import Domain, as_numbers, dotted
+from verifai_jax.features.domain import Domain, as_numbers, as_scalar, dotted
 from verifai_jax.features.signal import Signal
 from verifai_jax.features.space import FeatureSpace
 
@@ -113,12 +113,31 @@ def check_columns(
     for name in space.columns:
         if name not in columns:
             raise unknown_name("column", name, columns)
-    own = {name: np.asarray(columns[name]) for name in space.columns}
+    own = {name: _column(columns[name], name) for name in space.columns}
     features = _converted(space, own, "float64")
     for name, domain in space.domains.items():
         if held or domain.size:
             _check_batch(domain, features[name], own, name)
     return features
+
+
+def _column(entries: Any, name: str) -> np.ndarray:
+    """Return a column of a table `[n]`, each entry of which is one value.
+
+    **Raises:** `ValueError` for an entry that is several, such as a list.
+    """
+    column = np.asarray(entries)
+    if column.dtype == object and column.ndim == 1:
+        column = np.fromiter(map(as_scalar, column), object, len(column))
+    several = [each for each in column if _is_several(each)] if column.dtype == object else []
+    if column.ndim != 1 or several:
+        shown = several[0] if several else column[0].tolist()
+        raise ValueError(f"{name} must be one value in each row; got {shown!r}")
+    return column
+
+
+def _is_several(entry: object) -> bool:
+    return isinstance(entry, Iterable) and not isinstance(entry, str | bytes)
 
 
 def _converted(
@@ -142,7 +161,7 @@ def _of_columns(space: FeatureSpace, columns: Mapping[str, Any], precision: str)
     features = check_columns(space, columns)
     _check_absent(space, columns)
     if precision != "float64":
-        own = {name: np.asarray(columns[name]) for name in space.columns}
+        own = {name: _column(columns[name], name) for name in space.columns}
         features = _converted(space, own, precision)
     count = len(jax.tree.leaves(features)[0])
     if space.where is not None and count:

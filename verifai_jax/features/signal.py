@@ -122,6 +122,10 @@ class Signal(Domain):
         knots = jax.vmap(self.domain.from_unit)(u.reshape(self.knots, self.domain.size))
         return self.waveform(knots)
 
+    @property
+    def monotone(self) -> bool:
+        return self.domain.monotone
+
     def to_unit(self, value: Waveform) -> Float[Array, " size"]:
         return jnp.ravel(jax.vmap(self.domain.to_unit)(value.knots))
 

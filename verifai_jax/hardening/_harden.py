@@ -183,7 +183,8 @@ def harden(
         work = Work(made, plan, values, untrained, start, cache)
         result = work.run(max_seconds)
     if folder is not None:
-        result.save(folder)
+        with cache.writing(folder):
+            result.save(folder)
     return result
 
 

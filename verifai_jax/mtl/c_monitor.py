@@ -220,7 +220,7 @@ def export_c(
     **Arguments:**
 
     - `dt`: sampling period in seconds.
-    - `name`: of the type in C, and before the names of its functions.
+    - `name`: the name of the type in C, and before the names of its functions.
     - `semantics`: `hard` or `boolean`.
     - `every`: whether each formula is asked at every instant, or at time 0.
     - `sizes`: number of components of each signal of which the formulas take a norm.

@@ -221,7 +221,6 @@ class Judgement(InNotebook):
             )
             for row in rows:
                 _case(suite, each, row)
-        path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as partial:
             ElementTree.ElementTree(root).write(partial, encoding="utf-8", xml_declaration=True)
         return path

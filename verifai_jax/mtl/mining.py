@@ -30,7 +30,7 @@ from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.mtl.parametric import Parametric, read_parametric
-from verifai_jax.mtl.recorded import Recordings, Simulated, as_recordings
+from verifai_jax.mtl.recorded import Recordings, Simulated, named_traces
 from verifai_jax.mtl.words import number_text
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
 
@@ -139,7 +139,7 @@ def mine(
         return lazy_import("verifai_jax.requirements", "mine_by_search")(
             template, recordings, budget, seed, confidence
         )
-    return mine_template(template, as_recordings(recordings), share, end, confidence)
+    return mine_template(template, tuple(named_traces(recordings).values()), share, end, confidence)
 
 
 def mine_template(

@@ -6,9 +6,7 @@ library(rows, key, first, temperatures, numbers)    # [n, count] of bits
 """
 
 import ctypes
-import os
 import platform
-import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -17,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt32
 
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.cores import available_cores
 from verifai_jax.core.machine_code import (
     Program,
@@ -144,9 +143,8 @@ def is_approved(name: str) -> bool | None:
 def approve(name: str, agrees: bool) -> None:
     """Note whether a library computes what XLA does, for later processes."""
     try:
-        with tempfile.NamedTemporaryFile(dir=library_folder(), delete=False) as file:
-            file.write((b"no", b"yes")[agrees])
-        os.replace(file.name, library_folder() / f"{name}.agrees")
+        with replacing(library_folder() / f"{name}.agrees") as partial:
+            partial.write_bytes((b"no", b"yes")[agrees])
     except (OSError, Unavailable):
         return  # It is compared again.
 

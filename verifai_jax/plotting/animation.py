@@ -37,7 +37,6 @@ class Animation:
         """
         _check_gif(path)
         path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as partial:
             partial.write_bytes(self.gif)
         return path
