@@ -3,11 +3,11 @@
 import itertools
 from collections.abc import Callable, Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from verifai_jax.sets import functions
-from verifai_jax.sets.elementwise import select
+from verifai_jax.sets import functions, whole
 from verifai_jax.sets.form import Form, is_point, product, rounded, total
 from verifai_jax.sets.interpreter import (
     Equation,
@@ -18,6 +18,7 @@ from verifai_jax.sets.interpreter import (
     as_whole,
     rule,
 )
+from verifai_jax.sets.elementwise import select
 from verifai_jax.sets.whole import Whole
 
 Move = Callable[[Params, np.ndarray, int], np.ndarray]
@@ -104,7 +105,10 @@ def together(values: Sequence[Value], join: Callable[[list[np.ndarray], int], np
             padded.append(own)
         slopes = leading(padded, 2)
     low = high = None
-    if all(f.low is not None for f in forms) or not all(np.isfinite(f.radius).all() for f in forms):
+    if all(f.low is not None for f in forms):
+        ends = [f.bounds() for f in forms]
+        low, high = (leading([end[side] for end in ends], 1) for side in (0, 1))
+    elif not all(np.isfinite(f.radius).all() for f in forms):
         ends = [f.bounds() for f in forms]
         low, high = (leading([end[side] for end in ends], 1) for side in (0, 1))
     return Form(

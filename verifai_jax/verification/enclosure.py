@@ -22,7 +22,7 @@ from verifai_jax.core.fingerprint import without_unused
 from verifai_jax.core.precision import in_precision
 from verifai_jax.evaluation.verdicts import boolean_semantics, trace_verdict
 from verifai_jax.problem.problem import Problem
-from verifai_jax.sets import Form, Interpreter, Whole
+from verifai_jax.sets import Form, Interpreter, MissingRule, Whole
 from verifai_jax.sets.interpreter import Value, as_form, as_whole, constant
 from verifai_jax.systems.ode import sin_cos
 

@@ -21,7 +21,7 @@ from verifai_jax.core.text import counted, format_percent, format_seconds
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.confidence_sequences import anytime_interval
 from verifai_jax.store.files import DamagedError, read_record, write_record
-from verifai_jax.verification.boxes import BROKEN, OUTSIDE, PROVED, Boxes
+from verifai_jax.verification.boxes import BROKEN, OPEN, OUTSIDE, PROVED, Boxes
 
 KIND = "verification"
 
