@@ -37,7 +37,7 @@ TAUGHT = 20_000
 
 
 class Model(Protocol):
-    """What learns to predict, as in scikit-learn."""
+    """A regressor that learns and predicts, as those of scikit-learn."""
 
     def fit(self, x: np.ndarray, y: np.ndarray) -> object:
         """Learn from rows `[n, d]` and values `[n]`."""

@@ -46,7 +46,7 @@ class Piecewise:
 
     @property
     def steps(self) -> bool:
-        """Whether every piece is constant."""
+        """True if every piece is constant."""
         return bool(np.all((self.right == self.left) | np.isnan(self.right)))
 
     def index(self, times: Values, after: bool = False) -> np.ndarray:

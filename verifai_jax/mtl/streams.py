@@ -62,7 +62,7 @@ class Output(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """What monitors of several formulas do at each sample.
+    """The operations of monitors of several formulas at each sample.
 
     - `leaves`: the leaves with the sign of their margin.
     - `top`: the greatest value: infinity, or 1 for truth values.
