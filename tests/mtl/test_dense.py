@@ -149,3 +149,12 @@ def test_what_has_no_meaning_between_samples_is_refused():
     with pytest.raises(ValueError, match="no verdict: signal 'x' is NaN"):
         mtl.dense_robustness("x > 0", Trace({"x": np.array([0.0, np.nan])}, dt=1.0))
     assert mtl.dense_robustness("always[0, 0.9] ok", trace) == 1.0
+
+
+def test_the_slope_in_a_time_is_that_of_the_signal_at_the_end_of_the_window():
+    trace = Trace({"x": np.array([4.0, 3.0, 1.0, 2.0])}, dt=1.0)
+    text = "always[?a, ?b] x > ?d"
+    slopes = mtl.dense_gradient(text, trace, {"a": 0.0, "b": 1.5, "d": 0.5})
+    assert slopes == pytest.approx({"a": 0.0, "b": -2.0, "d": -1.0}, abs=1e-6)
+    slopes = mtl.dense_gradient(text, trace, {"a": 2.25, "b": 3.0, "d": 0.5})
+    assert slopes == pytest.approx({"a": 1.0, "b": 0.0, "d": -1.0}, abs=1e-6)

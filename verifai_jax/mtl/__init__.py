@@ -14,7 +14,7 @@ from verifai_jax.mtl.calibrated import (
     predictive_monitor,
 )
 from verifai_jax.mtl.counting import durations
-from verifai_jax.mtl.dense import dense_robustness, dense_signal
+from verifai_jax.mtl.dense import dense_gradient, dense_robustness, dense_signal
 from verifai_jax.mtl.distinguishing import Distinction, distinguish
 from verifai_jax.mtl.evaluate import End, IntervalError
 from verifai_jax.mtl.exemplary import Examples, examples
@@ -58,13 +58,14 @@ __all__ = [
     "Expression", "Finding", "Findings", "Formula", "FormulaSyntaxError", "HorizonError",
     "IntervalError", "Judgement", "Mined", "Mutant", "Mutants", "Online", "PredictiveMonitor",
     "Requirement", "SamplingError", "Semantics", "SmoothingError", "Template",
-    "TimeColumnError", "Watch", "always", "anneal", "boolean", "dense_robustness",
-    "dense_signal", "distinguish", "domain_monitor", "draw", "durations", "during",
-    "eventually", "examples", "explain", "export_c", "fall", "hard", "historically", "judge",
-    "latex", "lint", "mine", "mutants", "next_", "nnf", "normalize", "once", "online", "parse",
-    "phase", "predictive_monitor", "prev", "read", "read_requirements", "resample", "rise",
-    "robustness", "robustness_signal", "satisfied", "signal", "simplify", "since", "smooth",
-    "smoothing_error", "sometime_during", "templates", "until", "watch", "write_requirements",
+    "TimeColumnError", "Watch", "always", "anneal", "boolean", "dense_gradient",
+    "dense_robustness", "dense_signal", "distinguish", "domain_monitor", "draw", "durations",
+    "during", "eventually", "examples", "explain", "export_c", "fall", "hard", "historically",
+    "judge", "latex", "lint", "mine", "mutants", "next_", "nnf", "normalize", "once", "online",
+    "parse", "phase", "predictive_monitor", "prev", "read", "read_requirements", "resample",
+    "rise", "robustness", "robustness_signal", "satisfied", "signal", "simplify", "since",
+    "smooth", "smoothing_error", "sometime_during", "templates", "until", "watch",
+    "write_requirements",
 ]  # fmt: skip
 
 

@@ -8,7 +8,7 @@ window, whose ends belong to it, so the robustness at the samples alone is no gu
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -18,10 +18,15 @@ from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
 from verifai_jax.mtl.formula import Formula, Term
 from verifai_jax.mtl.host_values import FUNCTIONS, numbers
+from verifai_jax.mtl.parametric import read_parametric
 from verifai_jax.mtl.piecewise import SNAP, Piecewise, aligned, joined, since, until, window
 from verifai_jax.mtl.resampling import Method
 from verifai_jax.mtl.setting import check_trace
 from verifai_jax.mtl.tree import missing_case, postorder
+
+STEP = 1e-6
+"""Share of a parameter by which it is moved for a slope: far above rounding, and far below the
+distance of kinks."""
 
 
 def dense_robustness(formula: Formula | str, trace: Trace, method: Method = "linear") -> float:
@@ -36,6 +41,35 @@ def dense_robustness(formula: Formula | str, trace: Trace, method: Method = "lin
     as `x * y` or `sin(x)` of signals that are not held, which are not straight between samples.
     """
     return float(dense_signal(formula, trace, method).point[0])
+
+
+def dense_gradient(
+    formula: str, trace: Trace, values: Mapping[str, float], method: Method = "linear"
+) -> dict[str, float]:
+    """Compute the slope of the robustness in each parameter `?name`, ends of intervals included.
+
+    Between samples the robustness is piecewise linear in times, which it is not at the samples, so
+    a quotient of differences is the slope; where it has a kink, the mean of both sides.
+
+    **Arguments:**
+
+    - `formula`: its text, as for `mine`.
+    - `values`: of all parameters.
+    """
+    template = read_parametric(formula)
+    slopes: dict[str, float] = {}
+    for name in template.names:
+        near = STEP * max(1.0, abs(values[name]))
+        low = values[name] - near
+        if name in template.times:
+            low = max(low, 0.0)
+        sides = low, values[name] + near
+        first, last = (
+            dense_robustness(template.formula({**values, name: side}), trace, method)
+            for side in sides
+        )
+        slopes[name] = (last - first) / (sides[1] - sides[0])
+    return slopes
 
 
 def dense_signal(formula: Formula | str, trace: Trace, method: Method = "linear") -> Piecewise:
