@@ -14,10 +14,11 @@ reliability analysis, Probabilistic Engineering Mechanics 33 (2013), for the res
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from verifai_jax.core.programs import power_of_two
 from verifai_jax.core.text import format_percent
@@ -30,6 +31,7 @@ from verifai_jax.estimation.answers import (
     bound_from_pilot,
 )
 from verifai_jax.estimation.components import Prior
+from verifai_jax.estimation.fitting import effective_size
 from verifai_jax.estimation.importance import ImportanceSamples
 from verifai_jax.estimation.mixture import Mixture
 from verifai_jax.estimation.monte_carlo import Counts
@@ -49,8 +51,13 @@ LEARNING, MAX_LEARNING = 0.5, 400
 estimate."""
 ROUNDS = 10
 """Rounds of learning."""
-CAUTION = 2.0
-"""Standard deviations by which a point may be off and still count as failing, while learning."""
+CAUTION, MARGIN = 2.0, 0.5
+"""Standard deviations by which a point may be off and still count as failing, while learning and
+while the proposal is fitted."""
+SCALES = np.array([1.0, 1.4, 1.8, 2.4, 3.2])
+WIDENED, ENOUGH = 8000, 100
+"""Samples of the prior widened by these factors, and the number of independent failures of the
+surrogate among them that makes splitting superfluous."""
 SETTLED = 0.01
 """Expected share of the surrogate's failures that are none, or are missed, at which it is good, and
 all learning is spent on looking for others."""
@@ -201,10 +208,9 @@ def _learn(limit_state: LimitState, rng: np.random.Generator, surrogate: Surroga
         size = min(size, int(limit_state.left - until) + 1)
         anywhere = _spread(limit_state, rng, CHUNK)
         unknown = _least_sure(np.zeros(len(anywhere)), surrogate.covariance(anywhere), size)
-        population = _failures_of(limit_state, rng, surrogate, CAUTION).points
+        population, _ = _failures_of(limit_state, rng, surrogate, CAUTION)
         if not len(population):
             population = limit_state.sample_prior(rng, PER_LEVEL)
-        population = population[rng.permutation(len(population))[:PER_LEVEL]]
         mean, std = surrogate.predict(population)
         wrong = ndtr(-np.abs(mean) / std)
         doubt = float(wrong.sum() / max(np.sum(mean < 0), 1.0))
@@ -252,20 +258,42 @@ def _state_of(limit_state: LimitState, surrogate: Surrogate, caution: float) -> 
 
 def _failures_of(
     limit_state: LimitState, rng: np.random.Generator, surrogate: Surrogate, caution: float
-) -> SplittingRun:
-    return run_splitting(_state_of(limit_state, surrogate, caution), rng, PER_LEVEL, CHAINS)
+) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, " n"]]:
+    """Return failures of the surrogate, distributed about as the prior's, and chains they come from.
+
+    Samples of the widened prior have no slope to follow, which may mislead; where they are too few,
+    splitting finds more.
+    """
+    state = _state_of(limit_state, surrogate, caution)
+    scale = np.repeat(SCALES, WIDENED // len(SCALES))[:, None]
+    z = rng.standard_normal((len(scale), limit_state.dim)) * scale
+    z = z[limit_state.accepts(z)]
+    z = z[state(z).failing]
+    square = np.sum(z**2, axis=1, keepdims=True) / 2
+    density = square * (1 - SCALES**-2.0) - limit_state.dim * np.log(SCALES)
+    weight = 1 / np.mean(np.exp(density), axis=1)
+    effective = effective_size(weight) if len(z) else 0.0
+    rows = np.zeros(0, int)
+    if len(z):
+        rows = rng.choice(len(z), PER_LEVEL, p=weight / weight.sum())
+    points, chain_ids = z[rows], rows
+    if effective < ENOUGH:
+        run = run_splitting(state, rng, PER_LEVEL, CHAINS)
+        if len(run.points):
+            points = np.concatenate([points, run.points])
+            chain_ids = np.concatenate([chain_ids, len(z) + run.chain_ids])
+    order = rng.permutation(len(points))[:PER_LEVEL]
+    return points[order], chain_ids[order]
 
 
 def _proposal(limit_state: LimitState, rng: np.random.Generator, surrogate: Surrogate) -> Mixture:
     """Fit a proposal to the failures of the surrogate; the prior if it has none."""
-    prior = Mixture((Prior(limit_state.dim),), np.ones(1))
-    if surrogate.posterior is None:
-        return prior
-    run = _failures_of(limit_state, rng, surrogate, 0.5)
-    if len(run.points) < 10:
-        return prior
-    state = _state_of(limit_state, surrogate, 0.5)
-    return importance.fit_proposal(state, rng, run.points, run.chain_ids, FITTING).proposal
+    if surrogate.posterior is not None:
+        points, chain_ids = _failures_of(limit_state, rng, surrogate, MARGIN)
+        if len(points) >= MIN_FAILING:
+            state = _state_of(limit_state, surrogate, MARGIN)
+            return importance.fit_proposal(state, rng, points, chain_ids, FITTING).proposal
+    return Mixture((Prior(limit_state.dim),), np.ones(1))
 
 
 def _sample(
