@@ -259,7 +259,7 @@ def _state_of(limit_state: LimitState, surrogate: Surrogate, caution: float) -> 
 def _failures_of(
     limit_state: LimitState, rng: np.random.Generator, surrogate: Surrogate, caution: float
 ) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, " n"]]:
-    """Return failures of the surrogate, distributed about as the prior's, and chains they come from.
+    """Return failures of the surrogate, distributed about as the prior's, and their chains.
 
     Samples of the widened prior have no slope to follow, which may mislead; where they are too few,
     splitting finds more.

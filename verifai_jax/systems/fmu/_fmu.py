@@ -2,7 +2,7 @@
 
 system = vj.fmu("suspension.fmu", duration=4.0, dt=0.01)
 system = vj.fmu("plant.fmu", duration=4.0, dt=0.01, controller=control, workers=4)
-space = vj.fmu_space("suspension.fmu", ["m", "k"])  # domains from the declared ranges
+ranges = vj.fmu_ranges("suspension.fmu", ["m", "k"])    # for vj.Box(*ranges["m"])
 
 Each simulation runs in a worker process, which keeps its instance of the FMU for the next one. An
 FMU that crashes ends its worker: that is one row, and the others go on.
@@ -23,11 +23,10 @@ from verifai_jax.core.checks import check_positive
 from verifai_jax.core.errors import missing_name, suggests_options
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import is_waveform
-from verifai_jax.features import Box
 from verifai_jax.systems.base import Features
 from verifai_jax.systems.blackbox._blackbox import BlackBox, PooledBlackBox, blackbox
 from verifai_jax.systems.fmu.description import Description, read_description
-from verifai_jax.systems.fmu.library import FMUError, Instance
+from verifai_jax.systems.fmu.library import Instance
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -237,10 +236,10 @@ def fmu_variables(file: str | Path) -> "pd.DataFrame":
     return pd.DataFrame(rows, columns=list(columns)).set_index("name")
 
 
-def fmu_space(
+def fmu_ranges(
     file: str | Path, names: Iterable[str], around: float | None = None
-) -> dict[str, Box]:
-    """Make domains of variables of an FMU: the ranges that it declares.
+) -> dict[str, tuple[float, float]]:
+    """Return the ranges that an FMU declares of variables, for `Box(low, high)`.
 
     **Arguments:**
 
@@ -248,12 +247,12 @@ def fmu_space(
     - `names`: parameters, start values or inputs.
     - `around`: share of the start value to both sides, for variables without a range, such as 0.2.
 
-    **Returns:** a `Box` for each name.
+    **Returns:** the low and the high end for each name.
 
     **Raises:** `ValueError` for a variable without a range, if `around` is left out or it has no
     start value; as `fmu`.
     """
-    description, space = read_description(file), {}
+    description, ranges = read_description(file), {}
     for name in names:
         variable = description.variable(name)
         low, high = variable.low, variable.high
@@ -267,14 +266,11 @@ def fmu_space(
             start = float(variable.start)
             reach = around * abs(start)
             low, high = max(low, start - reach), min(high, start + reach)
-        space[name] = Box(low, high)
-    return space
+        ranges[name] = (low, high)
+    return ranges
 
 
 def _identifier(name: str) -> str:
     """Return a name that formulas can use for a variable."""
     made = "".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in name)
     return made if made[:1].isalpha() or made[:1] == "_" else f"_{made}"
-
-
-__all__ = ["FMUError", "fmu", "fmu_space", "fmu_variables"]

@@ -154,10 +154,14 @@ class Instance:
                 variable = self.description.variable(name)
                 by_type.setdefault(variable.type, []).append((index, variable))
             self._groups[names] = [
-                (kind, [i for i, _ in those], (c_uint32 * len(those))(*(v.reference for _, v in those)),
-                 (self._c_type(kind) * len(those))())
+                (
+                    kind,
+                    [index for index, _ in those],
+                    (c_uint32 * len(those))(*(variable.reference for _, variable in those)),
+                    (self._c_type(kind) * len(those))(),
+                )
                 for kind, those in by_type.items()
-            ]  # fmt: skip
+            ]
         return self._groups[names]
 
     def _c_type(self, kind: str) -> Any:
