@@ -11,7 +11,7 @@ PACKAGE = ROOT / "verifai_jax"
 
 LAYERS = (
     {"core", "store", "statistics", "_version"},
-    {"features", "mtl", "systems", "search", "clusters", "native_code"},
+    {"features", "mtl", "systems", "search", "clusters", "native_code", "sets"},
     {"rl", "problem", "perception", "events", "scenes", "blocks"},
     {"evaluation", "policies", "faults"},
     {"falsification"},
@@ -25,12 +25,14 @@ LAYERS = (
         "analysis",
         "compositional",
         "requirements",
+        "verification",
     },
-    {"failure_modes", "failure_table", "trials"},
+    {"failure_modes", "failure_table", "error_budgets", "trials"},
     {"sweeps", "augmentation", "checking"},
     {"hardening"},
     {"plotting"},
     {"reports"},
+    {"traceability"},
     {"cli", "testing"},
 )
 """Rooms from the ground up: each may import itself and the layers below its own."""

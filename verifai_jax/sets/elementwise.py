@@ -1,0 +1,227 @@
+"""Operations on single numbers, on sets of them."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from verifai_jax.sets import functions, whole
+from verifai_jax.sets.form import Form, add, is_point, negative, product, settled
+from verifai_jax.sets.interpreter import (
+    Equation,
+    Interpreter,
+    Value,
+    as_form,
+    as_whole,
+    constant,
+    rule,
+)
+from verifai_jax.sets.whole import Whole
+
+
+def _levelled(values: list[Value]) -> list[Value]:
+    """Return operands of one rank: numbers that stand for arrays get their axes."""
+    rank = max(len(value.shape) for value in values)
+
+    def widen(array: np.ndarray, leading: int) -> np.ndarray:
+        missing = rank + leading - array.ndim
+        return array.reshape(*array.shape[:leading], *(1,) * missing, *array.shape[leading:])
+
+    return [value if len(value.shape) == rank else value.moved(widen) for value in values]
+
+
+@rule("add", "add_any", "sub", "mul", "div", "rem", "max", "min", "pow", "atan2")
+def _two(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    name = step.primitive.name.replace("add_any", "add")
+    if step.invars[0] is step.invars[1] and name == "mul" and isinstance(inputs[0], Form):
+        return [functions.FUNCTIONS["square"](inputs[0])]
+    a, b = _levelled(inputs)
+    if isinstance(a, Whole) and isinstance(b, Whole):
+        if name not in whole.OPERATIONS:
+            return t.concrete(step, inputs)
+        # What all boxes share may wrap around, as the machine's numbers do.
+        if a.common is not None and b.common is not None:
+            return t.concrete(step, inputs)
+        return [whole.OPERATIONS[name](a, b)]
+    if name == "pow" and isinstance(b, Whole):
+        b = _as_real(b, as_form(a).dtype)
+    a, b = as_form(a), as_form(b)
+    match name:
+        case "add" | "sub":
+            return [add(a, b, 1.0 if name == "add" else -1.0)]
+        case "mul":
+            return [product(a, b)]
+        case "div":
+            return [functions.quotient(a, b)]
+        case "rem":
+            return [functions.remainder(a, b)]
+        case "max":
+            return [functions.greater(a, b)]
+        case "min":
+            return [functions.lesser(a, b)]
+        case "pow":
+            return [functions.power(a, b)]
+    return [functions.angle(a, b)]
+
+
+@rule(*functions.FUNCTIONS)
+def _one(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    (value,), name = inputs, step.primitive.name
+    if isinstance(value, Whole):
+        if name == "abs":
+            return [whole.absolute(value)]
+        if name == "sign":
+            return [Whole(np.sign(value.low), np.sign(value.high), value.dtype)]
+        if name == "square":
+            size = whole.absolute(value)
+            return [whole.OPERATIONS["mul"](size, size)]
+        return t.concrete(step, inputs)
+    return [functions.FUNCTIONS[name](value)]
+
+
+@rule("neg")
+def _negative(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    (value,) = inputs
+    if isinstance(value, Form):
+        return [negative(value)]
+    return [whole.OPERATIONS["sub"](Whole(value.low * 0, value.low * 0, value.dtype), value)]
+
+
+@rule("integer_pow")
+def _integer_power(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    if isinstance(inputs[0], Whole):
+        return t.concrete(step, inputs)
+    return [functions.integer_power(inputs[0], int(step.params["y"]))]
+
+
+@rule("round")
+def _round(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    return [functions.nearest(as_form(inputs[0]), int(step.params["rounding_method"]) == 1)]
+
+
+@rule("clamp")
+def _clamp(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    low, x, high = _levelled(inputs)
+    if isinstance(x, Whole):
+        raised = whole.OPERATIONS["max"](x, as_whole(low))
+        return [whole.OPERATIONS["min"](raised, as_whole(high))]
+    return [functions.clamped(as_form(low), x, as_form(high))]
+
+
+@rule("is_finite")
+def _is_finite(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    low, high = as_form(inputs[0]).bounds()
+    return [Whole.truth(np.isfinite(low) & np.isfinite(high), np.zeros(low.shape, bool))]
+
+
+@rule(*whole.COMPARISONS)
+def _compare(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    a, b = _levelled(inputs)
+    name = step.primitive.name
+    if isinstance(a, Whole):
+        b = as_whole(b)
+        return [whole.compared(name, a.low - b.high, a.high - b.low)]
+    b = as_form(b)
+    if is_point(a) and is_point(b):
+        (one, _), (other, _) = a.bounds(), b.bounds()
+        with np.errstate(invalid="ignore"):
+            gap = np.sign(one - other)
+        # Infinities are equal to themselves.
+        gap = np.where(one == other, 0.0, gap)
+        return [whole.compared(name, gap, gap)]
+    return [whole.compared(name, *functions.difference(a, b).bounds())]
+
+
+@rule("not")
+def _not(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    return [whole.inverted(as_whole(inputs[0]))]
+
+
+@rule("and", "or", "xor")
+def _logic(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    a, b = map(as_whole, _levelled(inputs))
+    return [whole.OPERATIONS[step.primitive.name](a, b)]
+
+
+@rule("select_n")
+def _select(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    which, *cases = _levelled(inputs)
+    return [select(as_whole(which), cases)]
+
+
+def select(which: Whole, cases: list[Value]) -> Value:
+    """Return one of several cases, by a number that may be open."""
+    result = cases[0]
+    for number, case in enumerate(cases[1:], 1):
+        truth = which.low >= number
+        maybe = (which.high >= number) & ~truth
+        if isinstance(result, Form):
+            result = functions.selected(truth, maybe, result, as_form(case))
+        else:
+            result = whole.selected(truth, maybe, as_whole(result), as_whole(case))
+    return result
+
+
+def _as_real(value: Whole, dtype: np.dtype) -> Form:
+    low, high = value.low.astype(np.float64), value.high.astype(np.float64)
+    exact = np.array_equal(low, low.astype(dtype)) and np.array_equal(high, high.astype(dtype))
+    form = Form.between(low, high, dtype)
+    if exact and max(np.abs(low).max(initial=0), np.abs(high).max(initial=0)) <= 2**24:
+        return form
+    return add(form, Form.constant(np.zeros(form.shape), dtype))
+
+
+@rule("convert_element_type", "reduce_precision")
+def _convert(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    (value,), dtype = inputs, np.dtype(step.outvars[0].aval.dtype)
+    if jnp.issubdtype(dtype, jnp.floating):
+        if isinstance(value, Whole):
+            return [_as_real(value, dtype)]
+        if value.dtype == dtype and step.primitive.name == "convert_element_type":
+            return [value]
+        if dtype.itemsize >= value.dtype.itemsize and step.primitive.name != "reduce_precision":
+            ends = None if value.low is None or value.high is None else (value.low, value.high)
+            return [settled(value.centre, value.slopes, value.radius, value.size, dtype, ends,
+                            value.frame)]  # fmt: skip
+        if step.primitive.name == "reduce_precision":
+            raise NotImplementedError("a reduction of precision")
+        moved = Form(value.centre, value.slopes, value.radius, value.size, dtype, value.low,
+                     value.high, value.frame)  # fmt: skip
+        return [add(moved, constant_zero(moved))]
+    if isinstance(value, Whole):
+        return [_whole_to_whole(value, dtype)]
+    low, high = value.bounds()
+    if dtype == bool:
+        return [whole.compared("ne", np.sign(low), np.sign(high))]
+    info = np.iinfo(dtype)
+    inside = (low > info.min) & (high < info.max)
+    low, high = (np.where(inside, np.trunc(end), 0).astype(np.int64) for end in (low, high))
+    most = min(info.max, 2**62)
+    return [Whole(np.where(inside, low, info.min), np.where(inside, high, most), dtype)]
+
+
+def constant_zero(like: Form) -> Form:
+    """Return zeros in the shape and type of a form."""
+    return Form.constant(np.zeros(like.shape), like.dtype)
+
+
+def _whole_to_whole(value: Whole, dtype: np.dtype) -> Whole:
+    if dtype == bool:
+        return whole.compared("ne", np.sign(value.low), np.sign(value.high))
+    info = np.iinfo(dtype)
+    if value.is_point:
+        wrapped = value.low.astype(dtype).astype(np.int64)
+        return Whole(wrapped, wrapped, dtype)
+    most = min(info.max, 2**62)
+    fits = (value.low >= info.min) & (value.high <= most)
+    return Whole(np.where(fits, value.low, info.min), np.where(fits, value.high, most), dtype)
+
+
+@rule("copy", "copy_p", "stop_gradient", "optimization_barrier", "device_put", "sharding_constraint")
+def _same(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    return inputs
+
+
+@rule("iota")
+def _iota(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    shape, axis = step.params["shape"], step.params["dimension"]
+    along = np.arange(shape[axis]).reshape([-1 if i == axis else 1 for i in range(len(shape))])
+    return [constant(np.broadcast_to(along, shape), step.params["dtype"])]

@@ -1,0 +1,443 @@
+"""Sets of real numbers, one for each box of a batch: affine forms within intervals.
+
+    x = Form.leaf(low, high, symbol, symbols, np.float32)    # a feature between its ends
+    y = add(x, product(x, x))
+    low, high = y.bounds()                                    # [boxes, *shape] each
+
+A form is `centre + sum_i slopes[i] symbol_i + [-radius, radius]`, met with `[low, high]` where an
+operation knows an interval of its own. Each symbol lies in [-1, 1]: the first are the features of
+the box, so that what depends on them stays correlated through a whole simulation; others belong
+to a `Frame` of a loop (`frames.py`). In a box of width w the radius is of the order of w squared.
+
+Each set contains the number in real arithmetic and the number that a computer gets: every result is
+widened by the rounding of its type, by numbers below the smallest normal one, which XLA takes for
+zero, and becomes unbounded where it may overflow. An interval without both ends stands for
+everything, NaN included; all operations keep that. Bounds are computed in double precision, whose
+own rounding is covered by what results are widened by.
+
+Sources: L. de Figueiredo and J. Stolfi, Affine arithmetic: concepts and applications, Numerical
+Algorithms 37 (2004); S. Rump, INTLAB, 1999.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import DTypeLike
+
+Reals = np.ndarray
+"""Numbers of double precision, `[boxes, *shape]`, or `[1, *shape]` where all boxes have the same."""
+
+SLACK = 2.0**-45
+"""Share of a number by which a result is widened for the rounding of its own bounds."""
+
+
+class Rounding(NamedTuple):
+    """The rounding of a type of real numbers: its unit, its smallest and its greatest number."""
+
+    unit: float
+    smallest: float
+    greatest: float
+
+
+@cache
+def rounding(dtype: DTypeLike) -> Rounding:
+    """Return the rounding of a type, with a margin for that of the bounds themselves."""
+    info = jnp.finfo(dtype)
+    unit = float(info.eps) / 2 * 1.01
+    return Rounding(max(unit, 2 * SLACK), float(info.tiny), float(info.max))
+
+
+class Frame(NamedTuple):
+    """The symbols after those of the features: which loop's step they belong to."""
+
+    number: int
+    features: int
+
+
+class Form:
+    """A set of arrays for each box; see the module's docstring.
+
+    - `centre`, `radius`: `[boxes, *shape]`.
+    - `slopes`: `[symbols, boxes, *shape]`; None for a set that depends on no symbol.
+    - `size`: a bound of the absolute value.
+    - `low`, `high`: an interval of its own; None without one.
+    - `frame`: of the symbols that are not features; None without them.
+    - `dtype`: the type in which the simulation computes it.
+    """
+
+    __slots__ = (
+        "_bounds", "_spread", "centre", "dtype", "frame", "high", "low", "radius", "size", "slopes",
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        centre: Reals,
+        slopes: Reals | None,
+        radius: Reals,
+        size: Reals,
+        dtype: np.dtype,
+        low: Reals | None = None,
+        high: Reals | None = None,
+        frame: Frame | None = None,
+    ) -> None:
+        self.centre, self.slopes, self.radius, self.size = centre, slopes, radius, size
+        self.dtype, self.low, self.high = dtype, low, high
+        self.frame = frame if slopes is not None else None
+        self._bounds: tuple[Reals, Reals] | None = None
+        self._spread: Reals | None = None
+
+    @classmethod
+    def constant(cls, value: np.ndarray, dtype: np.dtype) -> "Form":
+        """Return one array that all boxes share."""
+        exact = np.asarray(value, np.float64)[None]
+        return cls.between(exact, exact, dtype)
+
+    @classmethod
+    def between(cls, low: Reals, high: Reals, dtype: np.dtype) -> "Form":
+        """Return intervals; ends that are NaN stand for everything."""
+        kind = rounding(dtype)
+        low = np.where(np.isnan(low) | (low < -kind.greatest), -np.inf, low)
+        high = np.where(np.isnan(high) | (high > kind.greatest), np.inf, high)
+        # What is below the smallest normal number may be taken for zero.
+        low = np.where((low > 0) & (low < kind.smallest), 0.0, low)
+        high = np.where((high < 0) & (high > -kind.smallest), 0.0, high)
+        bounded = np.isfinite(low) & np.isfinite(high)
+        with np.errstate(invalid="ignore"):
+            centre = np.where(bounded, low / 2 + high / 2, 0.0)
+            radius = np.where(bounded, np.maximum(high - centre, centre - low), np.inf)
+        size = np.maximum(np.abs(low), np.abs(high))
+        radius = np.where((radius > 0) & bounded, radius + SLACK * size, radius)
+        return cls(centre, None, radius, size, dtype, low, high)
+
+    @classmethod
+    def leaf(cls, low: Reals, high: Reals, symbols: Reals, dtype: np.dtype) -> "Form":
+        """Return numbers between ends, each of which is the value of one symbol, or of none.
+
+        **Arguments:**
+
+        - `low`, `high`: `[boxes, *shape]`.
+        - `symbols`: `[symbols, *shape]`, 1 where a number is that symbol's, 0 elsewhere.
+        """
+        whole = cls.between(low, high, dtype)
+        slopes = symbols[:, None] * np.where(np.isfinite(whole.radius), whole.radius, 0.0)
+        own = np.any(symbols != 0, axis=0)[None] & np.isfinite(whole.radius)
+        radius = np.where(own, SLACK * whole.size, whole.radius)
+        return cls(whole.centre, slopes, radius, whole.size, dtype, whole.low, whole.high)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the array."""
+        return self.centre.shape[1:]
+
+    @property
+    def spread(self) -> Reals:
+        """The greatest distance from the centre that the affine form allows."""
+        if self._spread is None:
+            spread = self.radius
+            if self.slopes is not None:
+                spread = np.abs(self.slopes).sum(0) + spread
+            self._spread = spread
+        return self._spread
+
+    def bounds(self) -> tuple[Reals, Reals]:
+        """Return the ends of the set: what the affine form and the interval have in common."""
+        if self._bounds is None:
+            if self.slopes is None and self.low is not None and self.high is not None:
+                self._bounds = self.low, self.high
+                return self._bounds
+            spread = self.spread
+            low, high = self.centre - spread, self.centre + spread
+            if self.low is not None and self.high is not None:
+                # Without bounds on either side the interval says whether NaN is possible.
+                low, high = np.maximum(low, self.low), np.minimum(high, self.high)
+            self._bounds = low, high
+        return self._bounds
+
+    def moved(self, move: Callable[[np.ndarray, int], np.ndarray]) -> "Form":
+        """Return the same numbers elsewhere; `move(array, leading)` moves arrays."""
+        return Form(
+            move(self.centre, 1), None if self.slopes is None else move(self.slopes, 2),
+            move(self.radius, 1), move(self.size, 1), self.dtype,
+            None if self.low is None else move(self.low, 1),
+            None if self.high is None else move(self.high, 1), self.frame,
+        )  # fmt: skip
+
+    def unframed(self) -> "Form":
+        """Return a set that depends on features alone: other symbols become part of the radius."""
+        if self.frame is None or self.slopes is None:
+            return self
+        count = self.frame.features
+        radius = self.radius + np.abs(self.slopes[count:]).sum(0)
+        radius = radius + SLACK * self.size
+        slopes = self.slopes[:count]
+        return Form(self.centre, slopes, radius, self.size, self.dtype, self.low, self.high)
+
+
+def unknown(low: Reals, high: Reals) -> Reals:
+    """Return where a set is everything, NaN included."""
+    return (low == -np.inf) & (high == np.inf)
+
+
+def rounded(
+    centre: Reals,
+    slopes: Reals | None,
+    radius: Reals,
+    size: Reals,
+    dtype: np.dtype,
+    ends: tuple[Reals, Reals] | None = None,
+    frame: Frame | None = None,
+    units: float = 1.0,
+    exact: bool = False,
+) -> Form:
+    """Return the result of an operation, widened by its rounding.
+
+    **Arguments:**
+
+    - `ends`: an interval of the result, not widened yet.
+    - `units`: error of the operation in units of rounding.
+    - `exact`: whether the result is never rounded, such as that of a maximum.
+    """
+    kind = rounding(dtype)
+    share, absolute = (SLACK, 0.0) if exact else (kind.unit * units, kind.smallest)
+    radius = radius + (share * size + absolute)
+    if ends is not None and not exact:
+        low, high = ends
+        low, high = low - share * np.abs(low), high + share * np.abs(high)
+        low = np.where(np.abs(low) < kind.smallest, np.where(low < 0, -kind.smallest, 0.0), low)
+        high = np.where(np.abs(high) < kind.smallest, np.where(high > 0, kind.smallest, 0.0), high)
+        ends = low, high
+    return settled(centre, slopes, radius, size, dtype, ends, frame)
+
+
+def settled(
+    centre: Reals,
+    slopes: Reals | None,
+    radius: Reals,
+    size: Reals,
+    dtype: np.dtype,
+    ends: tuple[Reals, Reals] | None,
+    frame: Frame | None,
+) -> Form:
+    """Return a form in which what may overflow, or is NaN, is unbounded."""
+    greatest = rounding(dtype).greatest
+    total = size.max(initial=0.0) + radius.max(initial=0.0)
+    low, high = (None, None) if ends is None else ends
+    if not total <= greatest / 2:
+        with np.errstate(invalid="ignore"):
+            wild = ~(size + radius <= greatest)
+        centre, size = np.where(wild, 0.0, centre), np.where(wild, np.inf, size)
+        radius = np.where(wild, np.inf, radius)
+        if slopes is not None:
+            slopes = np.where(wild, 0.0, slopes)
+        if low is not None and high is not None:
+            low = np.where(np.isnan(low) | (low < -greatest), -np.inf, low)
+            high = np.where(np.isnan(high) | (high > greatest), np.inf, high)
+    return Form(centre, slopes, radius, size, dtype, low, high, frame)
+
+
+def aligned(a: Form, b: Form) -> tuple[Form, Form]:
+    """Return two forms whose symbols are the same: those of an earlier step are given up."""
+    if a.frame is not None and b.frame is not None and a.frame.number != b.frame.number:
+        if a.frame.number < b.frame.number:
+            return a.unframed(), b
+        return a, b.unframed()
+    return a, b
+
+
+def joint_slopes(
+    a: Form, b: Form, first: Reals | float, second: Reals | float
+) -> tuple[Reals | None, Frame | None]:
+    """Return the slopes of `first * a + second * b`, of aligned forms."""
+    if a.slopes is None or b.slopes is None:
+        one, factor = (a, first) if b.slopes is None else (b, second)
+        if one.slopes is None:
+            return None, None
+        unchanged = isinstance(factor, float) and factor == 1.0
+        return one.slopes if unchanged else one.slopes * factor, one.frame
+    long, short, by, other = a, b, first, second
+    if len(b.slopes) > len(a.slopes):
+        long, short, by, other = b, a, second, first
+    assert long.slopes is not None and short.slopes is not None
+    slopes, more = long.slopes * by, short.slopes * other
+    if len(more) == len(slopes):
+        return slopes + more, long.frame
+    count = len(more)
+    return np.concatenate([slopes[:count] + more, np.broadcast_to(
+        slopes[count:], (len(slopes) - count, *(slopes[:count] + more).shape[1:]))]), long.frame  # fmt: skip
+
+
+def add(a: Form, b: Form, sign: float = 1.0) -> Form:
+    """Return `a + b`, or `a - b` for the sign -1."""
+    a, b = aligned(a, b)
+    slopes, frame = joint_slopes(a, b, 1.0, sign)
+    centre = a.centre + b.centre if sign > 0 else a.centre - b.centre
+    form = rounded(centre, slopes, a.radius + b.radius, a.size + b.size, a.dtype, None, frame)
+    if a.low is None or b.low is None:
+        return form
+    (low, high), (first, last) = a.bounds(), b.bounds()
+    if sign < 0:
+        first, last = -last, -first
+    with np.errstate(invalid="ignore"):
+        form.low, form.high = _sum_end(low, first, a.dtype, -1), _sum_end(high, last, a.dtype, 1)
+    return form
+
+
+def _sum_end(one: Reals, other: Reals, dtype: np.dtype, side: int) -> Reals:
+    """Return the end of a sum of intervals, widened by rounding only where there is any."""
+    kind = rounding(dtype)
+    end = one + other
+    back = end - one
+    # Knuth's error of the sum: it is zero where the sum is exact.
+    exact = (one - (end - back)) + (other - back) == 0
+    if dtype.itemsize < 8:
+        with np.errstate(over="ignore"):
+            exact &= end.astype(dtype).astype(np.float64) == end
+    small = (end != 0) & (np.abs(end) < kind.smallest)
+    widened = np.where(exact & ~small, end, end + side * (kind.unit * np.abs(end) + kind.smallest))
+    # A sum of numbers of one sign has that sign, or is zero.
+    signed = (one * side <= 0) & (other * side <= 0)
+    widened = np.where(signed, side * np.minimum(side * widened, 0.0), widened)
+    widened = np.where(np.abs(widened) > kind.greatest, np.sign(widened) * np.inf, widened)
+    return np.where(np.isnan(widened), side * np.inf, widened)
+
+
+def negative(a: Form) -> Form:
+    """Return `-a`, which is exact."""
+    slopes = None if a.slopes is None else -a.slopes
+    low = None if a.high is None else -a.high
+    high = None if a.low is None else -a.low
+    return Form(-a.centre, slopes, a.radius, a.size, a.dtype, low, high, a.frame)
+
+
+def is_point(a: Form) -> bool:
+    """Return whether a set is one array of exact numbers."""
+    return a.slopes is None and not a.radius.any()
+
+
+def scaled(a: Form, by: Reals) -> Form:
+    """Return `a` times exact finite numbers."""
+    slopes = None if a.slopes is None else a.slopes * by
+    size, scale = a.size * np.abs(by), np.abs(by)
+    with np.errstate(invalid="ignore"):
+        ends = None
+        if a.low is not None and a.high is not None:
+            one, other = a.low * by, a.high * by
+            ends = np.minimum(one, other), np.maximum(one, other)
+        return rounded(a.centre * by, slopes, a.radius * scale, size, a.dtype, ends, a.frame)
+
+
+def interval_product(a: Form, b: Form) -> tuple[Reals, Reals]:
+    """Return the interval of a product; everything where zero may meet an infinity."""
+    (low, high), (first, last) = a.bounds(), b.bounds()
+    with np.errstate(invalid="ignore"):
+        ends = low * first, low * last, high * first, high * last
+        least = np.minimum(np.minimum(ends[0], ends[1]), np.minimum(ends[2], ends[3]))
+        greatest = np.maximum(np.maximum(ends[0], ends[1]), np.maximum(ends[2], ends[3]))
+    bad = np.isnan(least)
+    # An interval with zero inside and one without an end: none of the four products is NaN.
+    for ours, theirs in (((low, high), (first, last)), ((first, last), (low, high))):
+        bad |= (ours[0] <= 0) & (ours[1] >= 0) & ~(np.isfinite(theirs[0]) & np.isfinite(theirs[1]))
+    return np.where(bad, -np.inf, least), np.where(bad, np.inf, greatest)
+
+
+def product(a: Form, b: Form) -> Form:
+    """Return `a * b` of different forms."""
+    for one, other in ((a, b), (b, a)):
+        if is_point(one) and np.isfinite(one.centre).all():
+            return scaled(other, one.centre)
+    a, b = aligned(a, b)
+    with np.errstate(invalid="ignore", over="ignore"):
+        ends = interval_product(a, b)
+        size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+        slopes, frame = joint_slopes(a, b, b.centre, a.centre)
+        centre = a.centre * b.centre
+        radius = np.abs(a.centre) * b.radius + np.abs(b.centre) * a.radius + a.spread * b.spread
+        if a.slopes is not None and b.slopes is not None:
+            # The square of a symbol lies in [0, 1], not in [-1, 1].
+            count = min(len(a.slopes), len(b.slopes))
+            squares = a.slopes[:count] * b.slopes[:count]
+            centre = centre + squares.sum(0) / 2
+            radius = radius - np.abs(squares).sum(0) / 2
+        slack = (np.abs(a.centre) + a.spread) * (np.abs(b.centre) + b.spread) * SLACK
+        return rounded(centre, slopes, radius + slack, size, a.dtype, ends, frame)
+
+
+def total(a: Form, axes: Sequence[int]) -> Form:
+    """Return the sum over axes, whatever the order in which it is computed."""
+    lead = tuple(axis + 1 for axis in axes)
+    count = int(np.prod([a.centre.shape[axis] for axis in lead], dtype=np.int64))
+    slopes = None if a.slopes is None else a.slopes.sum(tuple(axis + 2 for axis in axes))
+    size = a.size.sum(lead)
+    ends = None
+    if a.low is not None and a.high is not None:
+        with np.errstate(invalid="ignore"):
+            low, high = a.low.sum(lead), a.high.sum(lead)
+            margin = rounding(a.dtype).unit * count * size
+            # Only what is of one sign keeps it for certain.
+            ends = (
+                np.where((a.low >= 0).all(lead), np.maximum(low - margin, 0), low - margin),
+                np.where((a.high <= 0).all(lead), np.minimum(high + margin, 0), high + margin),
+            )
+            ends = np.where(np.isnan(ends[0]), -np.inf, ends[0]), np.where(
+                np.isnan(ends[1]), np.inf, ends[1]
+            )
+    return rounded(
+        a.centre.sum(lead), slopes, a.radius.sum(lead), size, a.dtype, ends, a.frame,
+        units=max(count, 1),
+    )  # fmt: skip
+
+
+def joined(cases: Sequence[Form]) -> Form:
+    """Return a set that contains several: their hull, with the mean of their slopes."""
+    whole = cases[0]
+    for other in cases[1:]:
+        a, b = aligned(whole, other)
+        slopes, frame = joint_slopes(a, b, 0.5, 0.5)
+        gap, _ = joint_slopes(a, b, 0.5, -0.5)
+        with np.errstate(invalid="ignore"):
+            apart = np.abs(a.centre - b.centre) / 2
+            if gap is not None:
+                apart = apart + np.abs(gap).sum(0)
+            radius = apart + np.maximum(a.radius, b.radius)
+        (low, high), (first, last) = a.bounds(), b.bounds()
+        ends = np.minimum(low, first), np.maximum(high, last)
+        size = np.maximum(a.size, b.size)
+        shape = np.broadcast_shapes(size.shape, ends[0].shape)
+        whole = rounded(
+            a.centre / 2 + b.centre / 2, slopes, radius, np.broadcast_to(size, shape), a.dtype,
+            ends, frame, exact=True,
+        )  # fmt: skip
+    return whole
+
+
+def chosen(masks: Sequence[np.ndarray], cases: Sequence[Form]) -> Form:
+    """Return for each number the case whose mask holds; exactly one does."""
+    frames = {c.frame.number: c.frame for c in cases if c.frame is not None}
+    if len(frames) > 1:
+        newest = max(frames)
+        cases = [c if c.frame is None or c.frame.number == newest else c.unframed() for c in cases]
+    frame = next((c.frame for c in cases if c.frame is not None), None)
+    count = max((len(c.slopes) for c in cases if c.slopes is not None), default=0)
+
+    def pick(arrays: Sequence[np.ndarray]) -> np.ndarray:
+        picked = arrays[-1]
+        for mask, array in zip(masks[-2::-1], arrays[-2::-1], strict=True):
+            picked = np.where(mask, array, picked)
+        return picked
+
+    def slopes_of(case: Form) -> np.ndarray:
+        if case.slopes is None:
+            return np.zeros((count, *(1,) * case.centre.ndim))
+        missing = count - len(case.slopes)
+        return np.pad(case.slopes, ((0, missing), *((0, 0),) * case.centre.ndim))
+
+    slopes = pick([slopes_of(case) for case in cases]) if count else None
+    ends = [case.bounds() for case in cases]
+    return Form(
+        pick([c.centre for c in cases]), slopes, pick([c.radius for c in cases]),
+        pick([c.size for c in cases]), cases[0].dtype, pick([low for low, _ in ends]),
+        pick([high for _, high in ends]), frame,
+    )  # fmt: skip

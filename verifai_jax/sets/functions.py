@@ -1,0 +1,439 @@
+"""Functions of one or two numbers, on sets: their range, and a line with bounds around it.
+
+    FUNCTIONS["tanh"](x)                    # Form -> Form
+    quotient(a, b), greater(a, b), power(a, b)
+
+A function f of one number is enclosed by `slope * x + offset +- error`. The slope is that of the
+secant, and the range of `f(x) - slope * x` is exact: its extremes are at the ends, or where the
+derivative of f is the slope, which each function has a formula for. A point that is wrong by
+rounding costs the square of that, which the widening of results covers.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy import special
+
+from verifai_jax.sets.form import (
+    SLACK,
+    Form,
+    Reals,
+    add,
+    chosen,
+    is_point,
+    joined,
+    negative,
+    product,
+    rounded,
+    rounding,
+    scaled,
+    unknown,
+)
+
+Criticals = Callable[[Reals, Reals, Reals], Sequence[Reals]]
+"""A function `(slope, low, high)` to points between which `f(x) - slope * x` is monotone."""
+
+UNITS = 32.0
+"""Error of XLA's elementary functions in units of rounding at most, relative to their result and,
+for those that cancel, to their greatest value; measured up to 4 on a CPU."""
+PERIODIC = 1e5
+"""Greatest argument of sines for which their results are bounded by more than their range: there
+the argument itself has a rounding of a hundredth."""
+
+
+class Function(NamedTuple):
+    """A function of one number.
+
+    - `value`: in double precision.
+    - `criticals`: where its derivative is a slope.
+    - `domain`: outside which it is NaN.
+    - `scale`: absolute size that its error is relative to; 0 for that of its result.
+    - `units`: its error in units of rounding.
+    - `range`: no result lies outside, whatever the rounding.
+    """
+
+    value: Callable[[Reals], Reals]
+    criticals: Criticals
+    domain: tuple[float, float] = (-np.inf, np.inf)
+    scale: float = 0.0
+    units: float = UNITS
+    range: tuple[float, float] = (-np.inf, np.inf)
+
+    def __call__(self, x: Form) -> Form:
+        """Return the set of its values on a set."""
+        with np.errstate(all="ignore"):
+            low, high = x.bounds()
+            return self._enclosed(x, low, high)
+
+    def _enclosed(self, x: Form, low: Reals, high: Reals) -> Form:
+        first, last = self.domain
+        outside = unknown(low, high) | (low < first) | (high > last) | (low > high)
+        inside_low, inside_high = np.clip(low, first, last), np.clip(high, first, last)
+        flat = np.zeros_like(low)
+        points = self._points(flat, inside_low, inside_high)
+        values = [self.value(point) for point in points]
+        least, greatest = _extremes(values)
+        start, end = values[0], values[1]
+        slope = (end - start) / (inside_high - inside_low)
+        middle = np.isfinite(slope) & (inside_high > inside_low)
+        slope = np.where(middle, slope, 0.0)
+        points = self._points(slope, inside_low, inside_high)
+        below, above = _extremes([self.value(point) - slope * point for point in points])
+        usable = np.isfinite(below) & np.isfinite(above) & np.isfinite(x.spread) & ~outside
+        slope = np.where(usable, slope, 0.0)
+        size = np.maximum(np.abs(least), np.abs(greatest))
+        offset = np.where(usable, below / 2 + above / 2, 0.0)
+        error = np.where(usable, above / 2 - below / 2, np.inf)
+        # Numbers of double precision between which the slope and the offset are rounded.
+        error = error + 4 * SLACK * (np.abs(offset) + np.abs(slope) * (x.size + np.abs(x.centre)))
+        radius = np.where(usable, np.abs(slope) * x.radius, 0.0) + error
+        ends = np.where(outside, -np.inf, least), np.where(outside, np.inf, greatest)
+        margin = rounding(x.dtype).unit * self.units * self.scale
+        if margin:
+            ends = ends[0] - margin, ends[1] + margin
+            radius = radius + margin
+        size = np.where(outside, np.inf, np.maximum(size, self.scale))
+        slopes = None if x.slopes is None else x.slopes * slope
+        form = rounded(
+            slope * x.centre + offset, slopes, radius, size, x.dtype, ends, x.frame, self.units
+        )
+        if self.range != (-np.inf, np.inf) and form.low is not None and form.high is not None:
+            form.low = np.where(outside, form.low, np.clip(form.low, *self.range))
+            form.high = np.where(outside, form.high, np.clip(form.high, *self.range))
+        return form
+
+    def _points(self, slope: Reals, low: Reals, high: Reals) -> list[Reals]:
+        inner = self.criticals(slope, low, high)
+        inner = [np.clip(np.where(np.isnan(x), low, x), low, high) for x in inner]
+        return [low, high, *inner]
+
+
+def _extremes(values: Sequence[Reals]) -> tuple[Reals, Reals]:
+    least, greatest = values[0], values[0]
+    for value in values[1:]:
+        least, greatest = np.minimum(least, value), np.maximum(greatest, value)
+    return least, greatest
+
+
+def _even(magnitude: Callable[[Reals], Reals]) -> Criticals:
+    """Return points at both signs of a magnitude that depends on the slope."""
+
+    def criticals(slope: Reals, low: Reals, high: Reals) -> Sequence[Reals]:
+        at = magnitude(slope)
+        return at, -at
+
+    return criticals
+
+
+def _single(at: Callable[[Reals], Reals]) -> Criticals:
+    return lambda slope, low, high: (at(slope),)
+
+
+def _periodic(at: Callable[[Reals], Reals], period: float, both: bool = True) -> Criticals:
+    """Return the points of both signs in all periods that an interval of one period may touch."""
+
+    def criticals(slope: Reals, low: Reals, high: Reals) -> Sequence[Reals]:
+        base, turn = at(slope), np.round((low / 2 + high / 2) / period)
+        return [s * base + period * (turn + k) for s in (1.0, -1.0) for k in (-1.0, 0.0, 1.0)]
+
+    return criticals
+
+
+def _sine(value: Callable[[Reals], Reals], criticals: Criticals) -> Callable[[Form], Form]:
+    function = Function(value, criticals, scale=1.0, range=(-1.0, 1.0))
+
+    def enclosed(x: Form) -> Form:
+        with np.errstate(all="ignore"):
+            low, high = x.bounds()
+            wide = (high - low >= np.pi) | (np.abs(low) > PERIODIC) | (np.abs(high) > PERIODIC)
+            if not np.any(wide):
+                return function(x)
+            finite = np.isfinite(low) & np.isfinite(high)
+            end = np.where(finite, 1.0, np.inf)
+            rest = Form.between(-end, end, x.dtype)
+            if np.all(wide):
+                return rest
+            tame = ~wide
+            kept = Form(
+                np.where(tame, x.centre, 0.0),
+                None if x.slopes is None else np.where(tame, x.slopes, 0.0),
+                np.where(tame, x.radius, 0.0), np.where(tame, x.size, 0.0), x.dtype,
+                np.where(tame, low, 0.0), np.where(tame, high, 0.0), x.frame,
+            )  # fmt: skip
+            return chosen([tame, wide], [function(kept), rest])
+
+    return enclosed
+
+
+def _whole(value: Callable[[Reals], Reals]) -> Callable[[Form], Form]:
+    """Return a function that is constant by pieces and does not fall, such as `floor`."""
+
+    def enclosed(x: Form) -> Form:
+        low, high = x.bounds()
+        return Form.between(value(low), value(high), x.dtype)
+
+    return enclosed
+
+
+def _tangent(x: Form) -> Form:
+    with np.errstate(all="ignore"):
+        low, high = x.bounds()
+        branch = np.round((low / 2 + high / 2) / np.pi)
+        edge = np.pi / 2 - 1e-6
+        broken = (low <= branch * np.pi - edge) | (high >= branch * np.pi + edge)
+        broken |= np.maximum(np.abs(low), np.abs(high)) > PERIODIC
+        form = _TAN(x)
+        _make_unknown(form, broken)
+        return form
+
+
+def _make_unknown(form: Form, where: np.ndarray) -> None:
+    """Let a form be everything at some numbers."""
+    if not np.any(where):
+        return
+    form.radius, form.size = np.where(where, np.inf, form.radius), np.where(where, np.inf, form.size)
+    if form.slopes is not None:
+        form.slopes = np.where(where, 0.0, form.slopes)
+    form.centre = np.where(where, 0.0, form.centre)
+    if form.low is not None and form.high is not None:
+        form.low = np.where(where, -np.inf, form.low)
+        form.high = np.where(where, np.inf, form.high)
+
+
+def _reciprocal_of_sign(x: Form) -> Form:
+    """Return `1 / x` of numbers of one sign; everything for those that may be zero."""
+    low, high = x.bounds()
+    form = _RECIPROCAL(x)
+    _make_unknown(form, ~((low > 0) | (high < 0)))
+    return form
+
+
+_ROOT_PI = np.sqrt(np.pi)
+_TAN = Function(np.tan, _periodic(lambda a: np.arccos(1 / np.sqrt(a)), np.pi), scale=1.0)
+_RECIPROCAL = Function(lambda x: 1 / x, _even(lambda a: np.sqrt(-1 / a)), units=4.0)
+_POSITIVE = (0.0, np.inf)
+
+
+def _of_power(n: int) -> Function:
+    def criticals(slope: Reals, low: Reals, high: Reals) -> Sequence[Reals]:
+        at = np.abs(slope / n) ** (1 / (n - 1))
+        return at, -at
+
+    even = (0.0, np.inf) if n % 2 == 0 else (-np.inf, np.inf)
+    # It is computed by multiplications, one after another.
+    return Function(lambda x: x**n, criticals, units=2.0 * n, range=even)
+
+
+FUNCTIONS: dict[str, Callable[[Form], Form]] = {
+    "exp": Function(np.exp, _single(np.log), range=_POSITIVE),
+    "exp2": Function(np.exp2, _single(lambda a: np.log2(a / np.log(2))), range=_POSITIVE),
+    "expm1": Function(np.expm1, _single(np.log), range=(-1.0, np.inf)),
+    "log": Function(np.log, _single(lambda a: 1 / a), _POSITIVE, scale=1.0),
+    "log1p": Function(np.log1p, _single(lambda a: 1 / a - 1), (-1.0, np.inf)),
+    "sqrt": Function(np.sqrt, _single(lambda a: 1 / (4 * a * a)), _POSITIVE, range=_POSITIVE),
+    "rsqrt": Function(
+        lambda x: 1 / np.sqrt(x), _single(lambda a: (-2 * a) ** (-2 / 3)), _POSITIVE,
+        range=_POSITIVE,
+    ),
+    "cbrt": Function(np.cbrt, _even(lambda a: (3 * a) ** -1.5)),
+    "tanh": Function(np.tanh, _even(lambda a: np.arctanh(np.sqrt(1 - a))), range=(-1.0, 1.0)),
+    "logistic": Function(
+        special.expit,
+        _even(lambda a: special.logit(0.5 + np.sqrt(np.maximum(0.25 - a, 0)))),
+        range=(0.0, 1.0),
+    ),
+    "sinh": Function(np.sinh, _even(np.arccosh)),
+    "cosh": Function(np.cosh, _single(np.arcsinh), range=(1.0, np.inf)),
+    "asinh": Function(np.arcsinh, _even(lambda a: np.sqrt(1 / a**2 - 1))),
+    "acosh": Function(np.arccosh, _single(lambda a: np.sqrt(1 / a**2 + 1)), (1.0, np.inf), 1.0),
+    "atanh": Function(np.arctanh, _even(lambda a: np.sqrt(1 - 1 / a)), (-1.0, 1.0)),
+    "asin": Function(np.arcsin, _even(lambda a: np.sqrt(1 - 1 / a**2)), (-1.0, 1.0)),
+    "acos": Function(np.arccos, _even(lambda a: np.sqrt(1 - 1 / a**2)), (-1.0, 1.0), 1.0),
+    "atan": Function(np.arctan, _even(lambda a: np.sqrt(1 / a - 1))),
+    "erf": Function(
+        special.erf, _even(lambda a: np.sqrt(-np.log(a * _ROOT_PI / 2))), range=(-1.0, 1.0)
+    ),
+    "erfc": Function(
+        special.erfc, _even(lambda a: np.sqrt(-np.log(-a * _ROOT_PI / 2))), scale=1.0
+    ),
+    "abs": Function(np.abs, _single(np.zeros_like), units=0.0, range=_POSITIVE),
+    "square": _of_power(2),
+    "sin": _sine(np.sin, _periodic(np.arccos, 2 * np.pi)),
+    "cos": _sine(
+        np.cos,
+        lambda a, low, high: [
+            x - np.pi / 2
+            for x in _periodic(np.arccos, 2 * np.pi)(a, low + np.pi / 2, high + np.pi / 2)
+        ],
+    ),
+    "tan": _tangent,
+    "floor": _whole(np.floor),
+    "ceil": _whole(np.ceil),
+    "sign": _whole(np.sign),
+}  # fmt: skip
+"""Functions of one number, by the name of JAX's primitive."""
+
+_RAMP = Function(
+    lambda x: np.maximum(x, 0.0), _single(np.zeros_like), units=0.0, range=(0.0, np.inf)
+)
+
+
+def nearest(x: Form, to_even: bool) -> Form:
+    """Return numbers rounded to whole ones, halves to even ones or away from zero."""
+    if to_even:
+        return _whole(np.round)(x)
+    return _whole(lambda a: np.sign(a) * np.floor(np.abs(a) + 0.5))(x)
+
+
+def integer_power(x: Form, n: int) -> Form:
+    """Return `x ** n`."""
+    if n == 0:
+        return Form.constant(np.ones(x.shape), x.dtype)
+    if n < 0:
+        return _reciprocal_of_sign(integer_power(x, -n))
+    return x if n == 1 else _of_power(n)(x)
+
+
+def quotient(a: Form, b: Form) -> Form:
+    """Return `a / b`; everything where `b` may be zero."""
+    with np.errstate(all="ignore"):
+        if is_point(b) and np.all((b.centre != 0) & np.isfinite(b.centre)):
+            inverse = 1 / b.centre
+            if np.isfinite(inverse).all():
+                return _widened(scaled(a, inverse), 3.0)
+        return _widened(product(a, _reciprocal_of_sign(b)), 3.0)
+
+
+def _widened(x: Form, units: float) -> Form:
+    """Widen a result by more units of rounding: XLA may divide by multiplying."""
+    margin = rounding(x.dtype).unit * units
+    x.radius = x.radius + margin * x.size
+    if x.low is not None and x.high is not None:
+        x.low, x.high = x.low - margin * np.abs(x.low), x.high + margin * np.abs(x.high)
+    return x
+
+
+def greater(a: Form, b: Form) -> Form:
+    """Return the maximum: `b + max(a - b, 0)`, which keeps what both depend on."""
+    (low, high), (first, last) = a.bounds(), b.bounds()
+    with np.errstate(all="ignore"):
+        nothing = unknown(low, high) | unknown(first, last)
+        ours, theirs = (low >= last) & ~nothing, (first >= high) & ~nothing
+        least, most = np.maximum(low, first), np.maximum(high, last)
+        ends = np.where(nothing, -np.inf, least), np.where(nothing, np.inf, most)
+        if a.slopes is None and b.slopes is None:
+            return Form.between(*ends, a.dtype)
+        mixed = ~(ours | theirs)
+        if not np.any(mixed):
+            return chosen([ours, theirs], [a, b])
+        ramp = add(b, _RAMP(difference(a, b)))
+        size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+        both = rounded(
+            ramp.centre, ramp.slopes, ramp.radius, np.broadcast_to(size, ramp.size.shape),
+            a.dtype, ends, ramp.frame, exact=True,
+        )  # fmt: skip
+        return chosen([ours, theirs, mixed], [a, b, both])
+
+
+def lesser(a: Form, b: Form) -> Form:
+    """Return the minimum."""
+    return negative(greater(negative(a), negative(b)))
+
+
+def difference(a: Form, b: Form) -> Form:
+    """Return `a - b` of numbers as they are, not rounded: what a comparison sees."""
+    exact = np.dtype(np.float64)
+    a, b = (Form(f.centre, f.slopes, f.radius, f.size, exact, f.low, f.high, f.frame) for f in (a, b))
+    form = add(a, b, -1.0)
+    (low, high), (first, last) = a.bounds(), b.bounds()
+    nothing = unknown(low, high) | unknown(first, last)
+    _make_unknown(form, nothing)
+    return form
+
+
+def remainder(a: Form, b: Form) -> Form:
+    """Return what a division leaves, with the sign of `a`."""
+    with np.errstate(all="ignore"):
+        (low, high), (first, last) = a.bounds(), b.bounds()
+        nothing = unknown(low, high) | ~np.isfinite(low) | ~np.isfinite(high)
+        nothing |= ~((first > 0) | (last < 0)) | ~np.isfinite(first) | ~np.isfinite(last)
+        most = np.maximum(np.abs(first), np.abs(last))
+        # The remainder is exact, so that only the number of divisors has to be the same.
+        ends = [np.trunc(x / y * s) for x in (low, high) for y in (first, last)
+                for s in (1 - 1e-14, 1 + 1e-14)]  # fmt: skip
+        same = np.logical_and.reduce([end == ends[0] for end in ends]) & ~nothing
+        wide = Form.between(
+            np.where(nothing, -np.inf, np.where(low >= 0, 0.0, np.maximum(-most, low))),
+            np.where(nothing, np.inf, np.where(high <= 0, 0.0, np.minimum(most, high))),
+            a.dtype,
+        )
+        if not np.any(same):
+            return wide
+        count = np.where(same, ends[0], 0.0)
+        times = Form.between(count, count, a.dtype)
+        exact = add(a, product(times, b), -1.0)
+        exact.low = exact.high = None
+        return chosen([same, ~same], [exact, wide])
+
+
+def power(a: Form, b: Form) -> Form:
+    """Return `a ** b`: of positive numbers, or with a whole exponent."""
+    if is_point(b) and b.centre.size and (b.centre == b.centre.flat[0]).all():
+        exponent = float(b.centre.flat[0])
+        if exponent.is_integer() and abs(exponent) <= 64:
+            return _widened(integer_power(a, int(exponent)), UNITS)
+        if exponent == 0.5:
+            return _widened(FUNCTIONS["sqrt"](a), UNITS)
+    low, _ = a.bounds()
+    form = FUNCTIONS["exp"](product(b, FUNCTIONS["log"](a)))
+    _make_unknown(form, np.broadcast_to(~(low > 0), form.centre.shape))
+    return form
+
+
+def angle(y: Form, x: Form) -> Form:
+    """Return the angle of a point `(x, y)`; the whole circle where it may cross the negative x."""
+    (low, high), (left, right) = y.bounds(), x.bounds()
+    nothing = unknown(low, high) | unknown(left, right)
+    masks = [left > 0, low > 0, high < 0]
+    masks = [masks[0], ~masks[0] & masks[1], ~masks[0] & ~masks[1] & masks[2]]
+    rest = ~(masks[0] | masks[1] | masks[2]) | nothing
+    masks = [mask & ~rest for mask in masks]
+    end = np.where(nothing, np.inf, np.pi)
+    circle = _widened(Form.between(-end, end, y.dtype), 2.0)
+    if np.all(rest):
+        return circle
+
+    def turned(by: float, ratio: Form) -> Form:
+        shift = Form.between(*np.full((2, *ratio.centre.shape), by), y.dtype)
+        return add(shift, FUNCTIONS["atan"](ratio))
+
+    with np.errstate(all="ignore"):
+        cases = [
+            turned(0.0, quotient(y, x)),
+            turned(np.pi / 2, negative(quotient(x, y))),
+            turned(-np.pi / 2, negative(quotient(x, y))),
+        ]
+    return _widened(chosen([*masks, rest], [*cases, circle]), UNITS)
+
+
+def clamped(low: Form, x: Form, high: Form) -> Form:
+    """Return numbers moved between two ends."""
+    return lesser(greater(x, low), high)
+
+
+def selected(truth: np.ndarray, maybe: np.ndarray, no: Form, yes: Form) -> Form:
+    """Return a case by a truth value that may be open: their hull where it is.
+
+    **Arguments:**
+
+    - `truth`, `maybe`: where it is true for certain, and where it is open.
+    """
+    if not np.any(maybe):
+        if np.all(truth):
+            return yes
+        if not np.any(truth):
+            return no
+        return chosen([truth, ~truth], [yes, no])
+    both = joined([no, yes])
+    return chosen([truth & ~maybe, maybe, ~truth & ~maybe], [yes, both, no])
