@@ -207,7 +207,7 @@ def _learn(limit_state: LimitState, rng: np.random.Generator, surrogate: Surroga
             return
         size = min(size, int(limit_state.left - until) + 1)
         anywhere = _spread(limit_state, rng, CHUNK)
-        unknown = _least_sure(np.zeros(len(anywhere)), surrogate.covariance(anywhere), size)
+        unknown = _in_doubt(np.zeros(len(anywhere)), surrogate.covariance(anywhere), size)
         population, _ = _failures_of(limit_state, rng, surrogate, CAUTION)
         if not len(population):
             population = limit_state.sample_prior(rng, PER_LEVEL)
@@ -216,11 +216,11 @@ def _learn(limit_state: LimitState, rng: np.random.Generator, surrogate: Surroga
         doubt = float(wrong.sum() / max(np.sum(mean < 0), 1.0))
         population, explored = population[:CHUNK], size if doubt < SETTLED else size // EXPLORED
         covariance = surrogate.covariance(population)
-        chosen = _least_sure(mean[:CHUNK], covariance, size - explored)
+        chosen = _in_doubt(mean[:CHUNK], covariance, size - explored)
         limit_state(np.concatenate([population[chosen], anywhere[unknown[:explored]]]))
 
 
-def _least_sure(
+def _in_doubt(
     mean: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"], count: int
 ) -> list[int]:
     """Choose points whose sign is least sure, each once those before it are known.

@@ -69,7 +69,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class Description:
-    """What an FMU says of itself.
+    """The description of an FMU, read from its archive.
 
     - `file`: the FMU.
     - `version`: of FMI, 2 or 3.

@@ -125,18 +125,18 @@ class Instance:
 
     def set(self, values: Mapping[str, float]) -> None:
         """Set variables by name."""
-        for kind, places, references, buffer in self._grouped(tuple(values)):
+        for kind, indices, references, buffer in self._grouped(tuple(values)):
             numbers = list(values.values())
-            for i, index in enumerate(places):
+            for i, index in enumerate(indices):
                 buffer[i] = numbers[index] if kind in FLOATS else round(numbers[index])
             self._exchange("Set", kind, references, buffer)
 
     def get(self, names: Sequence[str]) -> list[float]:
         """Return the values of variables by name."""
         found = [0.0] * len(names)
-        for kind, places, references, buffer in self._grouped(tuple(names)):
+        for kind, indices, references, buffer in self._grouped(tuple(names)):
             self._exchange("Get", kind, references, buffer)
-            for i, index in enumerate(places):
+            for i, index in enumerate(indices):
                 found[index] = float(buffer[i])
         return found
 
