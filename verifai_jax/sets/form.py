@@ -92,15 +92,14 @@ class Form:
     @classmethod
     def constant(cls, value: np.ndarray, dtype: np.dtype) -> "Form":
         """Return one array that all boxes share."""
-        exact = np.asarray(value, np.float64)[None]
+        exact = np.asarray(value).astype(dtype).astype(np.float64)[None]
         return cls.between(exact, exact, dtype)
 
     @classmethod
     def between(cls, low: Reals, high: Reals, dtype: np.dtype) -> "Form":
         """Return intervals; ends that are NaN stand for everything."""
         kind = rounding(dtype)
-        low = np.where(np.isnan(low) | (low < -kind.greatest), -np.inf, low)
-        high = np.where(np.isnan(high) | (high > kind.greatest), np.inf, high)
+        low, high = overflown(low, high, kind.greatest)
         # What is below the smallest normal number may be taken for zero.
         low = np.where((low > 0) & (low < kind.smallest), 0.0, low)
         high = np.where((high < 0) & (high > -kind.smallest), 0.0, high)
@@ -176,6 +175,13 @@ class Form:
         return Form(self.centre, slopes, radius, self.size, self.dtype, self.low, self.high)
 
 
+def overflown(low: Reals, high: Reals, greatest: float) -> tuple[Reals, Reals]:
+    """Return an interval that is unbounded where its numbers may be beyond the greatest one."""
+    low, high = np.minimum(low, np.where(low < np.inf, greatest, np.inf)), np.maximum(high, np.where(high > -np.inf, -greatest, -np.inf))
+    low = np.where(np.isnan(low) | (low < -greatest), -np.inf, low)
+    return low, np.where(np.isnan(high) | (high > greatest), np.inf, high)
+
+
 def unknown(low: Reals, high: Reals) -> Reals:
     """Return where a set is everything, NaN included."""
     return (low == -np.inf) & (high == np.inf)
@@ -233,8 +239,7 @@ def settled(
         if slopes is not None:
             slopes = np.where(wild, 0.0, slopes)
         if low is not None and high is not None:
-            low = np.where(np.isnan(low) | (low < -greatest), -np.inf, low)
-            high = np.where(np.isnan(high) | (high > greatest), np.inf, high)
+            low, high = overflown(low, high, greatest)
     return Form(centre, slopes, radius, size, dtype, low, high, frame)
 
 
@@ -281,7 +286,8 @@ def add(a: Form, b: Form, sign: float = 1.0) -> Form:
     if sign < 0:
         first, last = -last, -first
     with np.errstate(invalid="ignore"):
-        form.low, form.high = _sum_end(low, first, a.dtype, -1), _sum_end(high, last, a.dtype, 1)
+        ends = _sum_end(low, first, a.dtype, -1), _sum_end(high, last, a.dtype, 1)
+        form.low, form.high = overflown(*ends, rounding(a.dtype).greatest)
     return form
 
 
@@ -299,9 +305,7 @@ def _sum_end(one: Reals, other: Reals, dtype: np.dtype, side: int) -> Reals:
     widened = np.where(exact & ~small, end, end + side * (kind.unit * np.abs(end) + kind.smallest))
     # A sum of numbers of one sign has that sign, or is zero.
     signed = (one * side <= 0) & (other * side <= 0)
-    widened = np.where(signed, side * np.minimum(side * widened, 0.0), widened)
-    widened = np.where(np.abs(widened) > kind.greatest, np.sign(widened) * np.inf, widened)
-    return np.where(np.isnan(widened), side * np.inf, widened)
+    return np.where(signed, side * np.minimum(side * widened, 0.0), widened)
 
 
 def negative(a: Form) -> Form:
