@@ -47,6 +47,7 @@ from verifai_jax.cli.report import report
 from verifai_jax.cli.shrink import shrink
 from verifai_jax.cli.sweep import sweep
 from verifai_jax.cli.synthesize import synthesize
+from verifai_jax.cli.verify import verify
 from verifai_jax.core.errors import unknown_name
 
 COMMANDS = (
@@ -60,6 +61,7 @@ COMMANDS = (
     doctor,
     confirm,
     estimate,
+    verify,
     modes,
     fmea,
     explain,

@@ -339,11 +339,10 @@ def _cumulative(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Val
 
 @rule("argmax", "argmin")
 def _argument(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    if isinstance(inputs[0], Whole):
-        return t.concrete(step, inputs)
-    value = inputs[0] if step.primitive.name == "argmax" else _minus(inputs[0])
-    (axis,) = step.params["axes"]
-    low, high = value.bounds()
+    (value,), (axis,) = inputs, step.params["axes"]
+    low, high = value.bounds() if isinstance(value, Form) else (1.0 * value.low, 1.0 * value.high)
+    if step.primitive.name == "argmin":
+        low, high = -high, -low
     best = low.max(axis + 1, keepdims=True)
     possible = high >= best
     possible |= ((low == -np.inf) & (high == np.inf)).any(axis + 1, keepdims=True)
@@ -352,12 +351,6 @@ def _argument(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value
     first = np.where(possible, number, count).min(axis + 1)
     last = np.where(possible, number, -1).max(axis + 1)
     return [Whole(first, last, np.dtype(step.outvars[0].aval.dtype))]
-
-
-def _minus(value: Value) -> Form:
-    from verifai_jax.sets.form import negative
-
-    return negative(as_form(value))
 
 
 @rule("dot_general")

@@ -330,7 +330,11 @@ def scaled(a: Form, by: Reals) -> Form:
         if a.low is not None and a.high is not None:
             one, other = a.low * by, a.high * by
             ends = np.minimum(one, other), np.maximum(one, other)
-        return rounded(a.centre * by, slopes, a.radius * scale, size, a.dtype, ends, a.frame)
+        # Times 0, 1, 2, 4 ... nothing is rounded.
+        exact = bool(((np.frexp(scale)[0] == 0.5) & (scale >= 1) | (scale == 0)).all())
+        return rounded(
+            a.centre * by, slopes, a.radius * scale, size, a.dtype, ends, a.frame, exact=exact
+        )
 
 
 def interval_product(a: Form, b: Form) -> tuple[Reals, Reals]:

@@ -87,6 +87,9 @@ def _by_corners(operation: Callable[..., Numbers]) -> Callable[[Whole, Whole], W
 def _logic(operation: Callable[..., np.ndarray]) -> Callable[[Whole, Whole], Whole]:
     def applied(a: Whole, b: Whole) -> Whole:
         if a.dtype != bool and not (a.is_point and b.is_point):
+            if operation is np.bitwise_and and (b if b.is_point else a).low.min() >= 0:
+                mask = b if b.is_point else a
+                return Whole(np.zeros_like(mask.low), mask.high, a.dtype)
             raise NotImplementedError("a bitwise operation on whole numbers that vary in a box")
         return Whole(operation(a.low, b.low), operation(a.high, b.high), a.dtype)
 

@@ -180,7 +180,8 @@ class _Work:
             bounds = self.enclosure(some.low[worth], some.high[worth])
             some.least[worth], some.greatest[worth] = bounds.low, bounds.high
             state = np.where(bounds.holds, PROVED, np.where(bounds.high < 0, BROKEN, OPEN))
-            state = np.where((state == BROKEN) & ~bounds.inside, OPEN, state)
+            # A box that the constraint cuts is split until it does so no more: its mass is unknown.
+            state = np.where(bounds.inside, state, OPEN)
             state = np.where(bounds.outside, OUTSIDE, state)
             # A simulation outside of its bounds would be a mistake of this program.
             seen = robustness[worth]

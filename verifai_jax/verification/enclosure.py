@@ -187,7 +187,7 @@ class Enclosure:
     def _evaluated(self, program: Any, leaves: Sequence[Value], count: int) -> list[Value]:
         interpreter = Interpreter(count, self.dim, self._known)
         with in_precision(self.precision):
-            return interpreter.closed(program, leaves)
+            return interpreter(program, leaves)
 
     def _leaves(self, low: Corners, high: Corners) -> list[Value]:
         """Return the features of boxes as sets, in the order of the leaves of their tree."""
@@ -212,8 +212,7 @@ class Enclosure:
             else:
                 symbols = np.eye(self.dim)[:, span]
                 unit = Form.leaf(first[:, span], last[:, span], symbols, np.dtype(self.precision))
-                with np.errstate(all="ignore"):
-                    sets[name] = self._evaluated(part, [unit], len(low))
+                sets[name] = self._evaluated(part, [unit], len(low))
         return [leaf for name in sorted(names) for leaf in sets[name]]
 
     def _leaf(
