@@ -1,4 +1,4 @@
-"""Random expressions of JAX with boxes of all sizes, and what their values are in two arithmetics."""
+"""Random expressions of JAX with boxes of all sizes, and their values in two arithmetics."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -48,7 +48,7 @@ ONE: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
     "floor": (jnp.floor, np.floor),
     "ceil": (jnp.ceil, np.ceil),
     "round": (jnp.round, np.round),
-    "clip": (lambda x: jnp.clip(x, -0.7, 1.3), lambda x: np.clip(x, np.float32(-0.7), np.float32(1.3))),
+    "clip": (lambda x: jnp.clip(x, -0.75, 1.25), lambda x: np.clip(x, -0.75, 1.25)),
 }  # fmt: skip
 TWO: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
     "add": (jnp.add, np.add),

@@ -85,7 +85,9 @@ def test_values_lie_in_their_sets(name):
 
 @pytest.mark.thorough
 def test_a_network_is_enclosed_tightly():
-    weights = [np.random.default_rng(i).normal(size=s) / 2 for i, s in enumerate([(3, 16), (16, 2)])]
+    weights = [
+        np.random.default_rng(i).normal(size=s) / 2 for i, s in enumerate([(3, 16), (16, 2)])
+    ]
 
     def network(x):
         hidden = jnp.tanh(x @ jnp.asarray(weights[0], jnp.float32))

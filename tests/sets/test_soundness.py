@@ -1,4 +1,4 @@
-"""No value leaves its set: random expressions and boxes, in single precision and in real arithmetic."""
+"""No value leaves its set: random expressions and boxes, in float32 and in real arithmetic."""
 
 import jax
 import jax.numpy as jnp

@@ -148,22 +148,12 @@ def _sine(value: Callable[[Reals], Reals], criticals: Criticals) -> Callable[[Fo
     def enclosed(x: Form) -> Form:
         with np.errstate(all="ignore"):
             low, high = x.bounds()
-            wide = (high - low >= np.pi) | (np.abs(low) > PERIODIC) | (np.abs(high) > PERIODIC)
+            wide = ~((high - low < np.pi) & (np.abs(low) < PERIODIC) & (np.abs(high) < PERIODIC))
+            form = function(x)
             if not np.any(wide):
-                return function(x)
-            finite = np.isfinite(low) & np.isfinite(high)
-            end = np.where(finite, 1.0, np.inf)
-            rest = Form.between(-end, end, x.dtype)
-            if np.all(wide):
-                return rest
-            tame = ~wide
-            kept = Form(
-                np.where(tame, x.centre, 0.0),
-                None if x.slopes is None else np.where(tame, x.slopes, 0.0),
-                np.where(tame, x.radius, 0.0), np.where(tame, x.size, 0.0), x.dtype,
-                np.where(tame, low, 0.0), np.where(tame, high, 0.0), x.frame,
-            )  # fmt: skip
-            return chosen([tame, wide], [function(kept), rest])
+                return form
+            end = np.where(np.isfinite(low) & np.isfinite(high), 1.0, np.inf)
+            return chosen([~wide, wide], [form, Form.between(-end, end, x.dtype)])
 
     return enclosed
 
@@ -196,7 +186,10 @@ def _make_unknown(form: Form, where: np.ndarray) -> None:
     """Let a form be everything at some numbers."""
     if not np.any(where):
         return
-    form.radius, form.size = np.where(where, np.inf, form.radius), np.where(where, np.inf, form.size)
+    form.radius, form.size = (
+        np.where(where, np.inf, form.radius),
+        np.where(where, np.inf, form.size),
+    )
     if form.slopes is not None:
         form.slopes = np.where(where, 0.0, form.slopes)
     form.centre = np.where(where, 0.0, form.centre)
@@ -355,8 +348,7 @@ def lesser(a: Form, b: Form) -> Form:
 
 def difference(a: Form, b: Form) -> Form:
     """Return `a - b` of numbers as they are, not rounded: what a comparison sees."""
-    exact = np.dtype(np.float64)
-    a, b = (Form(f.centre, f.slopes, f.radius, f.size, exact, f.low, f.high, f.frame) for f in (a, b))
+    a, b = a.of_type(np.dtype(np.float64)), b.of_type(np.dtype(np.float64))
     form = add(a, b, -1.0)
     (low, high), (first, last) = a.bounds(), b.bounds()
     nothing = unknown(low, high) | unknown(first, last)
@@ -447,5 +439,5 @@ def selected(truth: np.ndarray, maybe: np.ndarray, no: Form, yes: Form) -> Form:
         if not np.any(truth):
             return no
         return chosen([truth, ~truth], [yes, no])
-    both = joined([no, yes])
+    both = joined(no, yes)
     return chosen([truth & ~maybe, maybe, ~truth & ~maybe], [yes, both, no])

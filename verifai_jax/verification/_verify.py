@@ -18,7 +18,7 @@ from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.problem.problem import Problem, ProblemError
 from verifai_jax.verification.boxes import BROKEN, OPEN, OUTSIDE, PROVED, Boxes
 from verifai_jax.verification.enclosure import TOGETHER, Enclosure
-from verifai_jax.verification.result import Verification, load_verification
+from verifai_jax.verification.result import Verification, described, load_verification
 
 REST = 0.08
 """Share of the seconds that is kept for the samples of what stays undecided."""
@@ -103,12 +103,10 @@ def verify(
     work.sample(samples)
     seconds = time.perf_counter() - started
     return Verification(
-        name=problem.name,
+        **described(problem),
         columns=problem.space.coordinates,
         boxes=work.boxes,
         shares=enclosure.shares(work.boxes.low), upper_shares=enclosure.shares(work.boxes.high),
-        features={name: repr(domain) for name, domain in problem.space.domains.items()},
-        formulas={name: str(formula) for name, formula in problem.formulas.items()},
         precision=precision,
         confidence=confidence,
         looked_at=work.looked_at + (0 if before is None else before.looked_at),
@@ -229,9 +227,10 @@ class _Work:
         self, some: Boxes, robustness: Float[np.ndarray, "n k"], can: np.ndarray
     ) -> Int[np.ndarray, " n"]:
         """Return the coordinate along which each box is to be split."""
-        middle, up, down = robustness[:, :1], robustness[:, 1::2], robustness[:, 2::2]
+        # What counts most is that a point has a verdict, or is accepted, and its neighbour is not.
+        values = np.where(np.isnan(robustness), 1e30, np.clip(robustness, -1e29, 1e29))
+        middle, up, down = values[:, :1], values[:, 1::2], values[:, 2::2]
         change = np.abs(up - down) + 2 * np.abs(up + down - 2 * middle)
-        change = np.where(np.isfinite(change), change, 0.0)
         change = change / np.maximum(change.max(1, keepdims=True), 1e-30)
         width = some.high - some.low
         # A coordinate without influence at these points may have one between them.

@@ -21,7 +21,7 @@ from verifai_jax.core.text import counted, format_percent, format_seconds
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.confidence_sequences import anytime_interval
 from verifai_jax.store.files import DamagedError, read_record, write_record
-from verifai_jax.verification.boxes import BROKEN, OPEN, OUTSIDE, PROVED, Boxes
+from verifai_jax.verification.boxes import BROKEN, OUTSIDE, PROVED, Boxes
 
 KIND = "verification"
 
@@ -141,7 +141,8 @@ class Verification(Drawn, InNotebook):
 
     def __str__(self) -> str:
         def share(part: Part) -> str:
-            return f"{format_percent(part.mass)} of the prior, {format_percent(part.volume)} of the volume"
+            mass, volume = map(format_percent, part)
+            return f"{mass} of the prior, {volume} of the volume"
 
         low, high = self.probability
         sure = format_percent(self.confidence)
@@ -175,12 +176,8 @@ class Verification(Drawn, InNotebook):
 
         **Raises:** `ValueError` that says what differs.
         """
-        for what, then, now in (
-            ("name", self.name, problem.name),
-            ("features", dict(self.features), {n: repr(d) for n, d in problem.space.domains.items()}),
-            ("formulas", dict(self.formulas), {n: str(f) for n, f in problem.formulas.items()}),
-            ("precision", self.precision, precision),
-        ):
+        for what, now in {**described(problem), "precision": precision}.items():
+            then = getattr(self, what)
             if then != now:
                 raise ValueError(
                     f"verify cannot go on with the result of another problem: its {what} was "
@@ -205,6 +202,15 @@ class Verification(Drawn, InNotebook):
         return Path(path)
 
 
+def described(problem: Problem) -> dict[str, Any]:
+    """Return what a result records of its problem."""
+    return {
+        "name": problem.name,
+        "features": {name: repr(domain) for name, domain in problem.space.domains.items()},
+        "formulas": {name: str(formula) for name, formula in problem.formulas.items()},
+    }
+
+
 def load_verification(path: str | Path) -> Verification:
     """Read a result that `Verification.save` has written.
 
@@ -227,5 +233,3 @@ def load_verification(path: str | Path) -> Verification:
     for name in ("columns", "notes"):
         record[name] = tuple(record[name])
     return Verification(**record)
-
-
