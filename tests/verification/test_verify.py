@@ -114,7 +114,7 @@ def test_choices_are_looked_at_one_by_one_and_a_constraint_leaves_boxes_out():
          "n": vj.DiscreteBox(1, 4)}, where=lambda f: f["x"] > 0.25,
     )  # fmt: skip
     problem = vj.Problem("choices", space, system, "always y > 0")
-    found = vj.verify(problem, boxes=200, samples=0, progress=False)
+    found = vj.verify(problem, boxes=700, samples=0, progress=False)
     assert found.proved.mass == pytest.approx(0.75, abs=0.02)
     assert found.throughout.mass == pytest.approx(0.25, abs=0.02)
     assert found.boxes.mass[found.verdicts == "outside"].sum() == pytest.approx(0.25, abs=0.01)

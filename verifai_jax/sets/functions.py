@@ -409,8 +409,8 @@ def angle(y: Form, x: Form) -> Form:
         return circle
 
     def turned(by: float, ratio: Form) -> Form:
-        shift = Form.between(*np.full((2, *ratio.centre.shape), by), y.dtype)
-        return add(shift, FUNCTIONS["atan"](ratio))
+        ends = np.full(ratio.centre.shape, by)
+        return add(Form.between(ends, ends, y.dtype), FUNCTIONS["atan"](ratio))
 
     with np.errstate(all="ignore"):
         cases = [

@@ -98,7 +98,7 @@ class Boxes:
     @property
     def has_witness(self) -> Bool[np.ndarray, " n"]:
         """Whether a point of the box fails as simulated."""
-        return ~np.isnan(self.witness).any(axis=1)
+        return np.asarray(~np.isnan(self.witness).any(axis=1))
 
     def splittable(self, enclosure: Enclosure) -> Bool[np.ndarray, "n dim"]:
         """Return which coordinates of each box can be split."""
