@@ -27,11 +27,12 @@ LAYERS = (
         "requirements",
         "verification",
     },
-    {"failure_modes", "failure_table"},
+    {"failure_modes", "failure_table", "error_budgets", "trials"},
     {"sweeps", "augmentation", "checking"},
     {"hardening"},
     {"plotting"},
     {"reports"},
+    {"traceability"},
     {"cli", "testing"},
 )
 """Rooms from the ground up: each may import itself and the layers below its own."""

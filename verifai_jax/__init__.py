@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from verifai_jax.counterexamples import explain as explain
     from verifai_jax.counterexamples import replay_counterexamples as replay_counterexamples
     from verifai_jax.counterexamples import shrink as shrink
+    from verifai_jax.error_budgets import ErrorBudget as ErrorBudget
+    from verifai_jax.error_budgets import error_budget as error_budget
     from verifai_jax.estimation import Estimate as Estimate
     from verifai_jax.estimation import SequenceEstimate as SequenceEstimate
     from verifai_jax.estimation import estimate as estimate
@@ -134,6 +136,12 @@ if TYPE_CHECKING:
     from verifai_jax.systems.ode import ode as ode
     from verifai_jax.systems.ode import sin_cos as sin_cos
     from verifai_jax.systems.remote import remote as remote
+    from verifai_jax.traceability import TraceMatrix as TraceMatrix
+    from verifai_jax.traceability import trace_matrix as trace_matrix
+    from verifai_jax.trials import RealTrials as RealTrials
+    from verifai_jax.trials import compare_trials as compare_trials
+    from verifai_jax.trials import real_trials as real_trials
+    from verifai_jax.trials import trial_protocol as trial_protocol
     from verifai_jax.verification import Verification as Verification
     from verifai_jax.verification import load_verification as load_verification
     from verifai_jax.verification import verify as verify

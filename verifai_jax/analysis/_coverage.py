@@ -113,7 +113,7 @@ def coverage(source: Source, *, cells: int = 10, seed: int = 0) -> Coverage:
       verdict.
     - `cells`: into how many equal parts the range of a feature is cut, fewer where rows are too few
       to fill them; a discrete feature of up to 20 values has a cell for each.
-    - `seed`: of what is drawn at random.
+    - `seed`: the seed of everything that is drawn at random.
 
     **Returns:** a `Coverage`.
 

@@ -44,9 +44,9 @@ class Check:
     - `budget`: simulations at most.
     - `max_failure_probability`: failure probability that is still accepted; None accepts no
       counterexample at all.
-    - `seed`: of the search and the samples.
-    - `search`: of counterexamples, where none is accepted.
-    - `confidence`: of what is said of the failure probability.
+    - `seed`: the seed of the search and the samples.
+    - `search`: the search of counterexamples, where none is accepted.
+    - `confidence`: the confidence of statements about the failure probability.
     - `rename`: new names of features, for older files of the corpus.
 
     **Raises:** `ValueError` for numbers out of range, and for a budget with which no test could

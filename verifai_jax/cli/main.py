@@ -34,6 +34,7 @@ from verifai_jax.cli.exit_codes import (
 from verifai_jax.cli.explain import explain
 from verifai_jax.cli.falsify import falsify
 from verifai_jax.cli.fmea import fmea
+from verifai_jax.cli.formula import formula
 from verifai_jax.cli.fuzz import fuzz
 from verifai_jax.cli.going_on import WORDS
 from verifai_jax.cli.list import list_targets
@@ -47,6 +48,8 @@ from verifai_jax.cli.report import report
 from verifai_jax.cli.shrink import shrink
 from verifai_jax.cli.sweep import sweep
 from verifai_jax.cli.synthesize import synthesize
+from verifai_jax.cli.trace import trace
+from verifai_jax.cli.trials import trials
 from verifai_jax.cli.verify import verify
 from verifai_jax.core.errors import unknown_name
 
@@ -58,6 +61,7 @@ COMMANDS = (
     replay,
     analyze,
     monitor,
+    formula,
     doctor,
     confirm,
     estimate,
@@ -73,6 +77,8 @@ COMMANDS = (
     replay_counterexamples,
     compare,
     report,
+    trace,
+    trials,
     new,
 )
 """The sub-commands. Their files import nothing heavy until a command runs."""

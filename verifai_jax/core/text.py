@@ -59,7 +59,7 @@ def format_seconds(seconds: float, digits: int = 6) -> str:
     **Arguments:**
 
     - `seconds`: instant or duration.
-    - `digits`: of one below ten minutes.
+    - `digits`: the digits of a duration below ten minutes.
     """
     if not LONG <= abs(seconds) < STAMPS:
         return f"{format_time(seconds, digits)} s"

@@ -45,10 +45,11 @@ class SavedCounterexample:
     - `problem`, `target`: names of the problem, in itself and on the command line.
     - `formulas`: their texts by name.
     - `features`: the columns of the feature space.
-    - `robustness`: of each formula, as simulated.
+    - `robustness`: the robustness of each formula, as simulated.
     - `seed`, `row`: of the run and in its table: they decide the random key of the simulation.
     - `precision`, `backend`: that it was simulated with.
-    - `verdict`: of closer replays of the row that it came from; empty if there were none.
+    - `verdict`: the verdict of closer replays of the row that it came from; empty if there were
+      none.
     - `changed`: what departs from nominal, `[nominal, value]` by coordinate, where it was shrunk.
     - `found`: the search, its budget, the number of simulations, the version, and the `sources`:
       what the model was made of, as a run records it.
@@ -86,7 +87,7 @@ class SavedCounterexample:
             words = ["verifai-jax", "replay-counterexamples", self.target, str(path)]
             content["reproduce"] = shlex.join(words)
         with replacing(path) as partial:
-            partial.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+            partial.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", "utf-8")
         return path
 
     @classmethod
@@ -96,7 +97,7 @@ class SavedCounterexample:
         **Raises:** `CorpusError` for anything else.
         """
         try:
-            content = json.loads(path.read_text())
+            content = json.loads(path.read_text(encoding="utf-8-sig"))
         except (OSError, ValueError, RecursionError) as error:
             raise CorpusError(f"{path} cannot be read: {one_line(format_error(error))}") from None
         form = content.get("format") if isinstance(content, dict) else None
@@ -200,7 +201,6 @@ def save_counterexamples(
     ordered = claimed.sort_values("rho", kind="stable")
     points = problem.space.points(ordered)
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     paths: dict[Path, None] = {}
     for index in _spread(points, max_count):
         row = int(ordered.index[index])

@@ -81,7 +81,7 @@ def estimate(
     - `budget`: simulations at most, pilot and fit included.
     - `batch`: simulations at once; by default as many as the method asks for at a time.
     - `seed`: the same seed gives the same estimate on the same machine.
-    - `confidence`: of the interval and of the bound, between 0 and 1.
+    - `confidence`: the confidence of the interval and of the bound, between 0 and 1.
     - `p0`: a wanted upper limit of the probability, between 0 and 1; the result says whether it is
       shown, and how many further simulations without a failure would show it.
     - `precision`, `backend`: as in `falsify`.

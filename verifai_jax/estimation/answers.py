@@ -34,7 +34,7 @@ UNDERSTATED = 1.6
 class Plan:
     """Requirements of an answer.
 
-    - `confidence`: of the interval and the bound.
+    - `confidence`: the confidence of the interval and the bound.
     - `chains`: splitting chains of a level.
     - `clamped`: True at coordinates whose domain ends in an outermost value.
     """

@@ -136,7 +136,7 @@ class FittedProposal:
     - `proposal`: the fitted mixture.
     - `effective`: effective failures per simulation.
     - `tail`: tail index of their weights.
-    - `probability`: of a failure, by these samples.
+    - `probability`: the probability of a failure, by these samples.
     """
 
     proposal: Mixture

@@ -34,9 +34,10 @@ class Estimate(Drawn, InNotebook):
     """A failure probability, as `estimate` returns it.
 
     - `name`: name of the problem.
-    - `probability`: of a failure, under the prior of the feature space; None if none is claimed.
+    - `probability`: the probability of a failure, under the prior of the feature space; None if
+      none is claimed.
     - `low`, `high`: the interval, at `confidence`; without an estimate 0 and `upper_bound`.
-    - `confidence`: of the interval and of the bound.
+    - `confidence`: the confidence of the interval and of the bound.
     - `method`: `"monte_carlo"`, `"importance"` or `"splitting"`; None without an estimate.
     - `simulations`: number of all simulations; one with its gradient counts 2.
     - `budget`: simulations that were allowed.
@@ -105,7 +106,7 @@ class Estimate(Drawn, InNotebook):
         **Arguments:**
 
         - `p0`: failure probability to be shown, between 0 and 1.
-        - `confidence`: of the bound; that of the estimate when left out.
+        - `confidence`: the confidence of the bound; that of the estimate when left out.
 
         **Returns:** the number of samples in addition to those that `upper_bound` rests on; 0 if
         these show it already.
@@ -176,8 +177,8 @@ class Estimate(Drawn, InNotebook):
 
         **Arguments:**
 
-        - `path`: of the HTML file.
-        - `options`: of `reports.write_report`: `problem`, `units`, `reasons`.
+        - `path`: the path of the HTML file.
+        - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`, `errors`.
 
         **Returns:** the path.
         """

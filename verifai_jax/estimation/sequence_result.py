@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 class PartEstimate:
     """One part of a sequence, given that the parts before it have not failed.
 
-    - `name`: of its problem.
+    - `name`: the name of its problem.
     - `probability`: share that fails; NaN if no simulation has a verdict.
     - `low`, `high`: ends of its interval.
     - `samples`: simulations, or rows of a run, that it rests on.
@@ -51,7 +51,7 @@ class SequenceEstimate:
     - `counterexamples`: a row for each failure: the `part` that fails, and the features of it and
       of all parts before it as columns `PART.FEATURE`.
     - `simulations`: made for it.
-    - `seed`: of the samples; part i has the random keys of seed + i.
+    - `seed`: the seed of the samples; part i has the random keys of seed + i.
     - `notes`: what the intervals rest on.
     """
 

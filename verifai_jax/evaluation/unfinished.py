@@ -60,7 +60,7 @@ class Unfinished:
 
         **Arguments:**
 
-        - `problem`: of the evaluator.
+        - `problem`: the problem of the evaluator.
         - `mode`: what else its verdicts depend on, as text.
         """
         number, self._parts = self._parts, self._parts + 1
@@ -136,7 +136,7 @@ class Part:
 
         **Arguments:**
 
-        - `numbers`: of the simulations, which their random keys come from.
+        - `numbers`: the numbers of the simulations, which their random keys come from.
         """
         asked = {
             "points": np.asarray(points),

@@ -113,8 +113,9 @@ def falsify(
       starts. Its rows are not copied.
     - `folder`: where rows are kept on disk as they come; must not hold another run.
     - `precision`: `"float32"` or `"float64"`, of simulations and verdicts.
-    - `backend`: of a system that has several (`"mjx"`, `"native"`); the faster one that the search
-      can use when left out, as measured here. Name it for the same table on every machine.
+    - `backend`: the backend of a system that has several (`"mjx"`, `"native"`); the faster one that
+      the search can use when left out, as measured here. Name it for the same table on every
+      machine.
     - `confirm`: replay what violates the property in double precision and, where the system has
       finer steps, at a half and a quarter of its step, and do not claim what no longer does: it
       stays in the table, as `unconfirmed`. At most 1024 rows are replayed, or one for 128

@@ -25,7 +25,7 @@ class Array(Domain):
 
     **Arguments:**
 
-    - `domain`: of each value.
+    - `domain`: the domain of each value.
     - `length`: their number, or a pair with the smallest and the greatest number.
 
     **Raises:** `ValueError` for a length that is not a positive integer, or a pair that is not

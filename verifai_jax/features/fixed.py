@@ -18,9 +18,9 @@ class Fixed(Domain):
 
     **Arguments:**
 
-    - `domain`: of the feature.
+    - `domain`: the domain of the feature.
     - `value`: in the domain, as a person writes it.
-    - `name`: of the feature, for messages.
+    - `name`: the name of the feature, for messages.
 
     **Raises:** `ValueError` for a value outside the domain.
     """

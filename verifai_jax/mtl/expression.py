@@ -26,6 +26,7 @@ _CONSTANT: dict[str, Callable[..., float]] = {
     "sqrt": math.sqrt,
     "sin": math.sin,
     "cos": math.cos,
+    "exp": math.exp,
     "min": min,
     "max": max,
 }
@@ -96,6 +97,10 @@ class Expression(Term):
     def cos(self) -> "Expression":
         """Return the cosine of an angle in radians."""
         return Arithmetic("cos", (self,))
+
+    def exp(self) -> "Expression":
+        """Return e to this power."""
+        return Arithmetic("exp", (self,))
 
     def norm(self) -> "Expression":
         """Return the Euclidean norm of a vector signal `[time, k]` at every instant."""

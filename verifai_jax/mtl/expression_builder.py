@@ -41,7 +41,7 @@ class ExpressionBuilder:
 
     **Arguments:**
 
-    - `text`: of the formula.
+    - `text`: the text of the formula.
     - `constants`, `known`: numbers and formulas by name.
     - `reads`: whether a text is a formula; by default no text is offered in an error.
     """
@@ -239,6 +239,9 @@ class ExpressionBuilder:
     def _call(self, tree: Tree) -> Part:
         name, *arguments = tree.children
         span = self._span(tree)
+        if name == "pow" and len(arguments) == 2:
+            base, exponent = (self._expression(self._build(c)) for c in arguments)
+            return Part(base**exponent, *span)
         if str(name) not in FUNCTIONS:
             error = unknown_name("function", str(name), FUNCTIONS)
             raise self._fail(str(error), name.start_pos, name.start_pos + len(name))

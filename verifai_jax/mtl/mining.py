@@ -30,7 +30,7 @@ from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.mtl.parametric import Parametric, read_parametric
-from verifai_jax.mtl.recorded import Recordings, Simulated, as_recordings
+from verifai_jax.mtl.recorded import Recordings, Simulated, named_traces
 from verifai_jax.mtl.words import number_text
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
 
@@ -119,10 +119,10 @@ def mine(
     - `text`: a formula with one or two parameters `?name`, for numbers or ends of intervals.
     - `recordings`: traces, files or tables; or a `Problem`, whose tightest values that a search
       does not break are found, which proves nothing.
-    - `share`: of the recordings that are to satisfy it.
+    - `share`: the share of the recordings that are to satisfy it.
     - `end`: what comes after the last sample, `"hold"` or `"truncate"`.
     - `constants`, `definitions`: as of `parse`; a constant can fix a parameter's value.
-    - `confidence`: of the interval for the rate of recordings that break it.
+    - `confidence`: the confidence of the interval for the rate of recordings that break it.
     - `budget`, `seed`: simulations of the search at most, and its seed, for a problem.
 
     **Raises:** `FormulaSyntaxError`; `ValueError` for more than two parameters, one in which the
@@ -139,7 +139,7 @@ def mine(
         return lazy_import("verifai_jax.requirements", "mine_by_search")(
             template, recordings, budget, seed, confidence
         )
-    return mine_template(template, as_recordings(recordings), share, end, confidence)
+    return mine_template(template, tuple(named_traces(recordings).values()), share, end, confidence)
 
 
 def mine_template(

@@ -28,6 +28,9 @@ DECIMAL_COMMAS = r"^\s*[-+]?\d*(,\d*)?([eE][-+]?\d+)?\s*$"
 THOUSANDS = r"^\s*[-+]?(\d{1,3}|[1-9]\d{0,2},\d{3})\s*$"
 """Numbers in which a comma, where there is one, may stand between thousands, `1,500`."""
 
+UNIT = b"unit"
+"""Key of Arrow's metadata of a field under which its unit stands."""
+
 ENDINGS = (".csv", ".parquet", ".npz")
 """Endings of files that are recordings."""
 
@@ -61,7 +64,7 @@ def read(
     length. Columns that hold no numbers are left out, with a note, unless named in `columns`. An
     empty cell is a gap (NaN). In a CSV file commas, semicolons or tabs separate the columns,
     whichever the first line has; numbers may have a decimal comma, if all of them do. Lines of
-    comments (`#`) before the names, and a row of units below them, are passed over.
+    comments (`#`) before the names are passed over, and a row of units may stand below them.
 
     **Arguments:**
 
@@ -84,21 +87,22 @@ def read(
         path = Path(source)
         if not path.exists():
             raise FileNotFoundError(f"there is no recording {path}")
-        name, table = str(path), _file_columns(path)
+        name, (table, units) = str(path), _file_columns(path)
     else:
-        name, table = "the data frame", _frame_columns(source)
+        name, table, units = "the data frame", _frame_columns(source), {}
     if time not in table and dt is None:
         raise TimeColumnError(f"{name} has no column {time!r} of sample times", list(table))
     times = table.pop(time, None)
     signals, notes = _signals(name, table, columns)
+    units = {each: unit for each in signals if (unit := units.get(each) or units.get(f"{each}[0]"))}
     if dt is not None:
-        trace = Trace(signals, dt=dt, notes=notes)
+        trace = Trace(signals, dt=dt, notes=notes, units=units)
     else:
         stamps = seconds_of(name, time, times)
         if is_numeric(times) and (unit := epoch_unit(numbers_of(name, time, times))) != "s":
             notes[f"column {time!r} is read as {unit} since 1970, in seconds from the first"] = 1
         check_increasing(stamps)
-        trace = Trace(signals, times=stamps, notes=notes)
+        trace = Trace(signals, times=stamps, notes=notes, units=units)
     if resample_to is not None and method is not None:
         return resample(trace, resample_to, method)
     return trace
@@ -143,8 +147,8 @@ def _refuse_repeated(source: str, names: Sequence[str]) -> None:
         raise ValueError(f"{source} has more than one column {', '.join(map(repr, repeated))}")
 
 
-def _file_columns(path: Path) -> dict[str, Any]:
-    """Read columns by name, as Arrow arrays."""
+def _file_columns(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
+    """Read columns by name, as Arrow arrays, and the units that the file says."""
     import pyarrow
     from pyarrow import parquet
 
@@ -167,7 +171,19 @@ def _file_columns(path: Path) -> dict[str, Any]:
     if table.num_rows == 0:
         raise ValueError(f"{path} has no rows")
     _refuse_repeated(str(path), names)
-    return {name: table.column(name) for name in names}
+    said = {field.name: (field.metadata or {}).get(UNIT, b"").decode() for field in table.schema}
+    return {name: table.column(name) for name in names}, {n: u for n, u in said.items() if u}
+
+
+def _with_units(table: Any, units: Sequence[str]) -> Any:
+    """Return an Arrow table with the units of its columns."""
+    import pyarrow
+
+    if len(units) != table.num_columns:
+        return table
+    pairs = zip(table.schema, units, strict=True)
+    fields = [field.with_metadata({UNIT: unit.strip(' "[]()')}) for field, unit in pairs]
+    return pyarrow.Table.from_arrays(table.columns, schema=pyarrow.schema(fields))
 
 
 def _read_csv(path: Path) -> Any:
@@ -180,14 +196,15 @@ def _read_csv(path: Path) -> Any:
             comments, first = comments + 1, file.readline()
         second, third = file.readline(), file.readline()
     separator = max((",", ";", "\t"), key=first.count)
-    units = _are_units(*(line.rstrip("\n").split(separator) for line in (second, third)))
+    below = [line.rstrip("\n").split(separator) for line in (second, third)]
+    units = _are_units(*below)
     parsed = csv.ParseOptions(delimiter=separator)
     skipped = csv.ReadOptions(skip_rows=comments, skip_rows_after_names=int(units))
     table = csv.read_csv(path, parse_options=parsed, read_options=skipped)
     named = list(zip(table.column_names, table.columns, strict=True))
     commas = [name for name, column in named if _all_match(column, DECIMAL_COMMAS)]
     if not commas:
-        return table
+        return _with_units(table, below[0]) if units else table
     # Semicolons between the columns are there because commas are those of decimals.
     unclear = [name for name in commas if _all_match(table.column(name), THOUSANDS)]
     if unclear and separator != ";":
@@ -208,7 +225,7 @@ def _read_csv(path: Path) -> Any:
                 f"{path} has decimal commas in column {commas[0]!r} and decimal points in column "
                 f"{name!r}: write all numbers in one way"
             )
-    return again
+    return _with_units(again, below[0]) if units else again
 
 
 def _are_units(second: list[str], third: list[str]) -> bool:

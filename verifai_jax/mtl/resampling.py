@@ -6,6 +6,7 @@ What was recorded between two samples of the new clock stays with the trace (`Tr
 verdicts count it: a spike between two samples is not lost.
 """
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -85,7 +86,8 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
             {name: np.concatenate([signals[name], inner[name]])[positions] for name in signals},
             times=times,
         )
-    return Trace(signals, dt=float(dt), status=trace.status, between=between, notes=notes)
+    about = {"status": trace.status, "notes": notes, "units": trace.units}
+    return Trace(signals, dt=float(dt), between=between, **about)
 
 
 def _recorded(trace: Trace) -> Trace:
@@ -96,7 +98,7 @@ def _recorded(trace: Trace) -> Trace:
     fine = trace.finely()
     new = np.append(True, np.diff(fine.clock()) > 0)
     signals = {name: np.asarray(signal)[new] for name, signal in fine.signals.items()}
-    return Trace(signals, times=fine.clock()[new], status=trace.status, notes=trace.notes)
+    return replace(trace, signals=signals, dt=None, times=fine.clock()[new], between=None)
 
 
 def _positions(cells: Int[np.ndarray, " passed"], count: int) -> Int[np.ndarray, " positions"]:

@@ -55,12 +55,12 @@ def train_detector(
     **Arguments:**
 
     - `images`: colours in [0, 1].
-    - `labels`: of each image.
+    - `labels`: the labels of each image.
     - `network`: one to go on from; None begins anew, with the layers that `detector` chooses.
     - `steps`, `batch`: number of steps, and images in each.
-    - `learning_rate`: of the first step.
+    - `learning_rate`: the learning rate of the first step.
     - `noise`: standard deviation of what is added to each pixel, anew in each step.
-    - `seed`: of the weights, the order of the images and the noise.
+    - `seed`: the seed of the weights, the order of the images and the noise.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     **Returns:** the network, and the loss of each step.

@@ -83,7 +83,7 @@ def name_points(
     **Arguments:**
 
     - `axes`: with the points.
-    - `names`: of the points at `x` and `y`, in the units of the data.
+    - `names`: the names of the points at `x` and `y`, in the units of the data.
     - `low`, `high`: ends of a horizontal bar at each point, on which no name lies.
     """
     figure: Any = axes.figure

@@ -2,8 +2,10 @@
 
 simulated(problem)                                  # 64 traces from the prior
 mine_by_search(read_parametric("always x > ?d"), problem)
+distinguish_by_search(one, other, problem)
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +13,7 @@ import numpy as np
 from verifai_jax.core.trace import Trace
 from verifai_jax.falsification import falsify
 from verifai_jax.falsification.run import Run
+from verifai_jax.mtl.distinguishing import Distinction, distinction
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.mining import Mined, mine_template
 from verifai_jax.mtl.parametric import Parametric
@@ -58,7 +61,7 @@ def mine_by_search(
         left = budget - spent
         # Half of what is left, so that the values that a search moves are searched again.
         count = left if unbroken or left <= 2 * SIMULATED else left // 2
-        run = _searched(problem, mined.formula, count, seed + spent)
+        run = _searched(problem, {"asked": mined.formula}, count, seed + spent)
         spent += run.simulations
         failing = _failing(run)
         traces += _traces(run, failing[:TAKEN])
@@ -68,9 +71,38 @@ def mine_by_search(
     return replace(mined, searched=unbroken)
 
 
-def _searched(problem: Problem, formula: Formula, budget: int, seed: int) -> Run:
-    asking = replace(problem, spec={"asked": formula}, priority=None)
-    return falsify(asking, "auto", budget, seed=seed, confirm=False, progress=False)
+def distinguish_by_search(
+    one: Formula, other: Formula, problem: Problem, budget: int = 2000, seed: int = 0
+) -> Distinction:
+    """Search for a simulation on which one of two formulas holds and the other does not.
+
+    Simulations from the prior are looked at first. Then each formula is asked to imply the other:
+    what breaks that tells them apart.
+
+    **Raises:** as `falsify`.
+    """
+    source, end = f"a simulation of {problem.name}", problem.end
+    some = simulated(problem, min(SIMULATED, budget), seed)
+    found = distinction(one, other, some, source, end, len(some))
+    if found or budget <= len(some):
+        return found
+    spec = {"forth": one >> other, "back": other >> one}
+    run = _searched(problem, spec, budget - len(some), seed, stop_after=1)
+    traces = _traces(run, _failing(run)[:TAKEN])
+    return distinction(one, other, traces, source, end, len(some) + run.simulations)
+
+
+def _searched(
+    problem: Problem,
+    spec: Mapping[str, Formula],
+    budget: int,
+    seed: int,
+    stop_after: int | None = None,
+) -> Run:
+    asking = replace(problem, spec=spec, priority=None)
+    return falsify(
+        asking, "auto", budget, seed=seed, confirm=False, progress=False, stop_after=stop_after
+    )
 
 
 def _failing(run: Run) -> list[int]:

@@ -40,7 +40,7 @@ def evaluate(
 
     - `task`: the task. An episode ends where it says so, or at its time limit.
     - `policy`: the policy to measure.
-    - `seed`: of the episodes' starts and of what is random in their steps.
+    - `seed`: the seed of the episodes' starts and of what is random in their steps.
     - `episodes`: their number.
 
     **Returns:** `[episodes]`, the sum of rewards of each episode.

@@ -36,7 +36,7 @@ class Study:
     **Arguments:**
 
     - `name`: name on the command line and in results.
-    - `space`: of the hyper-parameters; a `FeatureSpace`, or a dictionary of domains.
+    - `space`: the space of the hyper-parameters; a `FeatureSpace`, or a dictionary of domains.
     - `trainer`: the task and the algorithms.
     - `problem`: from a policy to the problem of its closed loop. JAX may trace the policy's
       weights.

@@ -182,8 +182,8 @@ def clusters(
     - `count`: number of clusters; by default that from 2 to `max_clusters` with the greatest
       silhouette (Rousseeuw, Journal of Computational and Applied Mathematics 20, 1987), or 1 if
       none is above 0.25, or there are less than three rows. It is chosen on at most 5000 rows.
-    - `radius`: of DBSCAN, by default the knee of the distances to the k-th neighbour, where k is
-      twice the number of columns, and 4 at least.
+    - `radius`: the radius of DBSCAN, by default the knee of the distances to the k-th neighbour,
+      where k is twice the number of columns, and 4 at least.
     - `seed`: an integer, a NumPy generator or a `jax.random` key.
     - `scale`: as in `Samples.scaling`.
     - `max_clusters`: clusters at most, where `count` is left out.
