@@ -147,7 +147,7 @@ class _Work:
                 new = np.isinf(self.boxes.least[open_ones])
                 open_ones = open_ones[can | new]
                 if not len(open_ones):
-                    return "all boxes are decided, or too narrow to be split"
+                    return "all boxes are decided or too narrow"
                 if end is not None:
                     count = min(count, max(int(rate * (end - now)), 0))
                 if limit is not None:

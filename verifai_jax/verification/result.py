@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 
 from verifai_jax.core.figure import Drawn
 from verifai_jax.core.notebook import InNotebook, frame_html, picture_html
-from verifai_jax.core.text import counted, format_percent, format_seconds
+from verifai_jax.core.text import counted, format_percent
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.confidence_sequences import anytime_interval
 from verifai_jax.store.files import DamagedError, read_record, write_record
@@ -159,8 +159,7 @@ class Verification(Drawn, InNotebook):
             f"  failing      {format_percent(low)} of the prior at least, "
             f"{format_percent(high)} at most at {sure}",
             f"  boxes        {len(self.boxes):,} of {self.looked_at:,} that were looked at, "
-            f"{self.simulations:,} simulations, {format_seconds(round(self.seconds, 1))}; "
-            f"{self.stopped}",
+            f"{self.simulations:,} simulations in {self.seconds:z.1f} s, stopped: {self.stopped}",
             "  verified     the system in discrete time as it is simulated, in real arithmetic and "
             f"with the rounding of {self.precision}; no differential equation",
         ]
