@@ -174,9 +174,11 @@ class _Work:
         passes = proper & ~failing.any(1) & (robustness[:, 0] - slope >= 0)
         fails = proper & failing.all(1) & (robustness[:, 0] + slope <= 0)
         worth = np.flatnonzero(passes | fails | ~proper)
+        moves = np.zeros(some.low.shape)
         if len(worth):
             bounds = self.enclosure(some.low[worth], some.high[worth])
             some.least[worth], some.greatest[worth] = bounds.low, bounds.high
+            moves[worth] = bounds.moves
             state = np.where(bounds.holds, PROVED, np.where(bounds.high < 0, BROKEN, OPEN))
             # A box that the constraint cuts is split until it does so no more: its mass is unknown.
             state = np.where(bounds.inside, state, OPEN)
@@ -194,7 +196,7 @@ class _Work:
         kept[rows[split]] = False
         for name in ("state", "least", "greatest", "witness", "confirmed"):
             getattr(self.boxes, name)[rows] = getattr(some, name)
-        along = self.influence(some, robustness, can)
+        along = self.influence(some, robustness, moves, can)
         halves = some[split].halves(along[split], self.enclosure)
         self.boxes = self.boxes[kept].with_more(halves)
 
@@ -224,18 +226,24 @@ class _Work:
         return robustness, failing
 
     def influence(
-        self, some: Boxes, robustness: Float[np.ndarray, "n k"], can: np.ndarray
+        self, some: Boxes, robustness: np.ndarray, moves: np.ndarray, can: np.ndarray
     ) -> Int[np.ndarray, " n"]:
-        """Return the coordinate along which each box is to be split."""
+        """Return the coordinate along which each box is to be split.
+
+        That is the one that changes the robustness most, or, as far as bounds are wider than what
+        simulations see, the one that moves the signals most, and with them what is not linear.
+        """
         # What counts most is that a point has a verdict, or is accepted, and its neighbour is not.
         values = np.where(np.isnan(robustness), 1e30, np.clip(robustness, -1e29, 1e29))
         middle, up, down = values[:, :1], values[:, 1::2], values[:, 2::2]
         change = np.abs(up - down) + 2 * np.abs(up + down - 2 * middle)
-        change = change / np.maximum(change.max(1, keepdims=True), 1e-30)
-        width = some.high - some.low
+        seen = values.max(1) - values.min(1) + 1e-30
+        excess = np.clip(some.greatest - some.least, 0, 1e29) - seen
+        loose = np.where(moves.any(1), np.clip(excess / (excess + seen), 0, 1), 0)[:, None]
         # A coordinate without influence at these points may have one between them.
-        width = width / width.max(1, keepdims=True)
-        return np.argmax(np.where(can, change + 0.1 * width, -1.0), axis=1)
+        width = 0.1 * _relative(some.high - some.low)
+        score = (1 - loose) * _relative(change) + loose * _relative(moves) + width
+        return np.argmax(np.where(can, score, -1.0), axis=1)
 
     def confirm(self) -> None:
         """Find out which failing points of open boxes fail for certain."""
@@ -276,3 +284,8 @@ class _Work:
             f"{self.contradicted} boxes have a simulation outside of their bounds, and stay "
             "undecided: this is a mistake of verifai_jax, please report it",
         )
+
+
+def _relative(numbers: Float[np.ndarray, "n dim"]) -> Float[np.ndarray, "n dim"]:
+    """Return numbers as shares of the greatest in their row."""
+    return numbers / np.maximum(numbers.max(1, keepdims=True), 1e-300)

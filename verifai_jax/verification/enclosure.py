@@ -40,6 +40,7 @@ class Bounds(NamedTuple):
     - `low`, `high`: of the least robustness over the formulas; infinite where nothing is known.
     - `holds`: whether no point of the box breaks a formula.
     - `inside`, `outside`: whether the constraint accepts all points, or none.
+    - `moves`: how far each coordinate moves the signals of the formulas, added up.
     """
 
     low: Float[np.ndarray, " n"]
@@ -47,6 +48,7 @@ class Bounds(NamedTuple):
     holds: Bool[np.ndarray, " n"]
     inside: Bool[np.ndarray, " n"]
     outside: Bool[np.ndarray, " n"]
+    moves: Float[np.ndarray, "n dim"]
 
 
 class Enclosure:
@@ -67,9 +69,11 @@ class Enclosure:
             key = jax.random.key(0)
             where = space.where
 
-            def verdict(features: PyTree) -> tuple[Array, Array]:
+            def verdict(features: PyTree) -> tuple[Array, Array, list[Array]]:
                 accepted = jnp.array(True) if where is None else jnp.asarray(where(features))
-                return trace_verdict(problem, problem.system(features, key))[0], accepted
+                trace = problem.system(features, key)
+                signals = [jnp.asarray(trace.signals[name]) for name in problem.monitored]
+                return trace_verdict(problem, trace)[0], accepted, signals
 
             def truth(features: PyTree) -> Array:
                 return boolean_semantics(problem, problem.system(features, key))
@@ -176,7 +180,7 @@ class Enclosure:
 
     def _bounds(self, leaves: Sequence[Value], count: int) -> Bounds:
         with np.errstate(all="ignore"):
-            rho, accepted = self._evaluated(self._verdict, leaves, count)
+            rho, accepted, *signals = self._evaluated(self._verdict, leaves, count)
             ends = as_form(rho).bounds()
             low, high = (np.broadcast_to(end, (count, end.shape[1])) for end in ends)
             truth = np.broadcast_to(as_whole(accepted).low, (count,)) > 0
@@ -188,7 +192,12 @@ class Enclosure:
                 (kept,) = self._evaluated(self._truth, leaves, count)
                 true = np.broadcast_to(as_whole(kept).low, (count, low.shape[1])) > 0
                 holds = holds | (open_ones & np.all((low > 0) | true, axis=1))
-        return Bounds(least, high.min(1), holds, truth, outside)
+            moves = np.zeros((count, self.dim))
+            for form in signals:
+                if isinstance(form, Form) and form.slopes is not None:
+                    slopes = np.abs(form.slopes[: self.dim]).reshape(self.dim, -1, form.slopes[0, 0].size)
+                    moves += slopes.max(2).T / max(np.median(slopes.max((0, 2))), 1e-300)
+        return Bounds(least, high.min(1), holds, truth, outside, moves)
 
     def _evaluated(self, program: Any, leaves: Sequence[Value], count: int) -> list[Value]:
         interpreter = Interpreter(count, self.dim, self._known)

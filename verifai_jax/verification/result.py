@@ -140,29 +140,36 @@ class Verification(Drawn, InNotebook):
         return pd.DataFrame(rows).sort_values("mass", ascending=False, kind="stable")
 
     def __str__(self) -> str:
-        def share(part: Part) -> str:
+        def line(name: str, part: Part, text: str) -> str:
+            if not part.mass:
+                return f"  {name:<12} nothing"
             mass, volume = map(format_percent, part)
-            return f"{mass} of the prior, {volume} of the volume"
+            return f"  {name:<12} {mass} of the prior, {volume} of the volume: {text}"
 
         low, high = self.probability
+        proved, broken, undecided = self.proved, self.broken, self.undecided
+        shares = [format_percent(part.mass) for part in (proved, broken, undecided)]
         sure = format_percent(self.confidence)
+        count = counted(int(self.boxes.samples.sum()), "sample")
         lines = [
-            f"{self.name}: {format_percent(self.proved.mass)} of the prior is proved, "
-            f"{format_percent(self.broken.mass)} broken, "
-            f"{format_percent(self.undecided.mass)} undecided",
-            f"  proved       {share(self.proved)}: no point of it fails",
-            f"  broken       {share(self.broken)}: boxes with a point that fails for certain; in "
-            f"{format_percent(self.throughout.mass)} of the prior every point does",
-            f"  undecided    {share(self.undecided)}: fails with at most "
-            f"{format_percent(self.failure_bound)} of it, at {sure} by "
-            f"{counted(int(self.boxes.samples.sum()), 'sample')}",
+            f"{self.name}: {shares[0]} of the prior is proved, {shares[1]} broken, {shares[2]} "
+            "undecided",
+            line("proved", proved, "no point of it fails"),
+            line(
+                "broken", broken, "boxes with a point that fails for certain; in "
+                f"{format_percent(self.throughout.mass)} of the prior every point does",
+            ),
+            line(
+                "undecided", undecided, f"at most {format_percent(self.failure_bound)} of it "
+                f"fails, at {sure} by {count}",
+            ),
             f"  failing      {format_percent(low)} of the prior at least, "
-            f"{format_percent(high)} at most at {sure}",
+            f"{format_percent(high)} at most{f' at {sure}' * (undecided.mass > 0)}",
             f"  boxes        {len(self.boxes):,} of {self.looked_at:,} that were looked at, "
             f"{self.simulations:,} simulations in {self.seconds:z.1f} s, stopped: {self.stopped}",
             "  verified     the system in discrete time as it is simulated, in real arithmetic and "
             f"with the rounding of {self.precision}; no differential equation",
-        ]
+        ]  # fmt: skip
         return "\n".join([*lines, *(f"  note         {note}" for note in self.notes)])
 
     __repr__ = __str__
