@@ -105,7 +105,8 @@ def shrink(
     check_count("budget", budget)
     at = _origin(problem, by, nominal)
     if row is None and isinstance(at, Likeliest) and len(failing := run.table.counterexamples):
-        row = int(run.improbability(failing)["log_density"].idxmax())
+        density = run.improbability(failing)["log_density"].to_numpy(float)
+        row = int(failing.index.to_numpy()[np.argmax(density)])
     number, first = select_row(run, row)
     about_key = note_on_key(problem, number)
     problem = fix_key(problem, run, number)

@@ -14,9 +14,9 @@ reliability analysis, Probabilistic Engineering Mechanics 33 (2013), for the res
 """
 
 from functools import partial
-from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -102,10 +102,10 @@ class Surrogate:
         self.middle, self.scale = float(y.mean()), max(float(y.std()), 1e-6)
         size = max(128, power_of_two(len(z)))
         pad = size - len(z)
-        data: Any = TrainingData(  # pyright: ignore
-            np.pad(_boxed(z), ((0, pad), (0, 0))),
-            np.pad((y - self.middle) / self.scale, (0, pad)).astype(np.float32),
-            np.arange(size) < len(z),
+        data = TrainingData(
+            jnp.asarray(np.pad(_boxed(z), ((0, pad), (0, 0)))),
+            jnp.asarray(np.pad((y - self.middle) / self.scale, (0, pad)), jnp.float32),
+            jnp.asarray(np.arange(size) < len(z)),
         )
         self.hyper, self.posterior = _fitted(self.process, self.hyper, data)
 
