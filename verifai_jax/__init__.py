@@ -100,6 +100,7 @@ if TYPE_CHECKING:
     from verifai_jax.problem import Problem as Problem
     from verifai_jax.problem import ProblemError as ProblemError
     from verifai_jax.problem import Rulebook as Rulebook
+    from verifai_jax.qualification import qualify as qualify
     from verifai_jax.scenes import ProgramError as ProgramError
     from verifai_jax.scenes import ScenicProgram as ScenicProgram
     from verifai_jax.scenes import scenic as scenic
