@@ -40,8 +40,8 @@ PLANTED = {
     "E13": ("mtl/windows.py", "return fixed + sign * tau * jnp.log(jnp", "return fixed + 0.1 + sign * tau * jnp.log(jnp"),
     "E14": ("evaluation/verdicts.py", "broken = proper & (lowest < 0)", "broken = proper & (lowest < -0.1)"),
     "E15": ("evaluation/verdicts.py", "broken = proper & (lowest < 0)", "broken = proper & (lowest < 0.1)"),
-    "E16": ("falsification/table.py", "        self._hold(first, batch)\n        if self._tail", "        batch = {n: v[1:] for n, v in batch.items()}\n        self._hold(first, batch)\n        if self._tail"),
-    "E17": ("falsification/table.py", "        self._hold(first, batch)\n        if self._tail", "        batch = {n: np.concatenate([v, v[:1]]) for n, v in batch.items()}\n        self._hold(first, batch)\n        if self._tail"),
+    "E16": ("falsification/table_view.py", "self._frame = self._concatenate(frames)", "self._frame = self._concatenate(frames).iloc[1:]"),
+    "E17": ("falsification/table_view.py", "            if self._batches:\n                frames.append(", "            if self._batches:\n                frames.append(to_frame(row_numbers(self._batches), merge(self._batches)).iloc[:1])\n                frames.append("),
     "E18": ("falsification/table.py", "        self._hold(first, batch)\n        if self._tail", '        batch["rho"] = np.roll(batch["rho"], 1)\n        self._hold(first, batch)\n        if self._tail'),
     "E19": ("falsification/counts.py", "counts.violating += int(np.sum(violating))", "counts.violating += int(np.sum(violating)) + 1"),
     "E20": ("falsification/counts.py", "index = indices[np.argmin(rho[indices])]", "index = indices[np.argmax(rho[indices])]"),
@@ -94,6 +94,7 @@ def plant(number: str, folder: Path) -> subprocess.CompletedProcess:
     return subprocess.run(
         [sys.executable, "-c", RUN, HAZARDS[number].oracle],
         cwd=folder, env={**os.environ, **options}, capture_output=True, text=True, check=False,
+        timeout=300,
     )  # fmt: skip
 
 
