@@ -5,3 +5,4 @@ from verifai_jax.sets.form import Form as Form
 from verifai_jax.sets.interpreter import Interpreter as Interpreter
 from verifai_jax.sets.interpreter import MissingRule as MissingRule
 from verifai_jax.sets.whole import Whole as Whole
+

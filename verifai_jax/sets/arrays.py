@@ -137,9 +137,7 @@ def _split(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     parts = []
     for size, end in zip(sizes, ends, strict=True):
 
-        def cut(
-            array: np.ndarray, lead: int, begin: int = end - size, end: int = end
-        ) -> np.ndarray:
+        def cut(array: np.ndarray, lead: int, begin: int = end - size, end: int = end) -> np.ndarray:
             part = array.take(range(begin, end), axis + lead)
             return part.squeeze(axis + lead) if step.primitive.name == "unstack" else part
 
@@ -149,7 +147,9 @@ def _split(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
 
 def _taken(value: Value, positions: np.ndarray) -> Value:
     """Return the elements at these positions of the flat array."""
-    return value.moved(lambda array, lead: array.reshape(*array.shape[:lead], -1)[..., positions])
+    return value.moved(
+        lambda array, lead: array.reshape(*array.shape[:lead], -1)[..., positions]
+    )
 
 
 def _positions(t: Interpreter, step: Equation, inputs: list[Value], of: int) -> np.ndarray:
@@ -172,7 +172,8 @@ def _positions(t: Interpreter, step: Equation, inputs: list[Value], of: int) -> 
 
 
 def _in_reach(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value] | None:
-    """Return the hull over all values of the one index of a slice that varies; None if it is fixed."""
+    """Return the hull over all values of the one index of a slice that varies; None if it is fixed.
+    """
     starts = [as_whole(value) for value in inputs[1:]]
     array, sizes = inputs[0], step.params["slice_sizes"]
     if all(start.common is not None for start in starts):
@@ -414,3 +415,5 @@ def _times(a: Form, matrix: np.ndarray, dtype: np.dtype) -> Form:
             multiplied(a.centre, other), slopes, multiplied(a.radius, size),
             multiplied(a.size, size), dtype, None, a.frame, units=count + 1.0,
         )  # fmt: skip
+
+

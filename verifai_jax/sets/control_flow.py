@@ -147,3 +147,5 @@ def _while(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
             return reached
         state = t.closed(params["body_jaxpr"], [*shared, *state])
     raise NotImplementedError(f"a loop that may take more than {PASSES} passes")
+
+

@@ -215,9 +215,7 @@ def _whole_to_whole(value: Whole, dtype: np.dtype) -> Whole:
     return Whole(np.where(fits, value.low, info.min), np.where(fits, value.high, most), dtype)
 
 
-@rule(
-    "copy", "copy_p", "stop_gradient", "optimization_barrier", "device_put", "sharding_constraint"
-)
+@rule("copy", "copy_p", "stop_gradient", "optimization_barrier", "device_put", "sharding_constraint")
 def _same(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     return inputs
 

@@ -381,9 +381,8 @@ def total(a: Form, axes: Sequence[int]) -> Form:
                 np.where((a.low >= 0).all(lead), np.maximum(low - margin, 0), low - margin),
                 np.where((a.high <= 0).all(lead), np.minimum(high + margin, 0), high + margin),
             )
-            ends = (
-                np.where(np.isnan(ends[0]), -np.inf, ends[0]),
-                np.where(np.isnan(ends[1]), np.inf, ends[1]),
+            ends = np.where(np.isnan(ends[0]), -np.inf, ends[0]), np.where(
+                np.isnan(ends[1]), np.inf, ends[1]
             )
     return rounded(
         a.centre.sum(lead), slopes, a.radius.sum(lead), size, a.dtype, ends, a.frame,

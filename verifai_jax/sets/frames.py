@@ -91,11 +91,7 @@ def _sides(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     own = np.arange(count)
     unit[:, own, own - count] += scale == 0
     rows = np.arange(len(unit))
-    rest, own_sides, turned = (
-        unit,
-        np.empty_like(unit[:, :, :count]),
-        np.empty_like(unit[:, :, :count]),
-    )
+    rest, own_sides, turned = unit, np.empty_like(unit[:, :, :count]), np.empty_like(unit[:, :, :count])
     for k in range(count):
         # The longest of what is not spanned yet.
         longest = np.argmax(np.square(rest).sum(1), axis=1)

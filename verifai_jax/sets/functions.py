@@ -192,10 +192,7 @@ def _make_unknown(form: Form, where: np.ndarray) -> None:
     """Let a form be everything at some numbers."""
     if not np.any(where):
         return
-    form.radius, form.size = (
-        np.where(where, np.inf, form.radius),
-        np.where(where, np.inf, form.size),
-    )
+    form.radius, form.size = np.where(where, np.inf, form.radius), np.where(where, np.inf, form.size)
     if form.slopes is not None:
         form.slopes = np.where(where, 0.0, form.slopes)
     form.centre = np.where(where, 0.0, form.centre)
@@ -347,9 +344,7 @@ def lesser(a: Form, b: Form) -> Form:
 def difference(a: Form, b: Form) -> Form:
     """Return `a - b` of numbers as they are, not rounded: what a comparison sees."""
     exact = np.dtype(np.float64)
-    a, b = (
-        Form(f.centre, f.slopes, f.radius, f.size, exact, f.low, f.high, f.frame) for f in (a, b)
-    )
+    a, b = (Form(f.centre, f.slopes, f.radius, f.size, exact, f.low, f.high, f.frame) for f in (a, b))
     form = add(a, b, -1.0)
     (low, high), (first, last) = a.bounds(), b.bounds()
     nothing = unknown(low, high) | unknown(first, last)

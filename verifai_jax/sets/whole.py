@@ -109,7 +109,9 @@ def _divided(a: Whole, b: Whole) -> Whole:
     trunc = lambda x, y: np.sign(x) * np.sign(y) * (np.abs(x) // np.abs(y))  # noqa: E731
     found = _by_corners(trunc)(a, Whole(low, high, b.dtype))
     info = np.iinfo(a.dtype)
-    return Whole(np.where(safe, found.low, info.min), np.where(safe, found.high, info.max), a.dtype)
+    return Whole(
+        np.where(safe, found.low, info.min), np.where(safe, found.high, info.max), a.dtype
+    )
 
 
 def _left(a: Whole, b: Whole) -> Whole:

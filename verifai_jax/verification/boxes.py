@@ -45,7 +45,9 @@ class Boxes:
     samples: Int[np.ndarray, " n"]
 
     @classmethod
-    def between(cls, low: Float[np.ndarray, "n dim"], high: Float[np.ndarray, "n dim"]) -> "Boxes":
+    def between(
+        cls, low: Float[np.ndarray, "n dim"], high: Float[np.ndarray, "n dim"]
+    ) -> "Boxes":
         """Return open boxes."""
         n, infinite = len(low), np.full(len(low), np.inf)
         return cls(
@@ -123,9 +125,8 @@ class Boxes:
                 own = coordinate == j
                 first, last = (np.searchsorted(edges, end[own]) for end in (low, high))
                 middle[own] = edges[(first + last) // 2]
-        left, right = (
-            Boxes.between(self.low, self.high.copy()),
-            Boxes.between(self.low.copy(), self.high),
+        left, right = Boxes.between(self.low, self.high.copy()), Boxes.between(
+            self.low.copy(), self.high
         )
         left.high[rows, coordinate] = right.low[rows, coordinate] = middle
         known = self.has_witness

@@ -144,10 +144,7 @@ class Enclosure:
             for j in np.flatnonzero(flat.any(1)):
                 if self._edges[j] is None:
                     at = int(np.argmax(flat[j]))
-                    value, (low, high) = (
-                        leaf.reshape(len(leaf), -1)[:, at],
-                        end.reshape(2, -1)[:, at],
-                    )
+                    value, (low, high) = leaf.reshape(len(leaf), -1)[:, at], end.reshape(2, -1)[:, at]
                     shares[:, j] = (value - low) / (high - low)
         return shares
 
@@ -241,7 +238,6 @@ class Enclosure:
 
 def _rows(value: Value, block: slice) -> Value:
     """Return the sets of some boxes."""
-
     def cut(array: np.ndarray, lead: int) -> np.ndarray:
         axis = lead - 1
         if array.shape[axis] == 1:
@@ -267,7 +263,9 @@ def _known_functions(precision: str) -> dict[str, Any]:
     step = jax.make_jaxpr(sin_cos)(number).jaxpr.eqns
     if len(step) != 1 or "call_jaxpr" not in step[0].params:
         return {}
-    sin, cos = (jax.make_jaxpr(function)(number).jaxpr.eqns[0] for function in (jnp.sin, jnp.cos))
+    sin, cos = (
+        jax.make_jaxpr(function)(number).jaxpr.eqns[0] for function in (jnp.sin, jnp.cos)
+    )
 
     def both(t: Interpreter, inputs: list[Value]) -> list[Value]:
         low, high = as_form(inputs[0]).bounds()
@@ -278,3 +276,5 @@ def _known_functions(precision: str) -> dict[str, Any]:
         return [t.step(each, inputs)[0] for each in (sin, cos)]
 
     return {str(step[0].params["call_jaxpr"]): both}
+
+

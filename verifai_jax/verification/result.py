@@ -177,11 +177,7 @@ class Verification(Drawn, InNotebook):
         """
         for what, then, now in (
             ("name", self.name, problem.name),
-            (
-                "features",
-                dict(self.features),
-                {n: repr(d) for n, d in problem.space.domains.items()},
-            ),
+            ("features", dict(self.features), {n: repr(d) for n, d in problem.space.domains.items()}),
             ("formulas", dict(self.formulas), {n: str(f) for n, f in problem.formulas.items()}),
             ("precision", self.precision, precision),
         ):
@@ -231,3 +227,5 @@ def load_verification(path: str | Path) -> Verification:
     for name in ("columns", "notes"):
         record[name] = tuple(record[name])
     return Verification(**record)
+
+
