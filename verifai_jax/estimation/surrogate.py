@@ -79,6 +79,9 @@ FIRST_LOOK = 0.3
 """Share of the final samples after which it is asked whether the proposal meets failures at all."""
 MIN_FAILING = 10
 """Failures among these below which the proposal is given up: their weights say too little."""
+UNDERSTATED = 1.2
+"""Factor on the logarithms of the interval: samples of a proposal that was fitted to a model of the
+failures seldom show the weights beyond its edges."""
 LOOKS, MIN_LOOK = 4, 40
 """Looks at the interval after the first one, where it decides when to stop, and samples of that."""
 
@@ -376,6 +379,7 @@ def _answer(
         return answer
     mean = samples.mean
     low, high = samples.interval(confidence)
+    low, high = (mean.mean * (end / mean.mean) ** UNDERSTATED for end in (low, high))
     answer = Answer(counts, min(mean.mean, 1.0), low, high, "surrogate", mean.effective, mean.cv)
     right = float(np.mean((surrogate.predict(samples.points)[0] < 0) == samples.failing))
     worth = (1 - mean.mean) / (mean.mean * mean.cv**2)
