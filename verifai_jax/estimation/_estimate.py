@@ -109,7 +109,7 @@ def estimate(
       takes half a second or longer, if the budget is 200 or more.
     - `within`: with slow simulations, the factor from the estimate to the ends of the interval at
       which they may end before the budget, such as 1.5.
-    - `cheap`: a cheap model of the same features, which says where failures may be, and is simulated
+    - `cheap`: a cheap model of the same features, which says where failures may be. It is simulated
       some 100 000 times; every claim rests on simulations of `problem` alone. Simulations are
       `"slow"` then, and end at `within=1.5` where nothing else is said.
 

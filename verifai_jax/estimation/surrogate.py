@@ -90,8 +90,8 @@ class Surrogate:
     """A Gaussian process on the robustness over normal space.
 
     With a cheap model of the same features it is a process on what a multiple of the cheap
-    robustness leaves over (Kennedy, O'Hagan, Predicting the output from a complex computer code when
-    fast approximations are available, Biometrika 87, 2000). A cheap model of no use has the
+    robustness leaves over (Kennedy, O'Hagan, Predicting the output from a complex computer code
+    when fast approximations are available, Biometrika 87, 2000). A cheap model of no use has the
     multiple zero.
 
     **Arguments:**
