@@ -21,7 +21,7 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.precision import in_precision, reproducible_settings
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.evaluation.backends import resolved
-from verifai_jax.falsification.cheap import check_same_features, gravest_rows
+from verifai_jax.falsification import cheap as cheaply
 from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
 from verifai_jax.falsification.model_changes import continued_with
@@ -64,12 +64,6 @@ if TYPE_CHECKING:
     from verifai_jax.core.executors import Executor
     from verifai_jax.features.given import Rows
     from verifai_jax.statistics.stopping import StoppingRule
-
-
-CHEAP_TIMES, MAX_CHEAP = 20, 50_000
-"""Simulations of a cheap model for each one of the slow one, and at most."""
-MAX_OF_CHEAP = 16
-"""Rows that a cheap model proposes at most: beyond these its failures are alike."""
 
 
 @suggests_options
@@ -185,14 +179,14 @@ def falsify(
     check_rule(search, stop_when)
     check_guide(problem, search)
     if cheap is not None:
-        check_same_features(problem, cheap)
+        cheaply.check_same_features(problem, cheap)
         if first is not None:
             raise ValueError("give either first, or a cheap model that finds what comes first")
         found = falsify(
-            cheap, budget=min(CHEAP_TIMES * budget, MAX_CHEAP), seed=seed, confirm=False,
+            cheap, budget=min(cheaply.TIMES * budget, cheaply.MAX_CHEAP), seed=seed, confirm=False,
             precision=precision, progress=False,
         )  # fmt: skip
-        first = gravest_rows(found, max(1, min(budget // 4, MAX_OF_CHEAP)))
+        first = cheaply.gravest_rows(found, budget)
     given = check_first(problem, first, stop_when, precision)
     callbacks = check_callbacks(callbacks)
     earlier = earlier_rows(warm_start, problem)

@@ -1,4 +1,4 @@
-"""What a run of a cheap model says to one of a slow model of the same features.
+"""Rows of a cheap model that a run of a slow model of the same features begins with.
 
 check_same_features(slow, cheap)
 rows = gravest_rows(run_of_cheap, 16)               # features to simulate first
@@ -15,6 +15,10 @@ from verifai_jax.problem.problem import Problem, ProblemError
 if TYPE_CHECKING:
     import pandas as pd
 
+TIMES, MAX_CHEAP = 20, 50_000
+"""Simulations of a cheap model for each one of the slow one, and at most."""
+MAX_ROWS = 16
+"""Rows that a cheap model proposes at most: beyond these its failures are alike."""
 MAX_CANDIDATES = 4096
 """Rows of the cheap run at most among which those to simulate are chosen, the lowest ones."""
 LOWEST = 0.02
@@ -43,11 +47,17 @@ def check_same_features(slow: Problem, cheap: Problem) -> None:
         raise ProblemError("a cheap model has its features in the same order as the slow one")
 
 
-def gravest_rows(run: Run, count: int) -> "pd.DataFrame":
+def gravest_rows(run: Run, budget: int) -> "pd.DataFrame":
     """Choose rows of a run: its gravest failure, then failures that are far from those before.
 
     Where few rows fail, those of the lowest robustness count as failures.
+
+    **Arguments:**
+
+    - `run`: the run of the cheap model.
+    - `budget`: simulations of the slow one, of which these take a quarter at most.
     """
+    count = max(1, min(budget // 4, MAX_ROWS))
     rows = run.table.all.dropna(subset=["rho"]).sort_values("rho", kind="stable")
     failing = int(rows["violated"].sum())
     wanted = max(failing, int(LOWEST * len(rows)), count)
