@@ -67,17 +67,13 @@ def test_a_surrogate_that_is_wrong_everywhere_costs_precision_alone(monkeypatch)
 
 @pytest.mark.slow
 def test_a_cheap_model_saves_simulations():
-    plan = Plan(0.95, 32, np.zeros(2, bool), within=1.5)
-    plain, alone = answer_of(series, 2, plan)
-
     def cheap(u):
         z = ndtri(np.clip(u, 1e-300, 1 - 1e-16))
         return 2 * series(z) + 0.3 * np.sin(2 * z[:, 0])
 
     helped, answer = answer_of(series, 2, Plan(*[0.95, 32, PLAN.clamped, 1.5], cheap=cheap))
-    for each in (alone, answer):
-        assert each.low < 2.224e-3 < each.high <= 1.5**2 * each.low
-    assert 2 * helped.simulations < plain.simulations
+    assert answer.low < 2.224e-3 < answer.high <= 1.5**2 * answer.low
+    assert helped.simulations < 160
     # Another one that is wrong everywhere is found out.
     _, misled = answer_of(series, 2, Plan(*[0.95, 32, PLAN.clamped, 1.5], cheap=lambda u: u[:, 0]))
     assert misled.low < 2.224e-3 < misled.high
@@ -146,9 +142,5 @@ def test_what_does_not_fit_is_refused():
         vj.falsify(SLOW, budget=16, cheap=fewer)
     with pytest.raises(ValueError, match="either first, or a cheap model"):
         vj.falsify(SLOW, budget=16, cheap=CHEAP, first=[{"x": 0.0, "y": 0.0}])
-    with pytest.raises(TypeError, match="cheap must be a Problem; got str"):
-        vj.falsify(SLOW, budget=16, cheap="CHEAP")
     with pytest.raises(ValueError, match=r"within must be a factor above 1.*got 0\.5"):
         vj.estimate(SLOW, within=0.5)
-    with pytest.raises(ValueError, match="simulations_are"):
-        vj.estimate(SLOW, simulations_are="lazy")

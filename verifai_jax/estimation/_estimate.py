@@ -168,11 +168,9 @@ def estimate(
                 plan, within=within or WITHIN, cheap=_robustness_of(cheap, precision, seed)
             )
         if choice.problem.black_box:
-            before = time.perf_counter()
             notice_own_chance(limit_state, np.random.default_rng((seed, 1)))
-            each = (time.perf_counter() - before) / max(limit_state.simulations, 1)
             if simulations_are == "auto" and can_be_slow(choice.problem, executor):
-                slow = each >= SLOW
+                slow = slow or limit_state.seconds >= SLOW
         if slow and method is None and problem.space.dim:
             method = "surrogate"
         try:

@@ -351,7 +351,7 @@ def _sample(
         new = importance.sample_proposal(limit_state, rng, proposal, max(size, 1), plan.clamped)
         found = new if found is None else found.join(new)
         low, high = found.interval(confidence)
-        enough = plan.within is not None and low > 0 and high <= plan.within**2 * low
+        enough = plan.within and low > 0 and (high / low) ** UNDERSTATED <= plan.within**2
         if enough or limit_state.ended or found.failing.sum() < MIN_FAILING:
             break
     assert found is not None
