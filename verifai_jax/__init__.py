@@ -144,6 +144,7 @@ if TYPE_CHECKING:
     from verifai_jax.traceability import TraceMatrix as TraceMatrix
     from verifai_jax.traceability import trace_matrix as trace_matrix
     from verifai_jax.trials import RealTrials as RealTrials
+    from verifai_jax.trials import calibrate as calibrate
     from verifai_jax.trials import compare_trials as compare_trials
     from verifai_jax.trials import real_trials as real_trials
     from verifai_jax.trials import trial_protocol as trial_protocol
