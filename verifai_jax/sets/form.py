@@ -39,7 +39,7 @@ class Rounding(NamedTuple):
 
     unit: float
     smallest: float
-    greatest: float
+    highest: float
 
 
 @cache
@@ -99,7 +99,7 @@ class Form:
     def between(cls, low: Reals, high: Reals, dtype: np.dtype) -> "Form":
         """Return intervals; ends that are NaN stand for everything."""
         kind = rounding(dtype)
-        low, high = overflown(low, high, kind.greatest)
+        low, high = overflown(low, high, kind.highest)
         # What is below the smallest normal number may be taken for zero.
         low = np.where((low > 0) & (low < kind.smallest), 0.0, low)
         high = np.where((high < 0) & (high > -kind.smallest), 0.0, high)
@@ -170,6 +170,18 @@ class Form:
         ends = self.low, self.high
         return Form(self.centre, self.slopes, self.radius, self.size, dtype, *ends, self.frame)
 
+    def forget(self, where: np.ndarray) -> None:
+        """Let it be everything at some numbers."""
+        if not np.any(where):
+            return
+        self._bounds = self._spread = None
+        for name, value in (
+            ("centre", 0.0), ("slopes", 0.0), ("radius", np.inf), ("size", np.inf),
+            ("low", -np.inf), ("high", np.inf),
+        ):  # fmt: skip
+            if getattr(self, name) is not None:
+                setattr(self, name, np.where(where, value, getattr(self, name)))
+
     def unframed(self) -> "Form":
         """Return a set that depends on features alone: other symbols become part of the radius."""
         if self.frame is None or self.slopes is None:
@@ -181,13 +193,13 @@ class Form:
         return Form(self.centre, slopes, radius, self.size, self.dtype, self.low, self.high)
 
 
-def overflown(low: Reals, high: Reals, greatest: float) -> tuple[Reals, Reals]:
+def overflown(low: Reals, high: Reals, highest: float) -> tuple[Reals, Reals]:
     """Return an interval that is unbounded where its numbers may be beyond the greatest one."""
-    low = np.where(np.isnan(low) | (low < -greatest), -np.inf, low)
-    high = np.where(np.isnan(high) | (high > greatest), np.inf, high)
+    low = np.where(np.isnan(low) | (low < -highest), -np.inf, low)
+    high = np.where(np.isnan(high) | (high > highest), np.inf, high)
     # What is beyond it for certain is an infinity to the machine, and a number in real arithmetic.
-    low = np.where((low > greatest) & (low < np.inf), greatest, low)
-    return low, np.where((high < -greatest) & (high > -np.inf), -greatest, high)
+    low = np.where((low > highest) & (low < np.inf), highest, low)
+    return low, np.where((high < -highest) & (high > -np.inf), -highest, high)
 
 
 def unknown(low: Reals, high: Reals) -> Reals:
@@ -217,38 +229,21 @@ def rounded(
     kind = rounding(dtype)
     share, absolute = (SLACK, 0.0) if exact else (kind.unit * units, kind.smallest)
     radius = radius + (share * size + absolute)
-    if ends is not None and not exact:
-        low, high = ends
+    low, high = (None, None) if ends is None else ends
+    if low is not None and high is not None and not exact:
         low, high = low - share * np.abs(low), high + share * np.abs(high)
         low = np.where(np.abs(low) < kind.smallest, np.where(low < 0, -kind.smallest, 0.0), low)
         high = np.where(np.abs(high) < kind.smallest, np.where(high > 0, kind.smallest, 0.0), high)
-        ends = low, high
-    return settled(centre, slopes, radius, size, dtype, ends, frame)
-
-
-def settled(
-    centre: Reals,
-    slopes: Reals | None,
-    radius: Reals,
-    size: Reals,
-    dtype: np.dtype,
-    ends: tuple[Reals, Reals] | None,
-    frame: Frame | None,
-) -> Form:
-    """Return a form in which what may overflow, or is NaN, is unbounded."""
-    greatest = rounding(dtype).greatest
-    total = size.max(initial=0.0) + radius.max(initial=0.0)
-    low, high = (None, None) if ends is None else ends
-    if not total <= greatest / 2:
+    form = Form(centre, slopes, radius, size, dtype, low, high, frame)
+    if not size.max(initial=0.0) + radius.max(initial=0.0) <= kind.highest / 2:
+        # What may overflow, or is NaN, is unbounded.
         with np.errstate(invalid="ignore"):
-            wild = ~(size + radius <= greatest)
-        centre, size = np.where(wild, 0.0, centre), np.where(wild, np.inf, size)
-        radius = np.where(wild, np.inf, radius)
-        if slopes is not None:
-            slopes = np.where(wild, 0.0, slopes)
+            wild = ~(size + radius <= kind.highest)
         if low is not None and high is not None:
-            low, high = overflown(low, high, greatest)
-    return Form(centre, slopes, radius, size, dtype, low, high, frame)
+            low, high = overflown(low, high, kind.highest)
+        form.forget(wild)
+        form.low, form.high = low, high
+    return form
 
 
 def alike(forms: Sequence[Form]) -> tuple[list[Form], Frame | None, int]:
@@ -292,7 +287,7 @@ def add(a: Form, b: Form, sign: float = 1.0) -> Form:
         first, last = -last, -first
     with np.errstate(invalid="ignore"):
         ends = _sum_end(low, first, a.dtype, -1), _sum_end(high, last, a.dtype, 1)
-        form.low, form.high = overflown(*ends, rounding(a.dtype).greatest)
+        form.low, form.high = overflown(*ends, rounding(a.dtype).highest)
     return form
 
 
@@ -347,13 +342,13 @@ def interval_product(a: Form, b: Form) -> tuple[Reals, Reals]:
     (low, high), (first, last) = a.bounds(), b.bounds()
     with np.errstate(invalid="ignore"):
         ends = low * first, low * last, high * first, high * last
-        least = np.minimum(np.minimum(ends[0], ends[1]), np.minimum(ends[2], ends[3]))
-        greatest = np.maximum(np.maximum(ends[0], ends[1]), np.maximum(ends[2], ends[3]))
-    bad = np.isnan(least)
+        lowest = np.minimum(np.minimum(ends[0], ends[1]), np.minimum(ends[2], ends[3]))
+        highest = np.maximum(np.maximum(ends[0], ends[1]), np.maximum(ends[2], ends[3]))
+    bad = np.isnan(lowest)
     # An interval with zero inside and one without an end: none of the four products is NaN.
     for ours, theirs in (((low, high), (first, last)), ((first, last), (low, high))):
         bad |= (ours[0] <= 0) & (ours[1] >= 0) & ~(np.isfinite(theirs[0]) & np.isfinite(theirs[1]))
-    return np.where(bad, -np.inf, least), np.where(bad, np.inf, greatest)
+    return np.where(bad, -np.inf, lowest), np.where(bad, np.inf, highest)
 
 
 def product(a: Form, b: Form) -> Form:
@@ -391,7 +386,7 @@ def total(a: Form, axes: Sequence[int]) -> Form:
             # Numbers of one sign add up to one of that sign.
             low = np.where((a.low >= 0).all(lead), np.maximum(low, 0), low)
             ends = low, np.where((a.high <= 0).all(lead), np.minimum(high, 0), high)
-            ends = overflown(*ends, rounding(a.dtype).greatest)
+            ends = overflown(*ends, rounding(a.dtype).highest)
     return rounded(
         a.centre.sum(lead), slopes, a.radius.sum(lead), size, a.dtype, ends, a.frame, units=count
     )

@@ -85,12 +85,9 @@ class Interpreter:
                 return constant(each.val, each.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
             return values[each]
 
-        last = _last_uses(program)
-        for index, step in enumerate(program.eqns):
+        for step in program.eqns:
             results = self.step(step, [read(each) for each in step.invars])
             values.update(zip(step.outvars, results, strict=True))
-            for variable in last.get(index, ()):
-                values.pop(variable, None)
         return [read(each) for each in program.outvars]
 
     def closed(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
@@ -134,20 +131,6 @@ def constant(value: ArrayLike, dtype: np.dtype) -> Value:
     if jnp.issubdtype(dtype, jnp.integer) or dtype == jnp.bool_:
         return Whole.constant(np.asarray(value), np.dtype(dtype))
     raise MissingRule(f"sets have no numbers of type {dtype}")
-
-
-def _last_uses(program: Program) -> dict[int, list[object]]:
-    """Return which variables no operation needs after which one."""
-    kept = {id(each) for each in program.outvars}
-    last: dict[int, tuple[int, object]] = {}
-    for index, step in enumerate(program.eqns):
-        for each in (*step.invars, *step.outvars):
-            if id(each) not in kept and not isinstance(each, jax.extend.core.Literal):
-                last[id(each)] = (index, each)
-    ends: dict[int, list[object]] = {}
-    for index, each in last.values():
-        ends.setdefault(index, []).append(each)
-    return ends
 
 
 def _where(step: Equation) -> str:

@@ -37,7 +37,7 @@ class Whole:
 
     @property
     def is_point(self) -> bool:
-        """Whether each is one number."""
+        """True if each is one number."""
         return self.low is self.high or bool((self.low == self.high).all())
 
     @property
@@ -114,8 +114,8 @@ def _divided(a: Whole, b: Whole) -> Whole:
 
 def _left(a: Whole, b: Whole) -> Whole:
     _check_divisor(b)
-    most = np.maximum(np.abs(b.low), np.abs(b.high)) - 1
-    low, high = np.maximum(a.low, -most), np.minimum(a.high, most)
+    top = np.maximum(np.abs(b.low), np.abs(b.high)) - 1
+    low, high = np.maximum(a.low, -top), np.minimum(a.high, top)
     return Whole(np.where(a.low >= 0, 0, low), np.where(a.high <= 0, 0, high), a.dtype)
 
 
@@ -139,18 +139,31 @@ OPERATIONS: dict[str, Callable[[Whole, Whole], Whole]] = {
 """Operations on two sets, by the name of JAX's primitive."""
 
 
-def absolute(a: Whole) -> Whole:
-    """Return absolute values."""
+def _absolute(a: Whole) -> Whole:
     low = np.where((a.low <= 0) & (a.high >= 0), 0, np.minimum(np.abs(a.low), np.abs(a.high)))
     return _within(low, np.maximum(np.abs(a.low), np.abs(a.high)), a.dtype)
 
 
-def inverted(a: Whole) -> Whole:
-    """Return the other truth value, or the other bits."""
+def _inverted(a: Whole) -> Whole:
     if a.dtype == np.bool_:
         return Whole(1 - a.high, 1 - a.low, a.dtype)
-    return Whole(~a.high, ~a.low, a.dtype)
+    top = np.iinfo(a.dtype).max if a.dtype.kind == "u" else -1
+    return Whole(top - a.high, top - a.low, a.dtype)
 
+
+def _squared(a: Whole) -> Whole:
+    size = _absolute(a)
+    return OPERATIONS["mul"](size, size)
+
+
+FUNCTIONS: dict[str, Callable[[Whole], Whole]] = {
+    "abs": _absolute,
+    "neg": lambda a: _within(-a.high, -a.low, a.dtype),
+    "not": _inverted,
+    "sign": lambda a: Whole(np.sign(a.low), np.sign(a.high), a.dtype),
+    "square": _squared,
+}
+"""Operations on one set, by the name of JAX's primitive."""
 
 COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
 

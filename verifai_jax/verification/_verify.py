@@ -138,13 +138,13 @@ class _Work:
 
     def go_on(self, end: float | None, limit: int | None) -> str:
         """Look at boxes, the most probable first; return why it stopped."""
-        most, count, rate = TOGETHER * available_cores(), 32, 1e6
+        top, count, rate = TOGETHER * available_cores(), 32, 1e6
         try:
             while True:
                 now = time.perf_counter()
                 open_ones = np.flatnonzero(self.boxes.state == OPEN)
                 can = self.boxes[open_ones].splittable(self.enclosure).any(1)
-                new = np.isinf(self.boxes.least[open_ones])
+                new = np.isinf(self.boxes.lowest[open_ones])
                 open_ones = open_ones[can | new]
                 if not len(open_ones):
                     return "all boxes are decided or too narrow"
@@ -157,7 +157,7 @@ class _Work:
                 mass = self.boxes.mass[open_ones]
                 self.look_at(open_ones[np.argsort(-mass, kind="stable")[:count]])
                 rate = count / (time.perf_counter() - now)
-                count = min(2 * count, most)
+                count = min(2 * count, top)
                 decided = float(self.boxes.mass[self.boxes.state != OPEN].sum())
                 say_done(self.looked_at, limit, f"{100 * decided:z.3g} % decided")
         except KeyboardInterrupt:
@@ -177,7 +177,7 @@ class _Work:
         moves = np.zeros(some.low.shape)
         if len(worth):
             bounds = self.enclosure(some.low[worth], some.high[worth])
-            some.least[worth], some.greatest[worth] = bounds.low, bounds.high
+            some.lowest[worth], some.highest[worth] = bounds.low, bounds.high
             moves[worth] = bounds.moves
             state = np.where(bounds.holds, PROVED, np.where(bounds.high < 0, BROKEN, OPEN))
             # A box that the constraint cuts is split until it does so no more: its mass is unknown.
@@ -194,7 +194,7 @@ class _Work:
         split = (some.state == OPEN) & can.any(1)
         kept = np.ones(len(self.boxes), bool)
         kept[rows[split]] = False
-        for name in ("state", "least", "greatest", "witness", "confirmed"):
+        for name in ("state", "lowest", "highest", "witness", "confirmed"):
             getattr(self.boxes, name)[rows] = getattr(some, name)
         along = self.influence(some, robustness, moves, can)
         halves = some[split].halves(along[split], self.enclosure)
@@ -238,8 +238,8 @@ class _Work:
         middle, up, down = values[:, :1], values[:, 1::2], values[:, 2::2]
         change = np.abs(up - down) + 2 * np.abs(up + down - 2 * middle)
         seen = values.max(1) - values.min(1) + 1e-30
-        excess = np.clip(some.greatest - some.least, 0, 1e29) - seen
-        loose = np.where(moves.any(1), np.clip(excess / (excess + seen), 0, 1), 0)[:, None]
+        wide = np.clip(some.highest - some.lowest, 1e-30, 1e29)
+        loose = np.where(moves.any(1), np.clip(1 - seen / wide, 0, 1), 0)[:, None]
         # A coordinate without influence at these points may have one between them.
         width = 0.1 * _relative(some.high - some.low)
         score = (1 - loose) * _relative(change) + loose * _relative(moves) + width

@@ -91,7 +91,8 @@ class Enclosure:
                 self._fields[name] = slice(start, start + domain.size), part
                 start += domain.size
             self._forms = {name: jax.tree.leaves(form[name]) for name in sorted(form)}
-        self._edges = [
+        # Where the cells of a coordinate begin and end; None for a continuous one.
+        self.edges = [
             None if not count else np.cumsum([0.0, *(weights or (1 / count,) * count)])
             for count, weights in zip(space.levels, space.weights, strict=True)
         ]
@@ -99,14 +100,10 @@ class Enclosure:
 
     # Boxes and their cells
 
-    def edges(self, coordinate: int) -> Float[np.ndarray, " cells"] | None:
-        """Return where the cells of a coordinate begin and end; None if it is continuous."""
-        return self._edges[coordinate]
-
     def ends(self, low: Corners, high: Corners) -> tuple[Corners, Corners]:
         """Return the points of the cube that have the least and the greatest features of boxes."""
         low, high = low.copy(), high.copy()
-        for j, edges in enumerate(self._edges):
+        for j, edges in enumerate(self.edges):
             if edges is not None:
                 first = np.searchsorted(edges[:-1], low[:, j], side="right") - 1
                 last = np.searchsorted(edges[1:], high[:, j], side="left")
@@ -149,7 +146,7 @@ class Enclosure:
                 continue
             flat = symbols.reshape(self.dim, -1)
             for j in np.flatnonzero(flat.any(1)):
-                if self._edges[j] is None:
+                if self.edges[j] is None:
                     at = int(np.argmax(flat[j]))
                     value, (low, high) = (
                         leaf.reshape(len(leaf), -1)[:, at],
@@ -185,9 +182,9 @@ class Enclosure:
             low, high = (np.broadcast_to(end, (count, end.shape[1])) for end in ends)
             truth = np.broadcast_to(as_whole(accepted).low, (count,)) > 0
             outside = np.broadcast_to(as_whole(accepted).high, (count,)) <= 0
-            least = low.min(1)
-            holds = least > 0
-            if np.any(open_ones := least == 0):
+            lowest = low.min(1)
+            holds = lowest > 0
+            if np.any(open_ones := lowest == 0):
                 # At exactly zero the comparison decides, as it does for a simulation.
                 (kept,) = self._evaluated(self._truth, leaves, count)
                 true = np.broadcast_to(as_whole(kept).low, (count, low.shape[1])) > 0
@@ -195,9 +192,11 @@ class Enclosure:
             moves = np.zeros((count, self.dim))
             for form in signals:
                 if isinstance(form, Form) and form.slopes is not None:
-                    slopes = np.abs(form.slopes[: self.dim]).reshape(self.dim, -1, form.slopes[0, 0].size)
+                    slopes = np.abs(form.slopes[: self.dim]).reshape(
+                        self.dim, -1, form.slopes[0, 0].size
+                    )
                     moves += slopes.max(2).T / max(np.median(slopes.max((0, 2))), 1e-300)
-        return Bounds(least, high.min(1), holds, truth, outside, moves)
+        return Bounds(lowest, high.min(1), holds, truth, outside, moves)
 
     def _evaluated(self, program: Any, leaves: Sequence[Value], count: int) -> list[Value]:
         interpreter = Interpreter(count, self.dim, self._known)
