@@ -6,7 +6,7 @@ What an operation does is in the tables of `elementwise.py`, `arrays.py` and `co
 by the name of JAX's primitive.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import jax
@@ -27,7 +27,7 @@ Program: TypeAlias = Any
 """A `Jaxpr` or a `ClosedJaxpr`."""
 Rule: TypeAlias = Callable[["Interpreter", Equation, list[Value]], list[Value]]
 
-Known: TypeAlias = Callable[["Interpreter", list[Value]], list[Value]]
+Known: TypeAlias = Callable[[Program], Callable[[list[Value]], list[Value]] | None]
 
 RULES: dict[str, Rule] = {}
 """What each primitive does with sets, by its name."""
@@ -54,11 +54,11 @@ class Interpreter:
 
     - `boxes`: size of the batch.
     - `features`: number of symbols that stand for features.
-    - `known`: rules for functions with a derivative of their own, by the text of their program.
+    - `known`: a rule for a function with a derivative of its own, by its program; or None.
     """
 
-    def __init__(self, boxes: int, features: int, known: Mapping[str, Known] | None = None) -> None:
-        self.boxes, self.features, self.known = boxes, features, known or {}
+    def __init__(self, boxes: int, features: int, known: Known | None = None) -> None:
+        self.boxes, self.features, self.known = boxes, features, known
 
     def __call__(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
         """Evaluate a traced program; what is not defined becomes a set that is everything.

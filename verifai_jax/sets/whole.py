@@ -28,7 +28,7 @@ class Whole:
     @classmethod
     def truth(cls, true: np.ndarray, false: np.ndarray) -> "Whole":
         """Return truth values: where they are true for certain, and where false."""
-        return cls((true).astype(np.int64), (~false).astype(np.int64), np.dtype(bool))
+        return cls(true.astype(np.int64), (~false).astype(np.int64), np.dtype(bool))
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -85,25 +85,20 @@ def _by_corners(operation: Callable[..., Numbers]) -> Callable[[Whole, Whole], W
 
 
 def _logic(operation: Callable[..., np.ndarray]) -> Callable[[Whole, Whole], Whole]:
+    """Return an operation on bits: of truth values, of single numbers, and with a mask."""
+
     def applied(a: Whole, b: Whole) -> Whole:
-        if a.dtype != np.bool_ and not (a.is_point and b.is_point):
-            if operation is np.bitwise_and and (b if b.is_point else a).low.min() >= 0:
-                mask = b if b.is_point else a
-                return Whole(np.zeros_like(mask.low), mask.high, a.dtype)
-            raise NotImplementedError("a bitwise operation on whole numbers that vary in a box")
-        return Whole(operation(a.low, b.low), operation(a.high, b.high), a.dtype)
+        if a.dtype == np.bool_ and operation is np.bitwise_xor:
+            true, false = a.true & b.false | a.false & b.true, a.true & b.true | a.false & b.false
+            return Whole.truth(true, false)
+        if a.dtype == np.bool_ or (a.is_point and b.is_point):
+            return Whole(operation(a.low, b.low), operation(a.high, b.high), a.dtype)
+        mask = b if b.is_point else a
+        if operation is np.bitwise_and and mask.low.min() >= 0:
+            return Whole(np.zeros_like(mask.low), mask.high, a.dtype)
+        raise NotImplementedError("a bitwise operation on whole numbers that vary in a box")
 
     return applied
-
-
-def _exclusive(a: Whole, b: Whole) -> Whole:
-    if a.is_point and b.is_point:
-        return Whole(a.low ^ b.low, a.low ^ b.low, a.dtype)
-    if a.dtype != np.bool_:
-        raise NotImplementedError("a bitwise operation on whole numbers that vary in a box")
-    return Whole.truth(
-        (a.true & b.false) | (a.false & b.true), (a.true & b.true) | (a.false & b.false)
-    )
 
 
 def _divided(a: Whole, b: Whole) -> Whole:
@@ -134,7 +129,7 @@ OPERATIONS: dict[str, Callable[[Whole, Whole], Whole]] = {
     "min": lambda a, b: Whole(np.minimum(a.low, b.low), np.minimum(a.high, b.high), a.dtype),
     "and": _logic(np.bitwise_and),
     "or": _logic(np.bitwise_or),
-    "xor": _exclusive,
+    "xor": _logic(np.bitwise_xor),
 }
 """Operations on two sets, by the name of JAX's primitive."""
 

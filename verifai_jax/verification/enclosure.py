@@ -8,8 +8,9 @@ and evaluated with sets. What it says holds for each simulation whose features l
 the box's corners, in real arithmetic and in the precision of the simulation.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -23,7 +24,8 @@ from verifai_jax.core.precision import in_precision
 from verifai_jax.evaluation.verdicts import boolean_semantics, trace_verdict
 from verifai_jax.problem.problem import Problem
 from verifai_jax.sets import Form, Interpreter, Whole
-from verifai_jax.sets.interpreter import Value, as_form, as_whole, constant
+from verifai_jax.sets.functions import FUNCTIONS
+from verifai_jax.sets.interpreter import Value, as_form, as_whole
 from verifai_jax.systems.ode import sin_cos
 
 TOGETHER = 512
@@ -80,7 +82,6 @@ class Enclosure:
 
             self._verdict = _program(verdict, form)
             self._truth = _program(truth, form)
-            self._known = _known_functions(precision)
             self._values = jax.jit(jax.vmap(space.unflatten))
             # Name by name in the order of the leaves: which coordinates, and the program of domains
             # whose numbers are no monotone functions of one coordinate each.
@@ -96,7 +97,7 @@ class Enclosure:
             None if not count else np.cumsum([0.0, *(weights or (1 / count,) * count)])
             for count, weights in zip(space.levels, space.weights, strict=True)
         ]
-        self._symbols, self._scale, self._exact = self._dependence()
+        self._depends = self._dependence()
 
     # Boxes and their cells
 
@@ -120,39 +121,34 @@ class Enclosure:
             leaves = jax.tree.leaves(self._values(padded))
         return [np.asarray(leaf)[: len(points)].astype(np.float64) for leaf in leaves]
 
-    def _dependence(self) -> tuple[list[np.ndarray], list[np.ndarray], list[bool]]:
-        """Return for each leaf on which coordinate its numbers depend, their size, and more.
+    def _dependence(self) -> list[tuple[np.ndarray, np.ndarray, bool]]:
+        """Return for each leaf on which coordinates its numbers depend, their size, and more.
 
         The last is whether the map of its domain to its ends is exact.
         """
         levels = [np.full((1, self.dim), level) for level in (0.0, 0.25, 0.75)]
         probes = np.concatenate([levels[0], np.eye(self.dim), *levels[1:]])
-        leaves = self._features(self.ends(probes, probes)[0] if self.dim else probes)
-        symbols = [(leaf[1:-2] != leaf[0]).astype(float) for leaf in leaves]
-        scale = [np.maximum(np.abs(leaf[-2]), np.abs(leaf[-1])) for leaf in leaves]
-        exact = [
-            self.problem.space.domains[name].uniform
-            for name, forms in self._forms.items() for _ in forms
-        ]  # fmt: skip
-        return symbols, scale, exact
+        leaves = iter(self._features(self.ends(probes, probes)[0]))
+        found = []
+        for name, forms in self._forms.items():
+            for _, leaf in zip(forms, leaves, strict=False):
+                symbols = (leaf[1:-2] != leaf[0]).astype(float)
+                size = np.maximum(np.abs(leaf[-2]), np.abs(leaf[-1]))
+                found.append((symbols, size, self.problem.space.domains[name].uniform))
+        return found
 
     def shares(self, points: Corners) -> Corners:
         """Return where the features of points lie between their least and greatest, from 0 to 1."""
         shares = points.astype(float).copy()
         leaves = self._features(points)
         ends = self._features(np.array([[0.0] * self.dim, [1.0] * self.dim]))
-        for leaf, end, symbols, exact in zip(leaves, ends, self._symbols, self._exact, strict=True):
-            if exact or not np.issubdtype(leaf.dtype, np.floating):
-                continue
+        for leaf, end, (symbols, _, exact) in zip(leaves, ends, self._depends, strict=True):
             flat = symbols.reshape(self.dim, -1)
-            for j in np.flatnonzero(flat.any(1)):
+            for j in np.flatnonzero(flat.any(1) & (not exact)):
                 if self.edges[j] is None:
                     at = int(np.argmax(flat[j]))
-                    value, (low, high) = (
-                        leaf.reshape(len(leaf), -1)[:, at],
-                        end.reshape(2, -1)[:, at],
-                    )
-                    shares[:, j] = (value - low) / (high - low)
+                    low, high = end.reshape(2, -1)[:, at]
+                    shares[:, j] = (leaf.reshape(len(leaf), -1)[:, at] - low) / (high - low)
         return shares
 
     # Sets
@@ -192,14 +188,13 @@ class Enclosure:
             moves = np.zeros((count, self.dim))
             for form in signals:
                 if isinstance(form, Form) and form.slopes is not None:
-                    slopes = np.abs(form.slopes[: self.dim]).reshape(
-                        self.dim, -1, form.slopes[0, 0].size
-                    )
-                    moves += slopes.max(2).T / max(np.median(slopes.max((0, 2))), 1e-300)
+                    slopes = np.abs(form.slopes[: self.dim])
+                    slopes = slopes.reshape(*slopes.shape[:2], -1).max(2)
+                    moves += slopes.T / max(np.median(slopes.max(0)), 1e-300)
         return Bounds(lowest, high.min(1), holds, truth, outside, moves)
 
     def _evaluated(self, program: Any, leaves: Sequence[Value], count: int) -> list[Value]:
-        interpreter = Interpreter(count, self.dim, self._known)
+        interpreter = Interpreter(count, self.dim, _known)
         with in_precision(self.precision):
             return interpreter(program, leaves)
 
@@ -229,11 +224,12 @@ class Enclosure:
         begin, end = begins[i], ends[i]
         if not jnp.issubdtype(dtype, jnp.floating):
             return Whole(begin.astype(np.int64), end.astype(np.int64), np.dtype(dtype))
-        symbols = self._symbols[i]
-        size = np.maximum(np.maximum(np.abs(begin), np.abs(end)), self._scale[i])
-        margin = ROUNDINGS * float(jnp.finfo(dtype).eps) * size * symbols.any(0)
+        symbols, scale, exact = self._depends[i]
+        smooth = np.array([edges is None for edges in self.edges])
+        size = np.maximum(np.maximum(np.abs(begin), np.abs(end)), scale)
+        margin = ROUNDINGS * float(jnp.finfo(dtype).eps) * size * symbols[smooth].any(0)
         moved = [margin, margin]
-        if self._exact[i]:
+        if exact:
             # The ends of the whole interval are values themselves, and nothing lies beyond.
             moved = [
                 margin * (1 - np.tensordot(1.0 * at_end, symbols, (1, 0)))
@@ -261,23 +257,33 @@ def _program(function: Any, form: PyTree) -> Any:
     return closed.replace(jaxpr=used)
 
 
-def _known_functions(precision: str) -> dict[str, Any]:
-    """Return rules for functions of this package that sets should not go into, by their program.
+def _known(program: Any) -> Callable[[list[Value]], list[Value]] | None:
+    """Return a rule for a function of this package that sets should not go into.
 
     `sin_cos` reduces its argument by a whole number of quarter turns, which boxes have several of.
     """
-    number = jax.ShapeDtypeStruct((), precision)
-    step = jax.make_jaxpr(sin_cos)(number).jaxpr.eqns
-    if len(step) != 1 or "call_jaxpr" not in step[0].params:
-        return {}
-    sin, cos = (jax.make_jaxpr(function)(number).jaxpr.eqns[0] for function in (jnp.sin, jnp.cos))
+    if len(program.in_avals) != 1 or program.consts:
+        return None
+    (form,) = program.in_avals
+    return _sin_cos if str(program) == _text_of_sin_cos(form.shape, form.dtype) else None
 
-    def both(t: Interpreter, inputs: list[Value]) -> list[Value]:
-        low, high = as_form(inputs[0]).bounds()
-        limit = 1e5
-        if np.any((low < -limit) | (high > limit)):
-            everything = constant(np.array(np.nan), np.dtype(precision))
-            return [everything, everything]
-        return [t.step(each, inputs)[0] for each in (sin, cos)]
 
-    return {str(step[0].params["call_jaxpr"]): both}
+@cache
+def _text_of_sin_cos(shape: tuple[int, ...], dtype: np.dtype) -> str:
+    steps = jax.make_jaxpr(sin_cos)(jax.ShapeDtypeStruct(shape, dtype)).jaxpr.eqns
+    return str(steps[0].params.get("call_jaxpr"))
+
+
+def _sin_cos(inputs: list[Value]) -> list[Value]:
+    angle = as_form(inputs[0])
+    low, high = angle.bounds()
+    results = []
+    for name in ("sin", "cos"):
+        form = FUNCTIONS[name](angle)
+        # Its error is 1.2e-7, and beyond 1e5 it is NaN.
+        form.radius = form.radius + 2.4e-7
+        if form.low is not None and form.high is not None:
+            form.low, form.high = form.low - 2.4e-7, form.high + 2.4e-7
+        form.forget((low < -1e5) | (high > 1e5))
+        results.append(form)
+    return results
