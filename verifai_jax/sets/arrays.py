@@ -313,9 +313,8 @@ def _times(a: Form, numbers: np.ndarray, names: str, dtype: np.dtype, terms: int
     """Return sums of so many products of a form and exact numbers, as einsum names them."""
     times = functools.partial(np.einsum, names, optimize=["einsum_path", (0, 1)])
     slopes = None if a.slopes is None else times(a.slopes, numbers)
-    with np.errstate(invalid="ignore"):
-        size = np.abs(numbers)
-        return rounded(
-            times(a.centre, numbers), slopes, times(a.radius, size), times(a.size, size), dtype,
-            None, a.frame, units=terms + 1.0,
-        )  # fmt: skip
+    size = np.abs(numbers)
+    return rounded(
+        times(a.centre, numbers), slopes, times(a.radius, size), times(a.size, size), dtype,
+        None, a.frame, units=terms + 1.0,
+    )  # fmt: skip

@@ -104,9 +104,8 @@ class Form:
         low = np.where((low > 0) & (low < kind.smallest), 0.0, low)
         high = np.where((high < 0) & (high > -kind.smallest), 0.0, high)
         bounded = np.isfinite(low) & np.isfinite(high)
-        with np.errstate(invalid="ignore"):
-            centre = np.where(bounded, low / 2 + high / 2, 0.0)
-            radius = np.where(bounded, np.maximum(high - centre, centre - low), np.inf)
+        centre = np.where(bounded, low / 2 + high / 2, 0.0)
+        radius = np.where(bounded, np.maximum(high - centre, centre - low), np.inf)
         size = np.maximum(np.abs(low), np.abs(high))
         radius = np.where((radius > 0) & bounded, radius + SLACK * size, radius)
         return cls(centre, None, radius, size, dtype, low, high)
@@ -237,8 +236,7 @@ def rounded(
     form = Form(centre, slopes, radius, size, dtype, low, high, frame)
     if not size.max(initial=0.0) + radius.max(initial=0.0) <= kind.highest / 2:
         # What may overflow, or is NaN, is unbounded.
-        with np.errstate(invalid="ignore"):
-            wild = ~(size + radius <= kind.highest)
+        wild = ~(size + radius <= kind.highest)
         if low is not None and high is not None:
             low, high = overflown(low, high, kind.highest)
         form.forget(wild)
@@ -285,9 +283,8 @@ def add(a: Form, b: Form, sign: float = 1.0) -> Form:
     (low, high), (first, last) = a.bounds(), b.bounds()
     if sign < 0:
         first, last = -last, -first
-    with np.errstate(invalid="ignore"):
-        ends = _sum_end(low, first, a.dtype, -1), _sum_end(high, last, a.dtype, 1)
-        form.low, form.high = overflown(*ends, rounding(a.dtype).highest)
+    ends = _sum_end(low, first, a.dtype, -1), _sum_end(high, last, a.dtype, 1)
+    form.low, form.high = overflown(*ends, rounding(a.dtype).highest)
     return form
 
 
@@ -299,8 +296,7 @@ def _sum_end(one: Reals, other: Reals, dtype: np.dtype, side: int) -> Reals:
     # Knuth's error of the sum: it is zero where the sum is exact.
     exact = (one - (end - back)) + (other - back) == 0
     if dtype.itemsize < 8:
-        with np.errstate(over="ignore"):
-            exact &= end.astype(dtype).astype(np.float64) == end
+        exact &= end.astype(dtype).astype(np.float64) == end
     small = (end != 0) & (np.abs(end) < kind.smallest)
     widened = np.where(exact & ~small, end, end + side * (kind.unit * np.abs(end) + kind.smallest))
     # A sum of numbers of one sign has that sign, or is zero.
@@ -325,25 +321,23 @@ def scaled(a: Form, by: Reals) -> Form:
     """Return `a` times exact finite numbers."""
     slopes = None if a.slopes is None else a.slopes * by
     size, scale = a.size * np.abs(by), np.abs(by)
-    with np.errstate(invalid="ignore"):
-        ends = None
-        if a.low is not None and a.high is not None:
-            one, other = a.low * by, a.high * by
-            ends = np.minimum(one, other), np.maximum(one, other)
-        # Times 0, 1, 2, 4 ... nothing is rounded.
-        exact = bool(((np.frexp(scale)[0] == 0.5) & (scale >= 1) | (scale == 0)).all())
-        return rounded(
-            a.centre * by, slopes, a.radius * scale, size, a.dtype, ends, a.frame, exact=exact
-        )
+    ends = None
+    if a.low is not None and a.high is not None:
+        one, other = a.low * by, a.high * by
+        ends = np.minimum(one, other), np.maximum(one, other)
+    # Times 0, 1, 2, 4 ... nothing is rounded.
+    exact = bool(((np.frexp(scale)[0] == 0.5) & (scale >= 1) | (scale == 0)).all())
+    return rounded(
+        a.centre * by, slopes, a.radius * scale, size, a.dtype, ends, a.frame, exact=exact
+    )
 
 
 def interval_product(a: Form, b: Form) -> tuple[Reals, Reals]:
     """Return the interval of a product; everything where zero may meet an infinity."""
     (low, high), (first, last) = a.bounds(), b.bounds()
-    with np.errstate(invalid="ignore"):
-        ends = low * first, low * last, high * first, high * last
-        lowest = np.minimum(np.minimum(ends[0], ends[1]), np.minimum(ends[2], ends[3]))
-        highest = np.maximum(np.maximum(ends[0], ends[1]), np.maximum(ends[2], ends[3]))
+    ends = low * first, low * last, high * first, high * last
+    lowest = np.minimum(np.minimum(ends[0], ends[1]), np.minimum(ends[2], ends[3]))
+    highest = np.maximum(np.maximum(ends[0], ends[1]), np.maximum(ends[2], ends[3]))
     bad = np.isnan(lowest)
     # An interval with zero inside and one without an end: none of the four products is NaN.
     for ours, theirs in (((low, high), (first, last)), ((first, last), (low, high))):
@@ -357,20 +351,19 @@ def product(a: Form, b: Form) -> Form:
         if is_point(one) and np.isfinite(one.centre).all():
             return scaled(other, one.centre)
     (a, b), frame, _ = alike([a, b])
-    with np.errstate(invalid="ignore", over="ignore"):
-        ends = interval_product(a, b)
-        size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
-        slopes = joint_slopes(a, b, b.centre, a.centre)
-        centre = a.centre * b.centre
-        radius = np.abs(a.centre) * b.radius + np.abs(b.centre) * a.radius + a.spread * b.spread
-        if a.slopes is not None and b.slopes is not None:
-            # The square of a symbol lies in [0, 1], not in [-1, 1].
-            count = min(len(a.slopes), len(b.slopes))
-            squares = a.slopes[:count] * b.slopes[:count]
-            centre = centre + squares.sum(0) / 2
-            radius = radius - np.abs(squares).sum(0) / 2
-        slack = (np.abs(a.centre) + a.spread) * (np.abs(b.centre) + b.spread) * SLACK
-        return rounded(centre, slopes, radius + slack, size, a.dtype, ends, frame)
+    ends = interval_product(a, b)
+    size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+    slopes = joint_slopes(a, b, b.centre, a.centre)
+    centre = a.centre * b.centre
+    radius = np.abs(a.centre) * b.radius + np.abs(b.centre) * a.radius + a.spread * b.spread
+    if a.slopes is not None and b.slopes is not None:
+        # The square of a symbol lies in [0, 1], not in [-1, 1].
+        count = min(len(a.slopes), len(b.slopes))
+        squares = a.slopes[:count] * b.slopes[:count]
+        centre = centre + squares.sum(0) / 2
+        radius = radius - np.abs(squares).sum(0) / 2
+    slack = (np.abs(a.centre) + a.spread) * (np.abs(b.centre) + b.spread) * SLACK
+    return rounded(centre, slopes, radius + slack, size, a.dtype, ends, frame)
 
 
 def total(a: Form, axes: Sequence[int]) -> Form:
@@ -380,13 +373,12 @@ def total(a: Form, axes: Sequence[int]) -> Form:
     slopes = None if a.slopes is None else a.slopes.sum(tuple(axis + 2 for axis in axes))
     size, ends = a.size.sum(lead), None
     if a.low is not None and a.high is not None:
-        with np.errstate(invalid="ignore"):
-            margin = rounding(a.dtype).unit * count * size
-            low, high = a.low.sum(lead) - margin, a.high.sum(lead) + margin
-            # Numbers of one sign add up to one of that sign.
-            low = np.where((a.low >= 0).all(lead), np.maximum(low, 0), low)
-            ends = low, np.where((a.high <= 0).all(lead), np.minimum(high, 0), high)
-            ends = overflown(*ends, rounding(a.dtype).highest)
+        margin = rounding(a.dtype).unit * count * size
+        low, high = a.low.sum(lead) - margin, a.high.sum(lead) + margin
+        # Numbers of one sign add up to one of that sign.
+        low = np.where((a.low >= 0).all(lead), np.maximum(low, 0), low)
+        ends = low, np.where((a.high <= 0).all(lead), np.minimum(high, 0), high)
+        ends = overflown(*ends, rounding(a.dtype).highest)
     return rounded(
         a.centre.sum(lead), slopes, a.radius.sum(lead), size, a.dtype, ends, a.frame, units=count
     )
@@ -396,11 +388,10 @@ def joined(one: Form, other: Form) -> Form:
     """Return a set that contains two: their hull, with the mean of their slopes."""
     (a, b), frame, _ = alike([one, other])
     gap = joint_slopes(a, b, 0.5, -0.5)
-    with np.errstate(invalid="ignore"):
-        apart = np.abs(a.centre - b.centre) / 2
-        if gap is not None:
-            apart = apart + np.abs(gap).sum(0)
-        radius = apart + np.maximum(a.radius, b.radius)
+    apart = np.abs(a.centre - b.centre) / 2
+    if gap is not None:
+        apart = apart + np.abs(gap).sum(0)
+    radius = apart + np.maximum(a.radius, b.radius)
     (low, high), (first, last) = a.bounds(), b.bounds()
     return rounded(
         a.centre / 2 + b.centre / 2, joint_slopes(a, b, 0.5, 0.5), radius,

@@ -65,11 +65,7 @@ class Function(NamedTuple):
 
     def __call__(self, x: Form) -> Form:
         """Return the set of its values on a set."""
-        with np.errstate(all="ignore"):
-            return self._enclosed(x, *x.bounds())
-
-    def _enclosed(self, x: Form, low: Reals, high: Reals) -> Form:
-        first, last = self.domain
+        (low, high), (first, last) = x.bounds(), self.domain
         outside = unknown(low, high) | (low < first) | (high > last) | (low > high)
         inside_low, inside_high = np.clip(low, first, last), np.clip(high, first, last)
         points = self._points(np.zeros_like(low), inside_low, inside_high)
@@ -142,14 +138,13 @@ def _sine(value: Callable[[Reals], Reals], criticals: Criticals) -> Callable[[Fo
     function = Function(value, criticals, range=(-1.0, 1.0))
 
     def enclosed(x: Form) -> Form:
-        with np.errstate(all="ignore"):
-            low, high = x.bounds()
-            wide = ~((high - low < np.pi) & (np.abs(low) < PERIODIC) & (np.abs(high) < PERIODIC))
-            form = function(x)
-            if not np.any(wide):
-                return form
-            end = np.where(np.isfinite(low) & np.isfinite(high), 1.0, np.inf)
-            return chosen([~wide, wide], [form, Form.between(-end, end, x.dtype)])
+        low, high = x.bounds()
+        wide = ~((high - low < np.pi) & (np.abs(low) < PERIODIC) & (np.abs(high) < PERIODIC))
+        form = function(x)
+        if not np.any(wide):
+            return form
+        end = np.where(np.isfinite(low) & np.isfinite(high), 1.0, np.inf)
+        return chosen([~wide, wide], [form, Form.between(-end, end, x.dtype)])
 
     return enclosed
 
@@ -167,12 +162,11 @@ def _whole(value: Callable[[Reals], Reals]) -> Callable[[Form], Form]:
 
 
 def _tangent(x: Form) -> Form:
-    with np.errstate(all="ignore"):
-        low, high = x.bounds()
-        branch = np.round((low / 2 + high / 2) / np.pi)
-        edge = np.pi / 2 - 1e-6
-        whole = (low > branch * np.pi - edge) & (high < branch * np.pi + edge)
-        return _but(_TAN(x), whole & (np.maximum(np.abs(low), np.abs(high)) < PERIODIC))
+    low, high = x.bounds()
+    branch = np.round((low / 2 + high / 2) / np.pi)
+    edge = np.pi / 2 - 1e-6
+    whole = (low > branch * np.pi - edge) & (high < branch * np.pi + edge)
+    return _but(_TAN(x), whole & (np.maximum(np.abs(low), np.abs(high)) < PERIODIC))
 
 
 def _but(form: Form, unless: np.ndarray) -> Form:
@@ -275,12 +269,11 @@ def integer_power(x: Form, n: int) -> Form:
 
 def quotient(a: Form, b: Form) -> Form:
     """Return `a / b`; everything where `b` may be zero."""
-    with np.errstate(all="ignore"):
-        if is_point(b) and np.all((b.centre != 0) & np.isfinite(b.centre)):
-            inverse = 1 / b.centre
-            if np.isfinite(inverse).all():
-                return _widened(scaled(a, inverse), 3.0)
-        return _widened(product(a, _reciprocal(b)), 3.0)
+    if is_point(b) and np.all((b.centre != 0) & np.isfinite(b.centre)):
+        inverse = 1 / b.centre
+        if np.isfinite(inverse).all():
+            return _widened(scaled(a, inverse), 3.0)
+    return _widened(product(a, _reciprocal(b)), 3.0)
 
 
 def _widened(x: Form, units: float) -> Form:
@@ -295,23 +288,22 @@ def _widened(x: Form, units: float) -> Form:
 def greater(a: Form, b: Form) -> Form:
     """Return the maximum: `b + max(a - b, 0)`, which keeps what both depend on."""
     (low, high), (first, last) = a.bounds(), b.bounds()
-    with np.errstate(all="ignore"):
-        nothing = unknown(low, high) | unknown(first, last)
-        ours, theirs = (low >= last) & ~nothing, (first >= high) & ~nothing
-        lowest, top = np.maximum(low, first), np.maximum(high, last)
-        ends = np.where(nothing, -np.inf, lowest), np.where(nothing, np.inf, top)
-        if a.slopes is None and b.slopes is None:
-            return Form.between(*ends, a.dtype)
-        mixed = ~(ours | theirs)
-        if not np.any(mixed):
-            return chosen([ours, theirs], [a, b])
-        ramp = add(b, _RAMP(difference(a, b)))
-        size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
-        both = rounded(
-            ramp.centre, ramp.slopes, ramp.radius, np.broadcast_to(size, ramp.size.shape),
-            a.dtype, ends, ramp.frame, exact=True,
-        )  # fmt: skip
-        return chosen([ours, theirs, mixed], [a, b, both])
+    nothing = unknown(low, high) | unknown(first, last)
+    ours, theirs = (low >= last) & ~nothing, (first >= high) & ~nothing
+    lowest, top = np.maximum(low, first), np.maximum(high, last)
+    ends = np.where(nothing, -np.inf, lowest), np.where(nothing, np.inf, top)
+    if a.slopes is None and b.slopes is None:
+        return Form.between(*ends, a.dtype)
+    mixed = ~(ours | theirs)
+    if not np.any(mixed):
+        return chosen([ours, theirs], [a, b])
+    ramp = add(b, _RAMP(difference(a, b)))
+    size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+    both = rounded(
+        ramp.centre, ramp.slopes, ramp.radius, np.broadcast_to(size, ramp.size.shape),
+        a.dtype, ends, ramp.frame, exact=True,
+    )  # fmt: skip
+    return chosen([ours, theirs, mixed], [a, b, both])
 
 
 def lesser(a: Form, b: Form) -> Form:
@@ -327,27 +319,26 @@ def difference(a: Form, b: Form) -> Form:
 
 def remainder(a: Form, b: Form) -> Form:
     """Return what a division leaves, with the sign of `a`."""
-    with np.errstate(all="ignore"):
-        (low, high), (first, last) = a.bounds(), b.bounds()
-        nothing = ~np.isfinite(low) | ~np.isfinite(high) | ~np.isfinite(first) | ~np.isfinite(last)
-        nothing = nothing | ~((first > 0) | (last < 0))
-        top = np.maximum(np.abs(first), np.abs(last))
-        # The remainder is exact, so that only the number of divisors has to be the same.
-        ends = [np.trunc(x / y * s) for x in (low, high) for y in (first, last)
-                for s in (1 - 1e-14, 1 + 1e-14)]  # fmt: skip
-        same = np.logical_and.reduce([end == ends[0] for end in ends]) & ~nothing
-        wide = Form.between(
-            np.where(nothing, -np.inf, np.where(low >= 0, 0.0, np.maximum(-top, low))),
-            np.where(nothing, np.inf, np.where(high <= 0, 0.0, np.minimum(top, high))),
-            a.dtype,
-        )
-        if not np.any(same):
-            return wide
-        count = np.where(same, ends[0], 0.0)
-        times = Form.between(count, count, a.dtype)
-        exact = add(a, product(times, b), -1.0)
-        exact.low = exact.high = None
-        return chosen([same, ~same], [exact, wide])
+    (low, high), (first, last) = a.bounds(), b.bounds()
+    nothing = ~np.isfinite(low) | ~np.isfinite(high) | ~np.isfinite(first) | ~np.isfinite(last)
+    nothing = nothing | ~((first > 0) | (last < 0))
+    top = np.maximum(np.abs(first), np.abs(last))
+    # The remainder is exact, so that only the number of divisors has to be the same.
+    ends = [np.trunc(x / y * s) for x in (low, high) for y in (first, last)
+            for s in (1 - 1e-14, 1 + 1e-14)]  # fmt: skip
+    same = np.logical_and.reduce([end == ends[0] for end in ends]) & ~nothing
+    wide = Form.between(
+        np.where(nothing, -np.inf, np.where(low >= 0, 0.0, np.maximum(-top, low))),
+        np.where(nothing, np.inf, np.where(high <= 0, 0.0, np.minimum(top, high))),
+        a.dtype,
+    )
+    if not np.any(same):
+        return wide
+    count = np.where(same, ends[0], 0.0)
+    times = Form.between(count, count, a.dtype)
+    exact = add(a, product(times, b), -1.0)
+    exact.low = exact.high = None
+    return chosen([same, ~same], [exact, wide])
 
 
 def power(a: Form, b: Form) -> Form:
@@ -381,12 +372,11 @@ def angle(y: Form, x: Form) -> Form:
         ends = np.full(ratio.centre.shape, by)
         return add(Form.between(ends, ends, y.dtype), FUNCTIONS["atan"](ratio))
 
-    with np.errstate(all="ignore"):
-        cases = [
-            turned(0.0, quotient(y, x)),
-            turned(np.pi / 2, negative(quotient(x, y))),
-            turned(-np.pi / 2, negative(quotient(x, y))),
-        ]
+    cases = [
+        turned(0.0, quotient(y, x)),
+        turned(np.pi / 2, negative(quotient(x, y))),
+        turned(-np.pi / 2, negative(quotient(x, y))),
+    ]
     return _widened(chosen([*masks, rest], [*cases, circle]), UNITS)
 
 

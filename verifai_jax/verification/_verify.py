@@ -1,7 +1,6 @@
 """Branch and bound over boxes of the feature space: `verify`."""
 
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +23,10 @@ REST = 0.08
 """Share of the seconds that is kept for the samples of what stays undecided."""
 REACH = 0.45
 """Where a box is sampled, as a share of its width from the middle: inside, not on its faces."""
+CONTRADICTED = (
+    "boxes have a simulation outside of their bounds, and stay undecided: this is a mistake of "
+    "verifai_jax, please report it"
+)
 CANDIDATES = 4096
 """Failing points that are confirmed when the budget is spent, those of the largest boxes first."""
 
@@ -96,7 +99,7 @@ def verify(
         before.check_same(problem, precision)
     enclosure = Enclosure(problem, precision)
     found = Boxes.whole(enclosure) if before is None else before.boxes
-    work = _Work(problem, enclosure, found, precision, seed)
+    work = _Work(problem, enclosure, found, seed)
     end = None if seconds is None else started + seconds * (1 - REST)
     stopped = work.go_on(end, boxes)
     work.confirm()
@@ -106,35 +109,26 @@ def verify(
         **described(problem),
         columns=problem.space.coordinates,
         boxes=work.boxes,
-        shares=enclosure.shares(work.boxes.low), upper_shares=enclosure.shares(work.boxes.high),
+        shares=enclosure.ranges.shares(work.boxes.low),
+        upper_shares=enclosure.ranges.shares(work.boxes.high),
         precision=precision,
         confidence=confidence,
         looked_at=work.looked_at + (0 if before is None else before.looked_at),
         simulations=work.evaluator.simulations + (0 if before is None else before.simulations),
         seconds=seconds + (0 if before is None else before.seconds),
         stopped=stopped,
-        notes=work.notes(),
+        notes=(f"{work.contradicted} {CONTRADICTED}",) if work.contradicted else (),
         version=__version__,
     )  # fmt: skip
 
 
-@dataclass
 class _Work:
     """The boxes, and what looks at them."""
 
-    problem: Problem
-    enclosure: Enclosure
-    boxes: Boxes
-    precision: str
-    seed: int
-    looked_at: int = 0
-    contradicted: int = 0
-    evaluator: Evaluator = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.evaluator = Evaluator(
-            self.problem, batch=4096, precision=self.precision, seed=self.seed
-        )
+    def __init__(self, problem: Problem, enclosure: Enclosure, boxes: Boxes, seed: int) -> None:
+        self.problem, self.enclosure, self.boxes, self.seed = problem, enclosure, boxes, seed
+        self.looked_at = self.contradicted = 0
+        self.evaluator = Evaluator(problem, 4096, precision=enclosure.precision, seed=seed)
 
     def go_on(self, end: float | None, limit: int | None) -> str:
         """Look at boxes, the most probable first; return why it stopped."""
@@ -275,15 +269,6 @@ class _Work:
         np.add.at(self.boxes.failures, chosen, failing)
         failed = np.flatnonzero(verdicts.violated & failing)
         self.boxes.witness[chosen[failed]] = points[failed]
-
-    def notes(self) -> tuple[str, ...]:
-        """Return what a person should know."""
-        if not self.contradicted:
-            return ()
-        return (
-            f"{self.contradicted} boxes have a simulation outside of their bounds, and stay "
-            "undecided: this is a mistake of verifai_jax, please report it",
-        )
 
 
 def _relative(numbers: Float[np.ndarray, "n dim"]) -> Float[np.ndarray, "n dim"]:

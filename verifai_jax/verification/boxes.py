@@ -59,13 +59,11 @@ class Boxes:
 
         **Raises:** `ValueError` for too many combinations.
         """
-        space = enclosure.problem.space
-        sides: list[list[tuple[float, float]]] = []
-        for j, (ordered, edges) in enumerate(zip(space.ordered, enclosure.edges, strict=True)):
-            apart = edges is not None and (not ordered or j in space.lengths)
-            sides.append(
-                list(itertools.pairwise(edges)) if apart and edges is not None else [(0.0, 1.0)]
-            )
+        space, sides = enclosure.problem.space, list[list[tuple[float, float]]]()
+        for j, edges in enumerate(enclosure.ranges.edges):
+            apart = not space.ordered[j] or j in space.lengths
+            cells = [] if edges is None or not apart else itertools.pairwise(edges.tolist())
+            sides.append([*cells] or [(0.0, 1.0)])
         count = math.prod(map(len, sides))
         if count > CHOICES:
             raise ValueError(
@@ -102,7 +100,7 @@ class Boxes:
         """Return which coordinates of each box can be split."""
         wide = self.high - self.low > NARROWEST
         for j in range(wide.shape[1]):
-            edges = enclosure.edges[j]
+            edges = enclosure.ranges.edges[j]
             if edges is not None:
                 inside = np.searchsorted(edges, self.high[:, j]) - np.searchsorted(
                     edges, self.low[:, j]
@@ -116,7 +114,7 @@ class Boxes:
         low, high = self.low[rows, coordinate], self.high[rows, coordinate]
         middle = low / 2 + high / 2
         for j in np.unique(coordinate):
-            edges = enclosure.edges[int(j)]
+            edges = enclosure.ranges.edges[int(j)]
             if edges is not None:
                 own = coordinate == j
                 first, last = (np.searchsorted(edges, end[own]) for end in (low, high))

@@ -22,6 +22,7 @@ from verifai_jax.core.cores import available_cores
 from verifai_jax.core.fingerprint import without_unused
 from verifai_jax.core.precision import in_precision
 from verifai_jax.evaluation.verdicts import boolean_semantics, trace_verdict
+from verifai_jax.features.ranges import FeatureRanges
 from verifai_jax.problem.problem import Problem
 from verifai_jax.sets import Form, Interpreter, Whole
 from verifai_jax.sets.functions import FUNCTIONS
@@ -30,9 +31,6 @@ from verifai_jax.systems.ode import sin_cos
 
 TOGETHER = 512
 """Boxes that are evaluated at once: the arrays of a step then fit the cache."""
-ROUNDINGS = 8
-"""Roundings by which the map from coordinates to a feature may fail to rise."""
-
 Corners = Float[np.ndarray, "n dim"]
 
 
@@ -82,7 +80,6 @@ class Enclosure:
 
             self._verdict = _program(verdict, form)
             self._truth = _program(truth, form)
-            self._values = jax.jit(jax.vmap(space.unflatten))
             # Name by name in the order of the leaves: which coordinates, and the program of domains
             # whose numbers are no monotone functions of one coordinate each.
             self._fields, start = {}, 0
@@ -92,66 +89,7 @@ class Enclosure:
                 self._fields[name] = slice(start, start + domain.size), part
                 start += domain.size
             self._forms = {name: jax.tree.leaves(form[name]) for name in sorted(form)}
-        # Where the cells of a coordinate begin and end; None for a continuous one.
-        self.edges = [
-            None if not count else np.cumsum([0.0, *(weights or (1 / count,) * count)])
-            for count, weights in zip(space.levels, space.weights, strict=True)
-        ]
-        self._depends = self._dependence()
-
-    # Boxes and their cells
-
-    def ends(self, low: Corners, high: Corners) -> tuple[Corners, Corners]:
-        """Return the points of the cube that have the least and the greatest features of boxes."""
-        low, high = low.copy(), high.copy()
-        for j, edges in enumerate(self.edges):
-            if edges is not None:
-                first = np.searchsorted(edges[:-1], low[:, j], side="right") - 1
-                last = np.searchsorted(edges[1:], high[:, j], side="left")
-                last = np.clip(last, first, len(edges) - 2)
-                middles = (edges[1:] + edges[:-1]) / 2
-                low[:, j], high[:, j] = middles[first], middles[last]
-        return low, high
-
-    def _features(self, points: Corners) -> list[np.ndarray]:
-        with in_precision(self.precision):
-            dtype = np.dtype(self.precision)
-            count = max(TOGETHER, -(-len(points) // TOGETHER) * TOGETHER)
-            padded = np.resize(points.astype(dtype), (count, self.dim))
-            leaves = jax.tree.leaves(self._values(padded))
-        return [np.asarray(leaf)[: len(points)].astype(np.float64) for leaf in leaves]
-
-    def _dependence(self) -> list[tuple[np.ndarray, np.ndarray, bool]]:
-        """Return for each leaf on which coordinates its numbers depend, their size, and more.
-
-        The last is whether the map of its domain to its ends is exact.
-        """
-        levels = [np.full((1, self.dim), level) for level in (0.0, 0.25, 0.75)]
-        probes = np.concatenate([levels[0], np.eye(self.dim), *levels[1:]])
-        leaves = iter(self._features(self.ends(probes, probes)[0]))
-        found = []
-        for name, forms in self._forms.items():
-            for _, leaf in zip(forms, leaves, strict=False):
-                symbols = (leaf[1:-2] != leaf[0]).astype(float)
-                size = np.maximum(np.abs(leaf[-2]), np.abs(leaf[-1]))
-                found.append((symbols, size, self.problem.space.domains[name].uniform))
-        return found
-
-    def shares(self, points: Corners) -> Corners:
-        """Return where the features of points lie between their least and greatest, from 0 to 1."""
-        shares = points.astype(float).copy()
-        leaves = self._features(points)
-        ends = self._features(np.array([[0.0] * self.dim, [1.0] * self.dim]))
-        for leaf, end, (symbols, _, exact) in zip(leaves, ends, self._depends, strict=True):
-            flat = symbols.reshape(self.dim, -1)
-            for j in np.flatnonzero(flat.any(1) & (not exact)):
-                if self.edges[j] is None:
-                    at = int(np.argmax(flat[j]))
-                    low, high = end.reshape(2, -1)[:, at]
-                    shares[:, j] = (leaf.reshape(len(leaf), -1)[:, at] - low) / (high - low)
-        return shares
-
-    # Sets
+        self.ranges = FeatureRanges(space, precision)
 
     def __call__(self, low: Corners, high: Corners) -> Bounds:
         """Return bounds over boxes `[n, dim]` between these points of the unit cube.
@@ -200,42 +138,24 @@ class Enclosure:
 
     def _leaves(self, low: Corners, high: Corners) -> list[Value]:
         """Return the features of boxes as sets, in the order of the leaves of their tree."""
-        first, last = self.ends(low, high)
-        begins, ends = self._features(first), self._features(last)
+        first, last = self.ranges.ends(low, high)
+        between = self.ranges(low, high)
         sets: list[Value] = []
         for name, forms in self._forms.items():
             span, part = self._fields[name]
-            if part is None:
-                count = len(sets)
-                sets += [
-                    self._leaf(count + i, each.dtype, begins, ends, low, high)
-                    for i, each in enumerate(forms)
-                ]
+            if part is not None:
+                symbols = np.eye(self.dim)[:, span]
+                unit = Form.leaf(first[:, span], last[:, span], symbols, np.dtype(self.precision))
+                sets += self._evaluated(part, [unit], len(low))
                 continue
-            symbols = np.eye(self.dim)[:, span]
-            unit = Form.leaf(first[:, span], last[:, span], symbols, np.dtype(self.precision))
-            sets += self._evaluated(part, [unit], len(low))
+            for form in forms:
+                begin, end, symbols = between[len(sets)]
+                kind = np.dtype(form.dtype)
+                if jnp.issubdtype(kind, jnp.floating):
+                    sets.append(Form.leaf(begin, end, symbols, kind))
+                else:
+                    sets.append(Whole(begin.astype(np.int64), end.astype(np.int64), kind))
         return sets
-
-    def _leaf(
-        self, i: int, dtype: np.dtype, begins: Sequence[np.ndarray], ends: Sequence[np.ndarray],
-        low: Corners, high: Corners,
-    ) -> Value:  # fmt: skip
-        begin, end = begins[i], ends[i]
-        if not jnp.issubdtype(dtype, jnp.floating):
-            return Whole(begin.astype(np.int64), end.astype(np.int64), np.dtype(dtype))
-        symbols, scale, exact = self._depends[i]
-        smooth = np.array([edges is None for edges in self.edges])
-        size = np.maximum(np.maximum(np.abs(begin), np.abs(end)), scale)
-        margin = ROUNDINGS * float(jnp.finfo(dtype).eps) * size * symbols[smooth].any(0)
-        moved = [margin, margin]
-        if exact:
-            # The ends of the whole interval are values themselves, and nothing lies beyond.
-            moved = [
-                margin * (1 - np.tensordot(1.0 * at_end, symbols, (1, 0)))
-                for at_end in (low == 0, high == 1)
-            ]
-        return Form.leaf(begin - moved[0], end + moved[1], symbols, np.dtype(dtype))
 
 
 def _rows(value: Value, block: slice) -> Value:
