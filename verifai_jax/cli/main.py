@@ -132,6 +132,8 @@ class _Group(click.Group):
             return context
         except BrokenPipeError:  # Of what --help and --version print.
             raise _closed_pipe() from None
+        except OSError as error:
+            raise command_error(error) from error
 
     def invoke(self, ctx: click.Context) -> Any:
         # A command imports and traces millions of objects that stay: looking at all of them as

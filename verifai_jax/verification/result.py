@@ -195,16 +195,18 @@ class Verification(Drawn, InNotebook):
 
         **Arguments:**
 
-        - `path`: of the file.
+        - `path`: of the file, whose folder is made.
 
         **Returns:** the path.
+
+        **Raises:** `OSError` that names the file, for whatever the file system refuses.
         """
         plain = {name: value for name, value in vars(self).items()
                  if name in self.__dataclass_fields__}  # fmt: skip
         for name in ("shares", "upper_shares"):
             plain[name] = plain[name].tolist()
         arrays = {name: array.tolist() for name, array in asdict(self.boxes).items()}
-        write_record(Path(path), {"kind": KIND, **plain, "boxes": arrays})
+        write_record(Path(path), {"kind": KIND, **plain, "boxes": arrays}, locked=False)
         return Path(path)
 
 
