@@ -50,6 +50,7 @@ from verifai_jax.cli.sweep import sweep
 from verifai_jax.cli.synthesize import synthesize
 from verifai_jax.cli.trace import trace
 from verifai_jax.cli.trials import trials
+from verifai_jax.cli.verify import verify
 from verifai_jax.core.errors import unknown_name
 
 COMMANDS = (
@@ -64,6 +65,7 @@ COMMANDS = (
     doctor,
     confirm,
     estimate,
+    verify,
     modes,
     fmea,
     explain,
