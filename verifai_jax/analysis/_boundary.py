@@ -158,7 +158,7 @@ def boundary(source: Source, *, seed: int = 0) -> Boundary:
     **Arguments:**
 
     - `source`: a run, its table, a DataFrame, or `Samples`; rows with a verdict count.
-    - `seed`: of the folds, and of the points of the prior.
+    - `seed`: the seed of the folds, and of the points of the prior.
 
     **Returns:** the `Boundary`.
 

@@ -43,7 +43,7 @@ def draw_around_elite(candidates: Candidates, rng: np.random.Generator) -> None:
     **Arguments:**
 
     - `candidates`: simulates, and remembers what failed, within its limit.
-    - `rng`: of the samples.
+    - `rng`: the rng of the samples.
     """
     nominal, fruitless = candidates.nominal, 0
     free = nominal.cube.continuous
@@ -101,7 +101,7 @@ def exchange_cells(candidates: Candidates, rng: np.random.Generator) -> None:
     **Arguments:**
 
     - `candidates`: simulates, and remembers what failed, within its limit.
-    - `rng`: of the order of changes that are predicted alike.
+    - `rng`: the rng of the order of changes that are predicted alike.
     """
     done: set[bytes] = set()
     while candidates.left > 0:

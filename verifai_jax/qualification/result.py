@@ -37,7 +37,7 @@ class Outcome:
 class Qualification(InNotebook):
     """The outcomes of the oracles on one machine.
 
-    - `versions`: of packages, Python and the machine.
+    - `versions`: the versions of packages, Python and the machine.
     - `package_sha256`: one hash of all files of the package, by name and content.
     - `date`: in UTC.
     - `complete`: whether all oracles were run.

@@ -61,9 +61,9 @@ def real_trials(
     - `trials`: the path of a CSV or Parquet file, or a data frame: a column for each feature as in
       the table of a run, and `failed` (yes or no; empty where a trial may have failed), or
       `recording` with a file of signals for each trial, which the formulas judge.
-    - `simulations`: of the prior, which say how often a failure is predicted.
+    - `simulations`: the simulations of the prior, which say how often a failure is predicted.
     - `confidence`: probability with which the interval is to hold.
-    - `seed`: of the simulations.
+    - `seed`: the seed of the simulations.
     - `allocated`: the numbers of trials that are predicted to fail and not to fail were chosen
       beforehand, as `next_trials` does; without that trials are samples of the prior.
     - `at_any_time`: verdicts decided which trials were made, or when to stop.
@@ -80,7 +80,7 @@ def real_trials(
     check_fraction("confidence", confidence)
     check_count("simulations", simulations)
     table, unread = read_trials(problem, trials, time=time, dt=dt)
-    features = table[list(problem.space.columns)]
+    features = table.loc[:, list(problem.space.columns)]
     same = simulate(
         problem, features, seed=seed, precision=precision, executor=executor, progress=progress
     )

@@ -73,9 +73,7 @@ class TraceForm:
         for code, value in (("valid", trace.valid), ("status", trace.status)):
             shape = [] if value is None else list(np.asarray(value).shape)
             if shape:
-                raise ValueError(
-                    f"{code} must be one number for a simulation; got shape {shape}"
-                )
+                raise ValueError(f"{code} must be one number for a simulation; got shape {shape}")
         signals = {name: np.asarray(signal) for name, signal in trace.signals.items()}
         for name, signal in signals.items():
             if signal.dtype.kind not in "biuf":
