@@ -131,8 +131,8 @@ class Verification(Drawn, InNotebook):
             bound[i] = anytime_interval(*counts, self.confidence).high
         rows: dict[str, Any] = {
             "verdict": self.verdicts, "throughout": boxes.state == BROKEN, "mass": boxes.mass,
-            "volume": np.prod(self.upper_shares - self.shares, axis=1), "least": boxes.least,
-            "greatest": boxes.greatest, "failure_bound": bound,
+            "volume": np.prod(self.upper_shares - self.shares, axis=1), "lowest": boxes.lowest,
+            "highest": boxes.highest, "failure_bound": bound,
         }  # fmt: skip
         for j, column in enumerate(self.columns):
             rows[f"{column} from"] = self.shares[:, j]

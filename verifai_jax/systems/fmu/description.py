@@ -61,7 +61,7 @@ class Variable:
 
     @property
     def settable(self) -> bool:
-        """Whether a value can be given before a simulation begins."""
+        """True where a value can be given before a simulation begins."""
         return self.causality == "input" or (
             self.variability != "constant" and self.start is not None
         )
