@@ -61,10 +61,10 @@ def lint(
 
     **Raises:** `FormulaSyntaxError`; as `read` for what cannot be read.
     """
-    requirements = requirements_of(formulas)
+    requirements = tuple(r for r in requirements_of(formulas) if r.formula is not None)
     traces = {} if signals is None else named_traces(signals)
     names = dict.fromkeys(name for trace in traces.values() for name in trace.signals)
-    read = dict.fromkeys(name for each in requirements for name in each.formula.signals())
+    read = dict.fromkeys(name for each in requirements for name in each.formalized.signals())
     said = {name: unit for trace in traces.values() for name, unit in trace.units.items()}
     known = units_of([*names, *read], said | dict(units or {}))
     found: list[Finding] = []
@@ -94,7 +94,7 @@ class _Linter:
 
     @property
     def formula(self) -> Formula:
-        return self.requirement.formula
+        return self.requirement.formalized
 
     def findings(self) -> list[Finding]:
         """Return what all checks find, one finding for each kind and part."""
