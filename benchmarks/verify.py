@@ -89,9 +89,7 @@ def double_integrator():
 
 def tora():
     """TORA with a controller that holds its action for a second: all states stay in a box."""
-    control = network(
-        lambda a, b, c, d: 0.5 * b - 0.6 * c - 0.9 * d, [-2] * 4, [2] * 4, 20
-    )
+    control = network(lambda a, b, c, d: 0.5 * b - 0.6 * c - 0.9 * d, [-2] * 4, [2] * 4, 20)
 
     def dynamics(t, s, u, f):
         a, b, c, d = s

@@ -131,6 +131,9 @@ if TYPE_CHECKING:
     from verifai_jax.systems.environments import gymnasium as gymnasium
     from verifai_jax.systems.environments import gymnax as gymnax
     from verifai_jax.systems.environments import playground as playground
+    from verifai_jax.systems.fmu import fmu as fmu
+    from verifai_jax.systems.fmu import fmu_ranges as fmu_ranges
+    from verifai_jax.systems.fmu import fmu_variables as fmu_variables
     from verifai_jax.systems.mujoco import Scaled as Scaled
     from verifai_jax.systems.mujoco import mjx as mjx
     from verifai_jax.systems.mujoco import mujoco as mujoco

@@ -119,6 +119,7 @@ def test_many_samples_at_once_are_the_samples_one_by_one():
     values = many.steps(recording)
     stepped = [one.step({name: v[k] for name, v in recording.items()}) for k in range(50)]
     np.testing.assert_array_equal(values, stepped)
+    assert len(many.steps({name: v[:0] for name, v in recording.items()})) == 0
     offline = HostValues.of(Trace(recording, dt=0.5))(mtl.parse(formula))
     np.testing.assert_allclose(values, offline, rtol=1e-15)
 

@@ -1,4 +1,4 @@
-"""A failure rate from two strata: exact, never much longer than without them, mostly far shorter."""
+"""A failure rate from two strata: exact, and hardly ever longer than without them."""
 
 import numpy as np
 import pytest
@@ -66,7 +66,7 @@ def test_exact_by_enumeration():
 def test_wrong_counts_are_refused(counts, words):
     with pytest.raises(ValueError, match=words):
         stratified_rate(*counts, share=0.2)
-    with pytest.raises(ValueError, match="share must be a probability; got 1.5"):
+    with pytest.raises(ValueError, match=r"share must be a probability; got 1\.5"):
         stratified_rate((0, 1), (0, 1), share=1.5)
 
 

@@ -113,13 +113,13 @@ class TestRealTrials:
 
 class TestTables:
     def test_what_is_missing_is_named(self, trials, tmp_path):
-        with pytest.raises(ValueError, match="'failed'.*this table has speed, brake"):
+        with pytest.raises(ValueError, match=r"'failed'.*this table has speed, brake"):
             vj.real_trials(PROBLEM, trials[["speed", "brake"]])
         with pytest.raises(ValueError, match="has no column 'brake'"):
             vj.real_trials(PROBLEM, trials.drop(columns="brake"))
-        with pytest.raises(ValueError, match="row 0: failed must be yes or no.*got 'perhaps'"):
+        with pytest.raises(ValueError, match=r"row 0: failed must be yes or no.*got 'perhaps'"):
             vj.real_trials(PROBLEM, trials.assign(failed="perhaps"))
-        with pytest.raises(FileNotFoundError, match="no file .*absent.csv of trials"):
+        with pytest.raises(FileNotFoundError, match=r"no file .*absent\.csv of trials"):
             vj.real_trials(PROBLEM, tmp_path / "absent.csv")
         with pytest.raises(ValueError, match="has no rows"):
             vj.real_trials(PROBLEM, trials.head(0))

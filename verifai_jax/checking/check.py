@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from verifai_jax.core.checks import check_count, check_fraction
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_features, format_percent, printable
 from verifai_jax.counterexamples import SavedCounterexample, save_counterexamples
 from verifai_jax.counterexamples import replay_counterexamples as replay
@@ -123,7 +124,7 @@ class Check:
 
 
 @dataclass(frozen=True, eq=False)
-class CheckOutcome:
+class CheckOutcome(InNotebook):
     """The outcome of testing a problem.
 
     - `problem`: its name.

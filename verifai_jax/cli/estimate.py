@@ -17,9 +17,17 @@ if TYPE_CHECKING:
 
 @command()
 @arguments.TARGET
-@click.option("--method", help="monte_carlo, importance or splitting  [default: chosen]")
+@click.option("--method", help="monte_carlo, importance, splitting or surrogate  [default: chosen]")
 @click.option("--budget", type=int, default=50_000, show_default=True, help="Simulations at most.")
 @click.option("--p0", type=float, help="Probability that it should be below.")
+@click.option(
+    "--simulations-are",
+    type=click.Choice(["auto", "slow", "fast"]),
+    default="auto",
+    show_default=True,
+    help="slow: a surrogate proposes, for a few hundred simulations.",
+)
+@click.option("--within", type=float, help="Slow simulations end at this factor to the ends.")
 @click.option("--confidence", type=float, default=0.95, show_default=True)
 @arguments.SEED
 @arguments.ONLY

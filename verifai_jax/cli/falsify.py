@@ -72,6 +72,13 @@ _PARTS = (
     type=click.Choice(["inputs", "behaviour"]),
     help="Of kinds that differ in this  [default: inputs]",
 )
+@click.option(
+    "--objective",
+    type=click.Choice(["robustness", "likelihood"]),
+    default="robustness",
+    show_default=True,
+    help="Failures that break the property by most, or the likeliest.",
+)
 @arguments.RUN_FOLDER
 @arguments.KEEP_GOING
 @arguments.PICTURES

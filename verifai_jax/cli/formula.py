@@ -12,7 +12,6 @@ from verifai_jax.cli.monitor_fleet import load_requirements
 
 if TYPE_CHECKING:
     from verifai_jax.mtl import Formula
-    from verifai_jax.problem import Problem
 
 End = Literal["hold", "truncate"]
 
@@ -119,8 +118,8 @@ def distinguish(
     """Find a trace on which one of the formulas ONE and OTHER holds, and the other does not."""
     from verifai_jax import mtl
 
-    formulas = (_parsed(text, constants, definitions) for text in (one, other))
-    found = mtl.distinguish(*formulas, _signals(recordings, problem), **options)
+    first, second = (_parsed(text, constants, definitions) for text in (one, other))
+    found = mtl.distinguish(first, second, _signals(recordings, problem), **options)
     show_result(found, plot if found else None, "source", "holds", "robustness", "tried")
     check_gate(fail_on, {"apart": bool(found)})
 
@@ -175,9 +174,7 @@ def _parsed(text: str, constants: tuple[str, ...], definitions: tuple[str, ...])
     return mtl.parse(text, *arguments.read_names(constants, definitions))
 
 
-def _signals(
-    recordings: tuple[Path, ...], problem: str | None
-) -> "Problem | tuple[Path, ...] | None":
+def _signals(recordings: tuple[Path, ...], problem: str | None) -> Any:
     """Return what the formula is asked about: recordings, a problem, or neither."""
     if problem is not None:
         if recordings:

@@ -51,6 +51,7 @@ from verifai_jax.cli.sweep import sweep
 from verifai_jax.cli.synthesize import synthesize
 from verifai_jax.cli.trace import trace
 from verifai_jax.cli.trials import trials
+from verifai_jax.cli.verify import verify
 from verifai_jax.core.errors import unknown_name
 
 COMMANDS = (
@@ -65,6 +66,7 @@ COMMANDS = (
     doctor,
     confirm,
     estimate,
+    verify,
     modes,
     fmea,
     explain,
@@ -132,6 +134,8 @@ class _Group(click.Group):
             return context
         except BrokenPipeError:  # Of what --help and --version print.
             raise _closed_pipe() from None
+        except OSError as error:
+            raise command_error(error) from error
 
     def invoke(self, ctx: click.Context) -> Any:
         # A command imports and traces millions of objects that stay: looking at all of them as

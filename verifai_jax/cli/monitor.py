@@ -17,6 +17,7 @@ from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result
 from verifai_jax.cli.monitor_fleet import fleet_options, is_fleet, monitor_fleet
 from verifai_jax.cli.monitor_stream import monitor_stream
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.errors import UnknownNameError, missing_name, nearest_names
 from verifai_jax.core.text import printable
 
@@ -93,7 +94,9 @@ def monitor(
         if recording or dt is None:
             raise click.UsageError("--export-c goes with --dt SECONDS, and with no RECORDING")
         name = re.sub(r"\W", "_", header.stem)
-        header.write_text(mtl.export_c(mtl.parse(formula, numbers, named), dt, name))
+        text = mtl.export_c(mtl.parse(formula, numbers, named), dt, name)
+        with replacing(header) as partial:
+            partial.write_text(text, encoding="utf-8")
         click.echo(f"monitor {header}")
         give_result(formula=formula, header=str(header))
         return

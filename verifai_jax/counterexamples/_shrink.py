@@ -21,8 +21,8 @@ from verifai_jax.core.errors import suggests_options, unknown_name
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.counterexamples.candidates import Candidates
-from verifai_jax.counterexamples.exchange_cells import exchange_cells
 from verifai_jax.counterexamples.fixed_key import fix_key, note_on_key
+from verifai_jax.counterexamples.likelier import draw_around_elite, exchange_cells
 from verifai_jax.counterexamples.minimize_count import grow, minimize_count, revert_features
 from verifai_jax.counterexamples.minimize_distance import minimize_distance
 from verifai_jax.counterexamples.nominal import Likeliest, Nominal
@@ -128,7 +128,8 @@ def shrink(
         at = at.restrict_to_side(start[0])
     candidates = Candidates(problem, at, int(budget), run.precision)
     search = _Search(candidates, by, np.random.default_rng(seed), start)
-    points = np.concatenate([start, select_others(run, at, number, OTHERS)]) if others else start
+    count = 4 * OTHERS if by == "likelihood" else OTHERS
+    points = np.concatenate([start, select_others(run, at, number, count)]) if others else start
     notes, stopped = [], None
     try:
         search.search(points)
@@ -237,8 +238,11 @@ class _Search:
             if self.by == "distance":
                 grow(candidates, failures[:1], 1)
             revert_features(candidates, failures[0])
-        if self.by == "likelihood" and len(nominal.cube.discrete):
-            exchange_cells(candidates, self.rng)
+        if self.by == "likelihood":
+            if len(nominal.cube.continuous):
+                draw_around_elite(candidates, self.rng)
+            if len(nominal.cube.discrete):
+                exchange_cells(candidates, self.rng)
         self.note()
         self.follow(self.starts())
         candidates.limit = candidates.budget - 2 * nominal.space.dim

@@ -23,6 +23,7 @@ import numpy as np
 from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.checks import check_count, is_number
 from verifai_jax.core.keys import run_keys
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.core.text import format_error, one_line
 from verifai_jax.counterexamples._shrink import shrink as shrink_row
 from verifai_jax.counterexamples.selection import columns_at, problem_of
@@ -73,7 +74,7 @@ class SavedCounterexample:
         """Name of its file: the problem's, and a digest of what decides the simulation."""
         deciding = [self.problem, self.formulas, self.features, self.seed, self.row]
         text = json.dumps(deciding, sort_keys=True)
-        stem = re.sub(r"\W+", "-", self.problem).strip("-") or "counterexample"
+        stem = re.sub(r"\W+", "-", self.problem).strip("-")[:60] or "counterexample"
         return f"{stem}-{hashlib.sha256(text.encode()).hexdigest()[:10]}.json"
 
     def write(self, folder: Path) -> Path:
@@ -164,6 +165,7 @@ _FORMS: dict[str, tuple[Callable[[Any], bool], str]] = {
 """For each entry of a file whether a value can be it, and what it must be, as text."""
 
 
+@shows_progress("saving counterexamples of", of_budget=False)
 def save_counterexamples(
     run: Run,
     folder: str | Path,
@@ -171,6 +173,7 @@ def save_counterexamples(
     max_count: int = 5,
     shrink: bool = True,
     budget: int = 1000,
+    progress: bool | None = None,
 ) -> list[Path]:
     """Write counterexamples of a run into a folder, one small file each.
 
@@ -185,6 +188,7 @@ def save_counterexamples(
     - `max_count`: counterexamples at most.
     - `shrink`: whether each is first shrunk towards the nominal features, where these are known.
     - `budget`: simulations to shrink one with, at most.
+    - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     **Returns:** the paths of the files, none twice.
 

@@ -37,6 +37,9 @@ TURNS = (1.0, 0.75, 0.5, 0.3, 0.15, 0.05)
 """Shares of the way to the linearised boundary's nearest point,"""
 STRETCHES = (1.0, 1.003, 1.015, 1.06)
 """and how far beyond it: the boundary is curved."""
+COSTS = (0.0, 3.0, 30.0)
+"""Standard deviations that the whole range of a value costs whose prior is even; one of them, at
+random, in each round."""
 ENOUGH = 5e-4
 """Relative improvement that is not worth a round."""
 
@@ -120,7 +123,8 @@ def propose(candidates: Candidates, track: Track, count: int, rng: np.random.Gen
     parts = [discrete_steps(candidates, track)]
     if length > 0:
         lines = segment_shares(track)
-        aims = boundary_steps(candidates, track, coordinates, v)
+        costs = rng.choice(COSTS)
+        aims = boundary_steps(candidates, track, coordinates, v, costs)
         left = max(count - len(lines) - len(aims) - len(parts[0]), 6)
         ones = single_coordinates(track, v, left // 3, rng)
         scale = nominal.scale[coordinates]
@@ -143,9 +147,17 @@ def segment_shares(track: Track) -> Float[np.ndarray, " n"]:
 
 
 def boundary_steps(
-    candidates: Candidates, track: Track, coordinates: Int[np.ndarray, " k"], v: Departure
+    candidates: Candidates,
+    track: Track,
+    coordinates: Int[np.ndarray, " k"],
+    v: Departure,
+    costs: float = 0.0,
 ) -> Departures:
-    """Return departures at, and on the way to, the nearest points of the linearised boundary."""
+    """Return departures at, and on the way to, the nearest points of the linearised boundary.
+
+    - `costs`: of a coordinate that departs by next to nothing anywhere, over its whole range; 0 for
+      no more than that. Without it a linear model goes on to an end of the range.
+    """
     nominal = candidates.nominal
     ends = np.zeros((2, len(track.u)))
     ends[0] += nominal.low
@@ -153,6 +165,9 @@ def boundary_steps(
     low, high = nominal.departure(ends)[:, coordinates]
     tangents = track.tangents[-1:] or fit_tangent(candidates, track, coordinates)
     targets = []
+    slight = (nominal.scale[coordinates] < 1) & (costs > 0)
+    centre = np.where(slight, v, 0.0)
+    width = np.where(slight, (high - low) / max(costs, 1.0), 1.0)
     for some in (tangents, track.tangents[-6:]) if len(track.tangents) > 1 else (tangents,):
         if not some:
             continue
@@ -163,9 +178,11 @@ def boundary_steps(
             continue
         values = np.array([piece.value for piece in some])
         levels = np.sum(rows * nominal.departure(points)[:, coordinates], axis=1) - values
-        nearest = shortest_in_box(rows, levels, low, high)
+        nearest = shortest_in_box(
+            rows * width, levels - rows @ centre, (low - centre) / width, (high - centre) / width
+        )
         if nearest is not None:
-            targets.append(nearest)
+            targets.append(centre + width * nearest)
     track.target = None
     if not targets:
         return np.zeros((0, len(v)))

@@ -37,11 +37,14 @@ class Plan:
     - `confidence`: the confidence of the interval and the bound.
     - `chains`: splitting chains of a level.
     - `clamped`: True at coordinates whose domain ends in an outermost value.
+    - `within`: factor from the estimate to an end of the interval that is short enough; None to
+      spend the budget.
     """
 
     confidence: float
     chains: int
     clamped: Bool[np.ndarray, " d"]
+    within: float | None = None
 
 
 @dataclass

@@ -132,6 +132,8 @@ class LimitState:
         """Simulations, failures and missing verdicts of the first samples of the prior."""
         self.own_chance = ""
         """A sentence on memory or chance that does not come from the random key; empty if none."""
+        self.rows: list[tuple[np.ndarray, np.ndarray]] | None = None
+        """Points and robustness of all simulations, where a method wants them; NaN for none."""
         self.lowest = np.inf
         self.ended: str | None = None
         self.strict = False
@@ -249,6 +251,8 @@ class LimitState:
         known = proper & np.isfinite(rho)
         score = np.where(known, np.maximum(rho, 0.0), np.inf).astype(np.float64)
         score[failing] = -np.inf
+        if self.rows is not None:
+            self.rows.append((z, np.where(known, rho, np.nan)))
         self.simulations += len(z)
         self.evaluated += len(z)
         self.failures += int(failing.sum())

@@ -26,7 +26,10 @@ METHODS = {
     "monte_carlo": "Monte Carlo",
     "importance": "importance sampling",
     "splitting": "multilevel splitting",
+    "surrogate": "importance sampling by a surrogate",
 }
+WEIGHTED = ("importance", "splitting", "surrogate")
+"""Methods that reach failures by a search, so that they may miss some."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +41,7 @@ class Estimate(Drawn, InNotebook):
       none is claimed.
     - `low`, `high`: the interval, at `confidence`; without an estimate 0 and `upper_bound`.
     - `confidence`: the confidence of the interval and of the bound.
-    - `method`: `"monte_carlo"`, `"importance"` or `"splitting"`; None without an estimate.
+    - `method`: a name of `METHODS`; None without an estimate.
     - `simulations`: number of all simulations; one with its gradient counts 2.
     - `budget`: simulations that were allowed.
     - `failures`, `no_verdict`: simulations among them that failed, and without a verdict.

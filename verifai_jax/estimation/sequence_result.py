@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ class PartEstimate:
 
 
 @dataclass(frozen=True, eq=False)
-class SequenceEstimate:
+class SequenceEstimate(InNotebook):
     """The failure probability of a sequence of scenarios, as `sequence` returns it.
 
     - `parts`: an estimate of each part that was reached.

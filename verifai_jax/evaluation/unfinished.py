@@ -192,13 +192,15 @@ def keeping(folder: Path, work: Mapping[str, Any]) -> Iterator[Unfinished]:
     other work.
     """
     with locked_cache(folder, KIND) as cache:
-        cache.claim(work)
         kept = Unfinished(cache, folder)
-        token = _PRESENT.set(kept)
         try:
-            yield kept
+            cache.claim(work)
+            token = _PRESENT.set(kept)
+            try:
+                yield kept
+            finally:
+                _PRESENT.reset(token)
         finally:
-            _PRESENT.reset(token)
             if kept.done or kept.empty:
                 shutil.rmtree(folder, ignore_errors=True)
 

@@ -39,6 +39,7 @@ from verifai_jax.falsification.validation import (
     check_first,
     check_gradient,
     check_guide,
+    check_objective,
     check_rule,
     check_same_guide,
     check_same_space,
@@ -49,6 +50,7 @@ from verifai_jax.falsification.validation import (
     recorded_search,
     rows_of_first,
     slow_search,
+    with_objective,
 )
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
@@ -82,6 +84,7 @@ def falsify(
     backend: str | None = None,
     confirm: bool = True,
     diverse: bool | Literal["inputs", "behaviour"] = False,
+    objective: Literal["robustness", "likelihood"] = "robustness",
     first: "Rows | None" = None,
     callbacks: Iterable[Callback] = (),
     progress: bool | None = None,
@@ -126,6 +129,10 @@ def falsify(
       failures that are far from each other (`search.Diverse`). True or `"inputs"`: in their
       inputs; `"behaviour"`: in what happens, that is the predicate that decides, when it does, and
       the shape of the trace.
+    - `objective`: what the search makes better: `"robustness"`, how badly the property breaks, or
+      `"likelihood"`, how probable a failure is under the features' distributions
+      (`search.Likeliest`). `vj.shrink(run, by="likelihood")` goes on from there to the likeliest
+      failure, and `run.improbability()` says how likely each is.
     - `first`: features that are simulated before the search proposes any, and told to it where it
       learns: as in `simulate`. They count in the budget, and the run then has no failure rate.
     - `callbacks`: functions called after each round with the number of simulations and a dictionary
@@ -162,6 +169,8 @@ def falsify(
     asking, search = without_suggestions(search)
     default = search == AUTO
     search = check_search(problem, "portfolio" if default else search)
+    search = with_objective(search, objective, bool(diverse))
+    check_objective(problem, search)
     check_rule(search, stop_when)
     check_guide(problem, search)
     given = check_first(problem, first, stop_when, precision)
@@ -172,7 +181,8 @@ def falsify(
 
     def batch_for(search: Search) -> int:
         alone = whole and not problem.black_box
-        return batch_size(batch, search, budget, stop_after, alone, bool(diverse))
+        small = 16 if diverse else 64 if search.wants.likelihood else None
+        return batch_size(batch, search, budget, stop_after, alone, small)
 
     size = batch_for(search)
     choice = resolved(
@@ -201,7 +211,7 @@ def falsify(
         def prepare() -> None:
             if earlier is not None:
                 rounds.warm(earlier)
-            chooses = default and not diverse
+            chooses = default and not diverse and not search.wants.likelihood
             if asking is not None or not can_be_slow(problem, executor):
                 return
             if keep_going and not chooses:

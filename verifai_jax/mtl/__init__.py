@@ -7,7 +7,14 @@ from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl._robustness import robustness, robustness_signal, satisfied
 from verifai_jax.mtl._smoothing_error import SmoothingError, smoothing_error
 from verifai_jax.mtl.c_monitor import export_c
+from verifai_jax.mtl.calibrated import (
+    DomainMonitor,
+    PredictiveMonitor,
+    domain_monitor,
+    predictive_monitor,
+)
 from verifai_jax.mtl.counting import durations
+from verifai_jax.mtl.dense import dense_gradient, dense_robustness, dense_signal
 from verifai_jax.mtl.distinguishing import Distinction, distinguish
 from verifai_jax.mtl.evaluate import End, IntervalError
 from verifai_jax.mtl.exemplary import Examples, examples
@@ -47,15 +54,17 @@ from verifai_jax.mtl.templating import Template, templates
 from verifai_jax.mtl.watching import Watch, watch
 
 __all__ = [
-    "FALSE", "TRUE", "Distinction", "End", "Examples", "Explanation", "Expression", "Finding",
-    "Findings", "Formula", "FormulaSyntaxError", "HorizonError", "IntervalError", "Judgement",
-    "Mined", "Mutant", "Mutants", "Online", "Requirement", "SamplingError", "Semantics",
-    "SmoothingError", "Template", "TimeColumnError", "Watch", "always", "anneal", "boolean",
-    "distinguish", "draw", "durations", "during", "eventually", "examples", "explain", "export_c",
-    "fall", "hard", "historically", "judge", "latex", "lint", "mine", "mutants", "next_", "nnf",
-    "normalize", "once", "online", "parse", "phase", "prev", "read", "read_requirements",
-    "resample", "rise", "robustness", "robustness_signal", "satisfied", "signal", "simplify",
-    "since", "smooth", "smoothing_error", "sometime_during", "templates", "until", "watch",
+    "FALSE", "TRUE", "Distinction", "DomainMonitor", "End", "Examples", "Explanation",
+    "Expression", "Finding", "Findings", "Formula", "FormulaSyntaxError", "HorizonError",
+    "IntervalError", "Judgement", "Mined", "Mutant", "Mutants", "Online", "PredictiveMonitor",
+    "Requirement", "SamplingError", "Semantics", "SmoothingError", "Template",
+    "TimeColumnError", "Watch", "always", "anneal", "boolean", "dense_gradient",
+    "dense_robustness", "dense_signal", "distinguish", "domain_monitor", "draw", "durations",
+    "during", "eventually", "examples", "explain", "export_c", "fall", "hard", "historically",
+    "judge", "latex", "lint", "mine", "mutants", "next_", "nnf", "normalize", "once", "online",
+    "parse", "phase", "predictive_monitor", "prev", "read", "read_requirements", "resample",
+    "rise", "robustness", "robustness_signal", "satisfied", "signal", "simplify", "since",
+    "smooth", "smoothing_error", "sometime_during", "templates", "until", "watch",
     "write_requirements",
 ]  # fmt: skip
 

@@ -16,7 +16,7 @@ import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ from verifai_jax.core.gaps import with_gaps
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import Evaluator
 from verifai_jax.mtl.formula import Formula
-from verifai_jax.mtl.semantics import Semantics, hard
+from verifai_jax.mtl.semantics import Kind, Semantics, hard
 from verifai_jax.mtl.stepping import Cell, advance, first_cells
 from verifai_jax.mtl.streams import Plan, streams
 
@@ -46,7 +46,7 @@ class Online:
 
     formula: Formula
     dt: float
-    kind: Literal["hard", "boolean"] = "hard"
+    kind: Kind = "hard"
 
     @property
     def plan(self) -> Plan:
@@ -99,16 +99,14 @@ def online(formula: Formula | str, dt: float, semantics: Semantics = hard) -> On
     no bounded memory can follow.
     """
     formula = parse(formula) if isinstance(formula, str) else formula
-    if semantics.kind == "smooth":
-        raise ValueError("an online monitor has hard or boolean semantics; got smooth ones")
-    monitor = Online(formula, float(dt), semantics.kind)
+    monitor = Online(formula, dt, semantics.kind)
     _plan(monitor)
     return monitor
 
 
 @functools.lru_cache(maxsize=256)
 def _plan(monitor: Online) -> Plan:
-    return streams([monitor.formula], monitor.dt, monitor.kind == "boolean")
+    return streams(monitor.formula, monitor.dt, Semantics(monitor.kind))
 
 
 @functools.partial(jax.jit, static_argnums=0, inline=True)
@@ -133,7 +131,7 @@ def _end_with(monitor: Online, state: State, unknown: float | None) -> Array:
     if unknown is not None:
         unknown = max(-plan.top, min(plan.top, unknown))
         leaves = tuple(jnp.full_like(leaf, unknown) for leaf in leaves)
-    _, _, settling, ends = plan.outputs[0]
+    settling, ends = plan.outputs[0].wait - 1, plan.outputs[0].ends
 
     def more(i: Array, cells: tuple[Cell, ...]) -> tuple[Cell, ...]:
         return advance(plan, jnp, state.count + i, leaves, cells)[1]

@@ -10,7 +10,6 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
-from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.c_margins import MarginCode, margin_code
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.semantics import Semantics, hard
@@ -233,25 +232,22 @@ def export_c(
         raise ValueError(
             f"the name of a monitor in C is a letter, then letters, digits and _; got {name!r}"
         )
-    if semantics.kind == "smooth":
-        raise ValueError("an exported monitor has hard or boolean semantics; got smooth ones")
-    named = formulas if isinstance(formulas, Mapping) else {name: formulas}
-    parsed = {key: parse(f) if isinstance(f, str) else f for key, f in named.items()}
-    boolean = semantics.kind == "boolean"
-    plan = streams(list(parsed.values()), dt, boolean, every)
-    front = margin_code(plan.leaves, boolean, sizes or {})
+    plan = streams(formulas, dt, semantics, every)
+    front = margin_code(plan.leaves, plan.top == 1, sizes or {})
     columns = [
         f"x[{k}] {n}{'' if i is None else f'[{i}]'}" for k, (n, i) in enumerate(front.columns)
     ]
-    outputs = [f"out[{k}] {key}: {f}" for k, (key, f) in enumerate(parsed.items())]
+    outputs = [
+        f"out[{k}] {key}{': ' * bool(key)}{f}" for k, (key, f) in enumerate(plan.formulas.items())
+    ]
     about = "\n".join(["", *outputs, *columns, f"a sample every {number_text(dt)} s"])
     comment = about.replace("*/", "* /").replace("\n", "\n * ")
     guard = f"VJ_MONITOR_{name.upper()}_H"
-    body = monitor_code(plan, front, name, every)
+    body = monitor_code(plan, front, name)
     return f"/*{comment}\n */\n#ifndef {guard}\n#define {guard}\n\n{HEAD}{HELPERS}{body}\n#endif\n"
 
 
-def monitor_code(plan: Plan, front: MarginCode, name: str, every: bool) -> str:
+def monitor_code(plan: Plan, front: MarginCode, name: str) -> str:
     """Return the type of a monitor and its functions, without what they need."""
     code = _Code(plan.top)
     values = [
@@ -263,7 +259,7 @@ def monitor_code(plan: Plan, front: MarginCode, name: str, every: bool) -> str:
         f"m->out[{k}] = (m->count >= {o.delay}) ? {values[o.slot]} : (double)NAN;"
         for k, o in enumerate(plan.outputs)
     ]
-    waits = [o.delay if every else o.settling + 1 for o in plan.outputs]
+    waits = [output.wait for output in plan.outputs]
     given = [f"m->leaf[{k}] = {text};" for k, text in enumerate(front.leaves)]
     parts = {
         "outputs": len(outputs), "leaves": max(1, len(front.leaves)),

@@ -29,7 +29,7 @@ from verifai_jax.mtl.walk import Walk
 
 Values = Float[np.ndarray, "time *lanes"]
 
-_FUNCTIONS: dict[str, Callable[..., Values]] = {
+FUNCTIONS: dict[str, Callable[..., Values]] = {
     "neg": np.negative,
     "+": np.add,
     "-": np.subtract,
@@ -44,6 +44,7 @@ _FUNCTIONS: dict[str, Callable[..., Values]] = {
     "min": lambda *values: _joined(values, -1),
     "max": lambda *values: _joined(values, 1),
 }
+"""The functions of expressions on the host, but for `norm`."""
 
 
 @dataclass
@@ -74,10 +75,10 @@ class HostValues:
         """
         check_trace(trace)
         dt, trace = period(trace), trace.trim()
-        signals = {name: _numbers(signal) for name, signal in trace.signals.items()}
+        signals = {name: numbers(signal) for name, signal in trace.signals.items()}
         if trace.between is not None:
             for name, own in signals.items():
-                inner = _numbers(trace.between.signals[name])
+                inner = numbers(trace.between.signals[name])
                 rows = inner.reshape(trace.length, -1, *own.shape[1:])
                 joined = np.concatenate([own[:, None], rows], axis=1)
                 signals[name] = joined.reshape(-1, *own.shape[1:])
@@ -197,7 +198,7 @@ class HostValues:
                 case Arithmetic(name, arguments):
                     for argument in arguments:
                         check_scalar(argument, values[id(argument)].shape, self.lanes)
-                    values[id(part)] = _FUNCTIONS[name](*(values[id(a)] for a in arguments))
+                    values[id(part)] = FUNCTIONS[name](*(values[id(a)] for a in arguments))
                 case _:
                     raise missing_case("the value", part)
         check_scalar(e, values[id(e)].shape, self.lanes)
@@ -226,7 +227,8 @@ def _look_back(formula: Formula, dt: float, stride: int) -> int:
     return sum(int(a if math.isinf(b) else b) for a, b in spans)
 
 
-def _numbers(signal: object) -> Values:
+def numbers(signal: object) -> Values:
+    """Return a signal in double precision, a truth value as 1 or -1."""
     array = np.asarray(without_wrapping(signal))  # pyright: ignore[reportArgumentType]
     return np.where(array, 1.0, -1.0) if array.dtype == bool else array.astype(float)
 

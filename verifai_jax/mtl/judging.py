@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from verifai_jax.core.errors import missing_name
 from verifai_jax.core.executors import Executor, check_executor, gather
+from verifai_jax.core.progress import count_done, shows_progress
 from verifai_jax.core.text import format_time, one_line
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl._robustness import first_nan
@@ -42,6 +43,7 @@ class Reading(NamedTuple):
     explain: bool
 
 
+@shows_progress("judging", "recordings")
 def judge(
     formulas: Requirements,
     recordings: Recordings,
@@ -54,6 +56,7 @@ def judge(
     explain: bool = True,
     executor: Executor | None = None,
     ended: Callable[[int, Sequence[Row]], None] | None = None,
+    progress: bool | None = None,
 ) -> Judgement:
     """Judge every requirement on every recording, in double precision.
 
@@ -71,6 +74,7 @@ def judge(
     - `executor`: anything with `concurrent.futures`' `submit` to read and judge in parallel; the
       process pool must not fork.
     - `ended`: called with the index and the rows of each recording as it ends.
+    - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     **Raises:** `ValueError` for no requirement, no recording, `resample_to` without `method`;
     `FileNotFoundError` for a folder or a file that does not exist.
@@ -85,6 +89,7 @@ def judge(
 
     def keep(index: int, found: Sequence[Row]) -> None:
         rows[index] = found
+        count_done(1)
         if ended is not None:
             ended(index, found)
 

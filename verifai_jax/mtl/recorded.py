@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Protocol, TypeAlias, Union, runtime_checkable
 
 from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.trace import Trace
+from verifai_jax.mtl.containers import Episode, episodes_of, lerobot_files
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.recording import ENDINGS, read
 
@@ -27,8 +28,8 @@ class Simulated(Protocol):
     nominal: Mapping[str, object] | None
 
 
-Recording: TypeAlias = Union[Trace, str, Path, "pd.DataFrame"]
-"""One recording: a trace, the path of a file or of a folder of them, or a table."""
+Recording: TypeAlias = Union[Trace, str, Path, Episode, "pd.DataFrame"]
+"""One recording: a trace, the path of a file or of a folder of them, an episode, or a table."""
 Recordings: TypeAlias = Recording | Iterable[Recording] | Mapping[str, Recording] | Simulated
 """One recording or several, also by name, or a problem that is simulated."""
 
@@ -46,7 +47,7 @@ def named_recordings(source: Recordings) -> Iterator[tuple[str, Recording]]:
     if isinstance(source, Mapping):
         yield from ((str(name), one) for name, one in source.items())
         return
-    alone = isinstance(source, str | Path | Trace) or hasattr(source, "columns")
+    alone = isinstance(source, str | Path | Trace | Episode) or hasattr(source, "columns")
     several: Iterable[Recording] = [source] if alone else source  # pyright: ignore
     for index, one in enumerate(several, 1):
         if not isinstance(one, str | Path):
@@ -55,7 +56,11 @@ def named_recordings(source: Recordings) -> Iterator[tuple[str, Recording]]:
         path = Path(one)
         if not path.exists():
             raise FileNotFoundError(f"there is no recording {path}")
-        if not path.is_dir():
+        if lerobot := lerobot_files(path):
+            for each in episodes_of(lerobot):
+                yield f"{path} episode {each.number}", each
+            continue
+        if not path.is_dir() or path.suffix.lower() in ENDINGS:
             yield str(path), path
             continue
         files = [each for each in sorted(path.rglob("*")) if each.suffix.lower() in ENDINGS]

@@ -137,8 +137,8 @@ class _Step:
             lefts, rights = -lefts, -rights
         top = self.xp.full((1,), self.xp.inf, lefts.dtype)
         before = self.xp.concatenate([top, lefts[:-1]])
-        least = np.minimum.accumulate if self.xp is np else jax.lax.cummin
-        return op.sign * self.xp.minimum(rights, least(before)).max()
+        running = np.minimum.accumulate if self.xp is np else jax.lax.cummin
+        return op.sign * self.xp.minimum(rights, running(before)).max()
 
     def reach(
         self, op: Op, index: Int[Array, ""] | int, inputs: Sequence[Value],

@@ -1,6 +1,6 @@
 """Formulas as streams: what a monitor computes at each sample, in memory that does not grow.
 
-    plan = streams([formula], dt=0.1)                 # operations over the margins of the leaves
+    plan = streams(formula, dt=0.1)                   # operations over the margins of the leaves
     plan.ops, plan.outputs                            # each reads results of earlier ones
 
 After sample k a stream gives the value at instant k - delay, where the delay is how far it looks
@@ -9,13 +9,15 @@ Negations are moved into the leaves, so every operation grows with each of its i
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from verifai_jax.mtl import formula as ast
+from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import samples
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.rewriting import expand, simplify
+from verifai_jax.mtl.semantics import Semantics, hard
 from verifai_jax.mtl.tree import missing_case
 
 LARGEST = 2**27
@@ -51,23 +53,26 @@ class Output(NamedTuple):
 
     - `slot`: number of its operation.
     - `delay`: samples by which it is late; 0 if it is asked at time 0.
-    - `settling`: samples after which a constant input has reached it.
-    - `ends`: whether it is final after as many samples as it takes to settle.
+    - `wait`: samples after which a constant input has reached it: asked at time 0, all of it has
+      settled; asked at every instant, it is of the latest sample.
+    - `ends`: whether no operator looks ahead without end.
     """
 
     slot: int
     delay: int
-    settling: int
+    wait: int
     ends: bool
 
 
 class Plan(NamedTuple):
-    """What monitors of several formulas do at each sample.
+    """The operations of monitors of several formulas at each sample.
 
+    - `formulas`: by name.
     - `leaves`: the leaves with the sign of their margin.
     - `top`: the greatest value: infinity, or 1 for truth values.
     """
 
+    formulas: Mapping[str, Formula]
     leaves: tuple[tuple[Formula, int], ...]
     ops: tuple[Op, ...]
     outputs: tuple[Output, ...]
@@ -85,30 +90,38 @@ _HOLD = ("delay", "window")
 
 
 def streams(
-    formulas: Sequence[Formula], dt: float, boolean: bool = False, every: bool = False
+    formulas: Formula | str | Mapping[str, Formula | str],
+    dt: float,
+    semantics: Semantics = hard,
+    every: bool = False,
 ) -> Plan:
-    """Lay out the operations of several formulas; what they have in common occurs once.
+    """Lay out the operations of one formula or several; what they have in common occurs once.
 
     **Arguments:**
 
     - `dt`: sampling period in seconds.
-    - `boolean`: whether values are truth values.
+    - `semantics`: `hard` or `boolean`.
     - `every`: whether each formula is asked at every instant, or at time 0.
 
     **Raises:** `IntervalError` for an interval that is not a multiple of `dt`; `ValueError` for no
-    formula, a period that is not positive, and for what no bounded memory can follow.
+    formula, smooth semantics, a period that is not positive, and what no bounded memory can follow.
     """
+    named = formulas if isinstance(formulas, Mapping) else {"": formulas}
+    parsed = {name: parse(f) if isinstance(f, str) else f for name, f in named.items()}
     if not dt > 0:
         raise ValueError(f"the sampling period dt must be positive; got {dt}")
-    if not formulas:
+    if not parsed:
         raise ValueError("a monitor needs one formula or more; got none")
-    plan = _Layout(dt, 1.0 if boolean else math.inf)
+    if semantics.kind == "smooth":
+        raise ValueError("an online monitor has hard or boolean semantics; got smooth ones")
+    plan = _Layout(dt, 1.0 if semantics.kind == "boolean" else math.inf)
     outputs: list[Output] = []
-    for formula in formulas:
+    for formula in parsed.values():
         f = simplify(expand(formula))
         slot, delay = plan.stream(f, 1) if every else (plan.at_start(f, 1), 0)
-        outputs.append(Output(slot, delay, plan.settling(f), plan.ends(f)))
-    made = Plan(tuple(plan.leaves), tuple(plan.ops), tuple(outputs), plan.top)
+        wait = delay if every else plan.settling(f) + 1
+        outputs.append(Output(slot, delay, wait, plan.ends(f)))
+    made = Plan(parsed, tuple(plan.leaves), tuple(plan.ops), tuple(outputs), plan.top)
     if made.memory > LARGEST:
         raise ValueError(
             f"the windows hold {made.memory} samples, and a monitor may hold {LARGEST}: sample "

@@ -22,7 +22,6 @@ from jaxtyping import Float
 from verifai_jax.core.errors import missing_name
 from verifai_jax.core.gaps import with_gaps
 from verifai_jax.core.machine_code import Unavailable, compiler, library_file
-from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.c_margins import MarginCode, margin_code
 from verifai_jax.mtl.c_monitor import HEAD, HELPERS, monitor_code
 from verifai_jax.mtl.formula import Formula
@@ -121,7 +120,7 @@ class CompiledMachine:
         library = LIBRARY
         for word, count in counts.items():
             library = library.replace(word, str(count))
-        source = "".join([HEAD, HELPERS, monitor_code(plan, front, "monitor", True), library])
+        source = "".join([HEAD, HELPERS, monitor_code(plan, front, "monitor"), library])
         tool = compiler()
         about = tool.stat()
         which = (str(tool), about.st_size, about.st_mtime_ns, platform.machine(), FLAGS, source)
@@ -172,13 +171,10 @@ class Watch(Generic[R]):
     - `compiled`: whether the machine's compiler made the step.
     """
 
-    def __init__(
-        self, plan: Plan, front: MarginCode, every: bool, result: Callable[[Numbers], R]
-    ) -> None:
+    def __init__(self, plan: Plan, front: MarginCode, result: Callable[[Numbers], R]) -> None:
         self.delays = tuple(output.delay for output in plan.outputs)
-        self._every = every
         self._top = plan.top
-        self._waits = [o.delay if every else o.settling + 1 for o in plan.outputs]
+        self._waits = [output.wait for output in plan.outputs]
         self._columns = front.columns
         self._read = _reader(front.columns)
         self._result = result
@@ -229,8 +225,8 @@ class Watch(Generic[R]):
         columns = [arrays[n] if i is None else arrays[n][:, i] for n, i in self._columns]
         length = len(next(iter(signals.values()))) if signals else 0
         rows = np.stack(columns, axis=1) if columns else np.zeros((length, 1))
-        out = self._machine.steps(rows)
-        return out[:, 0] if isinstance(self._result(self._out), float) else out
+        out = self._machine.steps(rows) if len(rows) else np.empty((0, len(self._out)))
+        return self._columns_of(out)
 
     def interval(self) -> tuple[R, R]:
         """Return the lowest and the greatest robustness that further samples allow.
@@ -252,7 +248,9 @@ class Watch(Generic[R]):
 
         After those that `steps` returned they complete the robustness at every sample.
         """
-        out = self._machine.ahead(max(self.delays), None)
+        return self._columns_of(self._machine.ahead(max(self.delays), None))
+
+    def _columns_of(self, out: np.ndarray) -> np.ndarray:
         return out[:, 0] if isinstance(self._result(self._out), float) else out
 
     def _end_with(self, leaf: float | None) -> list[float]:
@@ -321,15 +319,9 @@ def watch(
     smooth semantics, for what looks ahead without end within another temporal operator, and for a
     norm without a size.
     """
-    if semantics.kind == "smooth":
-        raise ValueError("a monitor of samples has hard or boolean semantics; got smooth ones")
-    several = isinstance(formulas, Mapping)
-    named = formulas if several else {"": formulas}
-    parsed = [parse(f) if isinstance(f, str) else f for f in named.values()]
-    boolean = semantics.kind == "boolean"
-    plan = streams(parsed, dt, boolean, every)
-    front = margin_code(plan.leaves, boolean, sizes or {})
-    if several:
-        names = tuple(named)
-        return Watch(plan, front, every, lambda out: dict(zip(names, out, strict=True)))
-    return Watch(plan, front, every, lambda out: out[0])
+    plan = streams(formulas, dt, semantics, every)
+    front = margin_code(plan.leaves, plan.top == 1, sizes or {})
+    if not isinstance(formulas, Mapping):
+        return Watch(plan, front, lambda out: out[0])
+    names = tuple(formulas)
+    return Watch(plan, front, lambda out: dict(zip(names, out, strict=True)))

@@ -16,6 +16,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.progress import say_done, shows_progress
 from verifai_jax.perception._detector import Detection, Detector, Layer, detector
 
@@ -167,7 +168,7 @@ def losses_of(network: Detector, seen: Detection, labels: Labels) -> Float[Array
 
 
 @dataclasses.dataclass(frozen=True)
-class Score:
+class Score(InNotebook):
     """The quality of a detector on a test set.
 
     - `images`: number of images.

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.core.trace import Trace
 from verifai_jax.falsification import falsify
 from verifai_jax.falsification.run import Run
@@ -39,12 +40,14 @@ def simulated(problem: Problem, count: int = SIMULATED, seed: int = 0) -> tuple[
     return _traces(run, rows)
 
 
+@shows_progress("mining parameters")
 def mine_by_search(
     template: Parametric,
     problem: Problem,
     budget: int = 2000,
     seed: int = 0,
     confidence: float = 0.95,
+    progress: bool | None = None,
 ) -> Mined:
     """Find the tightest parameters that no search breaks: each counterexample loosens them.
 

@@ -113,6 +113,8 @@ class Wants:
     - `no_verdict_rows`: simulations without a verdict as if they were valid, with the greatest
       robustness so far, so that a model of the robustness learns to stay away from them.
     - `traces`: a model of the traces that proposes some of the points, with these options.
+    - `likelihood`: an objective by which failures are the better the likelier they are, in the
+      place of the robustness.
     - `max_batch`: points in a round beyond which more rounds are worth more than larger ones. The
       default is a size at which compiled simulators run at three quarters of their greatest speed
       or more (`benchmarks/RESULTS.md`, "The engine on real dynamics").
@@ -125,6 +127,7 @@ class Wants:
     outcomes: bool = False
     no_verdict_rows: bool = False
     traces: TraceOptions | None = None
+    likelihood: bool = False
     max_batch: int = 1024
 
     @property

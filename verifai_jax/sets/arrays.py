@@ -1,14 +1,15 @@
 """Operations that move the elements of arrays, add them up or multiply matrices, on sets."""
 
+import functools
 import itertools
 from collections.abc import Callable, Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from verifai_jax.sets import functions, whole
-from verifai_jax.sets.form import Form, is_point, product, rounded, total
+from verifai_jax.sets import functions
+from verifai_jax.sets.elementwise import of_rank, select
+from verifai_jax.sets.form import Form, alike, is_point, padded, product, rounded, total
 from verifai_jax.sets.interpreter import (
     Equation,
     Interpreter,
@@ -18,8 +19,10 @@ from verifai_jax.sets.interpreter import (
     as_whole,
     rule,
 )
-from verifai_jax.sets.elementwise import select
 from verifai_jax.sets.whole import Whole
+
+WINDOWS = 1024
+"""Positions of an array that an index may have in a box."""
 
 Move = Callable[[Params, np.ndarray, int], np.ndarray]
 """A function of the parameters of a step, an array and the number of its leading axes."""
@@ -63,7 +66,7 @@ def _transpose(params: Params, array: np.ndarray, lead: int) -> np.ndarray:
 
 @_moving("rev")
 def _reverse(params: Params, array: np.ndarray, lead: int) -> np.ndarray:
-    return np.flip(array, [axis + lead for axis in params["dimensions"]])
+    return np.flip(array, tuple(axis + lead for axis in params["dimensions"]))
 
 
 @_moving("slice")
@@ -89,26 +92,16 @@ def together(values: Sequence[Value], join: Callable[[list[np.ndarray], int], np
         parts = [as_whole(value) for value in values]
         low, high = ([getattr(p, end) for p in parts] for end in ("low", "high"))
         return Whole(leading(low, 1), leading(high, 1), parts[0].dtype)
-    forms = [as_form(value) for value in values]
-    newest = max((f.frame.number for f in forms if f.frame is not None), default=0)
-    forms = [f if f.frame is None or f.frame.number == newest else f.unframed() for f in forms]
-    frame = next((f.frame for f in forms if f.frame is not None), None)
-    count = max((len(f.slopes) for f in forms if f.slopes is not None), default=0)
+    forms, frame, count = alike([as_form(value) for value in values])
     slopes = None
     if count:
-        padded = []
-        for form in forms:
-            own = np.zeros((count, *form.centre.shape))
-            if form.slopes is not None:
-                own = np.zeros((count, *form.slopes.shape[1:]))
-                own[: len(form.slopes)] = form.slopes
-            padded.append(own)
-        slopes = leading(padded, 2)
+        slopes = leading(
+            [np.broadcast_to(padded(f, count), (count, *(
+                f.centre.shape if f.slopes is None else f.slopes.shape[1:]
+            ))) for f in forms], 2,
+        )  # fmt: skip
     low = high = None
-    if all(f.low is not None for f in forms):
-        ends = [f.bounds() for f in forms]
-        low, high = (leading([end[side] for end in ends], 1) for side in (0, 1))
-    elif not all(np.isfinite(f.radius).all() for f in forms):
+    if all(f.low is not None for f in forms) or not all(np.isfinite(f.radius).all() for f in forms):
         ends = [f.bounds() for f in forms]
         low, high = (leading([end[side] for end in ends], 1) for side in (0, 1))
     return Form(
@@ -137,7 +130,9 @@ def _split(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     parts = []
     for size, end in zip(sizes, ends, strict=True):
 
-        def cut(array: np.ndarray, lead: int, begin: int = end - size, end: int = end) -> np.ndarray:
+        def cut(
+            array: np.ndarray, lead: int, begin: int = end - size, end: int = end
+        ) -> np.ndarray:
             part = array.take(range(begin, end), axis + lead)
             return part.squeeze(axis + lead) if step.primitive.name == "unstack" else part
 
@@ -147,9 +142,7 @@ def _split(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
 
 def _taken(value: Value, positions: np.ndarray) -> Value:
     """Return the elements at these positions of the flat array."""
-    return value.moved(
-        lambda array, lead: array.reshape(*array.shape[:lead], -1)[..., positions]
-    )
+    return value.moved(lambda array, lead: array.reshape(*array.shape[:lead], -1)[..., positions])
 
 
 def _positions(t: Interpreter, step: Equation, inputs: list[Value], of: int) -> np.ndarray:
@@ -171,56 +164,32 @@ def _positions(t: Interpreter, step: Equation, inputs: list[Value], of: int) -> 
     return np.asarray(step.primitive.bind(*map(jnp.asarray, arrays), **params))
 
 
-def _in_reach(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value] | None:
-    """Return the hull over all values of the one index of a slice that varies; None if it is fixed.
-    """
-    starts = [as_whole(value) for value in inputs[1:]]
+@rule("dynamic_slice")
+def _dynamic_slice(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    """Return the window, or the hull of all windows where the index varies in a box."""
     array, sizes = inputs[0], step.params["slice_sizes"]
-    if all(start.common is not None for start in starts):
-        return None
+    ends = []
+    for start, n, size in zip(inputs[1:], array.shape, sizes, strict=True):
+        start = as_whole(start)
+        ends.append((np.clip(start.low, 0, n - size), np.clip(start.high, 0, n - size)))
+    ranges = [range(int(low.min()), int(high.max()) + 1) for low, high in ends]
+    if np.prod([len(each) for each in ranges]) > WINDOWS:
+        raise NotImplementedError(f"an index of more than {WINDOWS} values in a box")
     result: Value | None = None
-    tops = [n - size for n, size in zip(array.shape, sizes, strict=True)]
-    ranges = [
-        range(int(np.clip(s.low.min(), 0, top)), int(np.clip(s.high.max(), 0, top)) + 1)
-        for s, top in zip(starts, tops, strict=True)
-    ]
-    if np.prod([len(each) for each in ranges]) > 1024:
-        raise NotImplementedError("an index of more than 1024 values in a box")
-    rank = (1,) * len(sizes)
     for cell in itertools.product(*ranges):
         window = tuple(slice(i, i + size) for i, size in zip(cell, sizes, strict=True))
         part = array.moved(lambda a, lead, window=window: a[(..., *window)])
-        if result is None:
-            result = part
-            continue
-        low = np.ones(1, bool)
-        high = np.ones(1, bool)
-        for i, start, top in zip(cell, starts, tops, strict=True):
-            least, most = np.clip(start.low, 0, top), np.clip(start.high, 0, top)
-            high = high & (least <= i) & (i <= most)
-            low = low & (least == i) & (i == most)
-        which = Whole(
-            low.astype(np.int64).reshape(-1, *rank), high.astype(np.int64).reshape(-1, *rank),
-            np.dtype(bool),
-        )  # fmt: skip
+        certain, possible = np.ones(1, bool), np.ones(1, bool)
+        for i, (low, high) in zip(cell, ends, strict=True):
+            certain, possible = (
+                certain & (low == i) & (high == i),
+                possible & (low <= i) & (i <= high),
+            )
         # A box in which the first window is out of reach has another one for certain.
-        result = select(which, [result, part])
+        which = Whole(certain.astype(np.int64), possible.astype(np.int64), np.dtype(bool))
+        result = part if result is None else select(of_rank(which, part), [result, part])
     assert result is not None
     return [result]
-
-
-@rule("dynamic_slice")
-def _dynamic_slice(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    varying = _in_reach(t, step, inputs)
-    if varying is not None:
-        return varying
-    cells = []
-    for start, n, size in zip(inputs[1:], inputs[0].shape, step.params["slice_sizes"], strict=True):
-        common = as_whole(start).common
-        assert common is not None
-        begin = int(np.clip(int(common), 0, n - size))
-        cells.append(slice(begin, begin + size))
-    return [inputs[0].moved(lambda array, lead: array[(..., *cells)])]
 
 
 @rule("gather")
@@ -298,11 +267,7 @@ def _extreme(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]
 def _product(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     value = as_form(inputs[0])
     for axis in sorted(step.params["axes"], reverse=True):
-        rows = _rows(value, axis)
-        result = rows[0]
-        for row in rows[1:]:
-            result = product(result, row)
-        value = result
+        value = functools.reduce(product, _rows(value, axis))
     return [value]
 
 
@@ -313,37 +278,30 @@ def _rows(value: Form, axis: int) -> list[Form]:
     ]
 
 
-@rule("cumsum", "cumprod", "cummax", "cummin")
+_ACCUMULATED = {"cumprod": product, "cummax": functions.greater, "cummin": functions.lesser}
+
+
+@rule("cumsum", *_ACCUMULATED)
 def _cumulative(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     axis, name = step.params["axis"], step.primitive.name
     if isinstance(inputs[0], Whole):
         return t.concrete(step, inputs)
-    rows = _rows(inputs[0], axis)
-    if step.params["reverse"]:
-        rows = rows[::-1]
+    order = slice(None, None, -1 if step.params["reverse"] else 1)
+    rows = _rows(inputs[0], axis)[order]
     if name == "cumsum":
-        # Of sums of any order of additions: XLA adds up in a tree.
-        sums = [
-            total(together(rows[: i + 1], lambda arrays, lead: np.stack(arrays, lead)), (0,))
-            for i in range(len(rows))
-        ]
+        # Whatever the order of the additions: XLA adds up in a tree.
+        sums = [total(as_form(together(rows[: i + 1], np.stack)), (0,)) for i in range(len(rows))]
     else:
-        operation = {
-            "cumprod": product, "cummax": functions.greater, "cummin": functions.lesser
-        }[name]  # fmt: skip
-        sums = list(itertools.accumulate(rows, operation))
-    if step.params["reverse"]:
-        sums = sums[::-1]
-    return [together(sums, lambda arrays, lead: np.stack(arrays, axis + lead))]
+        sums = list(itertools.accumulate(rows, _ACCUMULATED[name]))
+    return [together(sums[order], lambda arrays, lead: np.stack(arrays, axis + lead))]
 
 
 @rule("argmax", "argmin")
 def _argument(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    if isinstance(inputs[0], Whole):
-        return t.concrete(step, inputs)
-    value = inputs[0] if step.primitive.name == "argmax" else _minus(inputs[0])
-    (axis,) = step.params["axes"]
-    low, high = value.bounds()
+    (value,), (axis,) = inputs, step.params["axes"]
+    low, high = value.bounds() if isinstance(value, Form) else (1.0 * value.low, 1.0 * value.high)
+    if step.primitive.name == "argmin":
+        low, high = -high, -low
     best = low.max(axis + 1, keepdims=True)
     possible = high >= best
     possible |= ((low == -np.inf) & (high == np.inf)).any(axis + 1, keepdims=True)
@@ -352,12 +310,6 @@ def _argument(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value
     first = np.where(possible, number, count).min(axis + 1)
     last = np.where(possible, number, -1).max(axis + 1)
     return [Whole(first, last, np.dtype(step.outvars[0].aval.dtype))]
-
-
-def _minus(value: Value) -> Form:
-    from verifai_jax.sets.form import negative
-
-    return negative(as_form(value))
 
 
 @rule("dot_general")
@@ -382,7 +334,7 @@ def _dot(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
             return array.transpose(axes).reshape(*array.shape[:lead], *flat)
 
         sides.append((form.moved(arrange), sizes))
-    (a, sizes), (b, others) = sides
+    (a, _), (b, _) = sides
     to = step.outvars[0].aval.shape
     dtype = np.dtype(step.outvars[0].aval.dtype)
     if is_point(b) and np.isfinite(b.centre).all():
@@ -398,7 +350,7 @@ def _dot(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
 
 
 def _times(a: Form, matrix: np.ndarray, dtype: np.dtype) -> Form:
-    """Return products `[batch, rows, columns]` of a form and exact numbers `[batch, columns, k]`."""
+    """Return products of a form `[batch, rows, k]` and exact numbers `[batch, columns, k]`."""
     other = np.swapaxes(matrix, -1, -2)
     count = matrix.shape[-1]
 
@@ -415,5 +367,3 @@ def _times(a: Form, matrix: np.ndarray, dtype: np.dtype) -> Form:
             multiplied(a.centre, other), slopes, multiplied(a.radius, size),
             multiplied(a.size, size), dtype, None, a.frame, units=count + 1.0,
         )  # fmt: skip
-
-

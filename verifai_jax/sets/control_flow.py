@@ -6,7 +6,7 @@ import numpy as np
 
 from verifai_jax.core.fingerprint import operands_of_scan
 from verifai_jax.sets.arrays import together
-from verifai_jax.sets.elementwise import select
+from verifai_jax.sets.elementwise import of_rank, select
 from verifai_jax.sets.form import Form
 from verifai_jax.sets.frames import framed
 from verifai_jax.sets.interpreter import (
@@ -88,7 +88,7 @@ def _framed(t: Interpreter, carry: Sequence[Value]) -> list[Value]:
 
 def _nothing(form: Equation) -> Value:
     """Return an array of no meaning, in this shape and type."""
-    if np.issubdtype(form.dtype, np.integer) or form.dtype == bool:
+    if np.issubdtype(form.dtype, np.integer) or form.dtype == np.bool_:
         return Whole.constant(np.zeros(form.shape), np.dtype(form.dtype))
     return Form.constant(np.zeros(form.shape), np.dtype(form.dtype))
 
@@ -107,13 +107,7 @@ def _cond(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     if len(results) == 1:
         return results[0]
     shifted = Whole(index.low - first, index.high - first, index.dtype)
-    return [select(_shaped(shifted, cases[0]), list(cases)) for cases in zip(*results, strict=True)]
-
-
-def _shaped(which: Whole, like: Value) -> Whole:
-    """Return one number for each box in the rank of an array."""
-    rank = (1,) * len(like.shape)
-    return which.moved(lambda array, lead: array.reshape(*array.shape[:lead], *rank))
+    return [select(of_rank(shifted, cases[0]), list(cases)) for cases in zip(*results, strict=True)]
 
 
 @rule("while")
@@ -137,7 +131,7 @@ def _while(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
             which = Whole((ends & ~started).astype(np.int64), ends.astype(np.int64),
                           np.dtype(bool))  # fmt: skip
             reached = [
-                select(_shaped(which, old), [old, new])
+                select(of_rank(which, old), [old, new])
                 for old, new in zip(reached, state, strict=True)
             ]
             started = started | ends
@@ -147,5 +141,3 @@ def _while(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
             return reached
         state = t.closed(params["body_jaxpr"], [*shared, *state])
     raise NotImplementedError(f"a loop that may take more than {PASSES} passes")
-
-

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.sets import functions, whole
-from verifai_jax.sets.form import Form, add, is_point, negative, product, settled
+from verifai_jax.sets.form import Form, add, is_point, negative, product
 from verifai_jax.sets.interpreter import (
     Equation,
     Interpreter,
@@ -147,6 +147,12 @@ def _select(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     return [select(as_whole(which), cases)]
 
 
+def of_rank(which: Whole, like: Value) -> Whole:
+    """Return one number for each box in the rank of an array."""
+    rank = (1,) * len(like.shape)
+    return which.moved(lambda array, lead: array.reshape(*array.shape[:lead], *rank))
+
+
 def select(which: Whole, cases: list[Value]) -> Value:
     """Return one of several cases, by a number that may be open."""
     result = cases[0]
@@ -177,19 +183,15 @@ def _convert(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]
             return [_as_real(value, dtype)]
         if value.dtype == dtype and step.primitive.name == "convert_element_type":
             return [value]
-        if dtype.itemsize >= value.dtype.itemsize and step.primitive.name != "reduce_precision":
-            ends = None if value.low is None or value.high is None else (value.low, value.high)
-            return [settled(value.centre, value.slopes, value.radius, value.size, dtype, ends,
-                            value.frame)]  # fmt: skip
         if step.primitive.name == "reduce_precision":
             raise NotImplementedError("a reduction of precision")
-        moved = Form(value.centre, value.slopes, value.radius, value.size, dtype, value.low,
-                     value.high, value.frame)  # fmt: skip
-        return [add(moved, constant_zero(moved))]
+        if dtype.itemsize >= value.dtype.itemsize:
+            return [value.of_type(dtype)]
+        return [add(value.of_type(dtype), Form.constant(np.zeros(value.shape), dtype))]
     if isinstance(value, Whole):
         return [_whole_to_whole(value, dtype)]
     low, high = value.bounds()
-    if dtype == bool:
+    if dtype == np.bool_:
         return [whole.compared("ne", np.sign(low), np.sign(high))]
     info = np.iinfo(dtype)
     inside = (low > info.min) & (high < info.max)
@@ -198,13 +200,8 @@ def _convert(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]
     return [Whole(np.where(inside, low, info.min), np.where(inside, high, most), dtype)]
 
 
-def constant_zero(like: Form) -> Form:
-    """Return zeros in the shape and type of a form."""
-    return Form.constant(np.zeros(like.shape), like.dtype)
-
-
 def _whole_to_whole(value: Whole, dtype: np.dtype) -> Whole:
-    if dtype == bool:
+    if dtype == np.bool_:
         return whole.compared("ne", np.sign(value.low), np.sign(value.high))
     info = np.iinfo(dtype)
     if value.is_point:
@@ -215,7 +212,9 @@ def _whole_to_whole(value: Whole, dtype: np.dtype) -> Whole:
     return Whole(np.where(fits, value.low, info.min), np.where(fits, value.high, most), dtype)
 
 
-@rule("copy", "copy_p", "stop_gradient", "optimization_barrier", "device_put", "sharding_constraint")
+@rule(
+    "copy", "copy_p", "stop_gradient", "optimization_barrier", "device_put", "sharding_constraint"
+)
 def _same(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     return inputs
 

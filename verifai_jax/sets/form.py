@@ -28,7 +28,7 @@ import numpy as np
 from jax.typing import DTypeLike
 
 Reals = np.ndarray
-"""Numbers of double precision, `[boxes, *shape]`, or `[1, *shape]` where all boxes have the same."""
+"""Numbers of double precision, `[boxes, *shape]`; `[1, *shape]` if they are those of all boxes."""
 
 SLACK = 2.0**-45
 """Share of a number by which a result is widened for the rounding of its own bounds."""
@@ -92,15 +92,14 @@ class Form:
     @classmethod
     def constant(cls, value: np.ndarray, dtype: np.dtype) -> "Form":
         """Return one array that all boxes share."""
-        exact = np.asarray(value, np.float64)[None]
+        exact = np.asarray(value).astype(dtype).astype(np.float64)[None]
         return cls.between(exact, exact, dtype)
 
     @classmethod
     def between(cls, low: Reals, high: Reals, dtype: np.dtype) -> "Form":
         """Return intervals; ends that are NaN stand for everything."""
         kind = rounding(dtype)
-        low = np.where(np.isnan(low) | (low < -kind.greatest), -np.inf, low)
-        high = np.where(np.isnan(high) | (high > kind.greatest), np.inf, high)
+        low, high = overflown(low, high, kind.greatest)
         # What is below the smallest normal number may be taken for zero.
         low = np.where((low > 0) & (low < kind.smallest), 0.0, low)
         high = np.where((high < 0) & (high > -kind.smallest), 0.0, high)
@@ -135,12 +134,13 @@ class Form:
     @property
     def spread(self) -> Reals:
         """The greatest distance from the centre that the affine form allows."""
-        if self._spread is None:
+        spread = self._spread
+        if spread is None:
             spread = self.radius
             if self.slopes is not None:
                 spread = np.abs(self.slopes).sum(0) + spread
             self._spread = spread
-        return self._spread
+        return spread
 
     def bounds(self) -> tuple[Reals, Reals]:
         """Return the ends of the set: what the affine form and the interval have in common."""
@@ -165,6 +165,11 @@ class Form:
             None if self.high is None else move(self.high, 1), self.frame,
         )  # fmt: skip
 
+    def of_type(self, dtype: np.dtype) -> "Form":
+        """Return the same numbers as those of another type, in which they are exact."""
+        ends = self.low, self.high
+        return Form(self.centre, self.slopes, self.radius, self.size, dtype, *ends, self.frame)
+
     def unframed(self) -> "Form":
         """Return a set that depends on features alone: other symbols become part of the radius."""
         if self.frame is None or self.slopes is None:
@@ -174,6 +179,15 @@ class Form:
         radius = radius + SLACK * self.size
         slopes = self.slopes[:count]
         return Form(self.centre, slopes, radius, self.size, self.dtype, self.low, self.high)
+
+
+def overflown(low: Reals, high: Reals, greatest: float) -> tuple[Reals, Reals]:
+    """Return an interval that is unbounded where its numbers may be beyond the greatest one."""
+    low = np.where(np.isnan(low) | (low < -greatest), -np.inf, low)
+    high = np.where(np.isnan(high) | (high > greatest), np.inf, high)
+    # What is beyond it for certain is an infinity to the machine, and a number in real arithmetic.
+    low = np.where((low > greatest) & (low < np.inf), greatest, low)
+    return low, np.where((high < -greatest) & (high > -np.inf), -greatest, high)
 
 
 def unknown(low: Reals, high: Reals) -> Reals:
@@ -233,46 +247,42 @@ def settled(
         if slopes is not None:
             slopes = np.where(wild, 0.0, slopes)
         if low is not None and high is not None:
-            low = np.where(np.isnan(low) | (low < -greatest), -np.inf, low)
-            high = np.where(np.isnan(high) | (high > greatest), np.inf, high)
+            low, high = overflown(low, high, greatest)
     return Form(centre, slopes, radius, size, dtype, low, high, frame)
 
 
-def aligned(a: Form, b: Form) -> tuple[Form, Form]:
-    """Return two forms whose symbols are the same: those of an earlier step are given up."""
-    if a.frame is not None and b.frame is not None and a.frame.number != b.frame.number:
-        if a.frame.number < b.frame.number:
-            return a.unframed(), b
-        return a, b.unframed()
-    return a, b
+def alike(forms: Sequence[Form]) -> tuple[list[Form], Frame | None, int]:
+    """Return forms of the newest frame among them, others without their own; and its symbols."""
+    newest = max((f.frame.number for f in forms if f.frame is not None), default=0)
+    forms = [f if f.frame is None or f.frame.number == newest else f.unframed() for f in forms]
+    frame = next((f.frame for f in forms if f.frame is not None), None)
+    return forms, frame, max((0 if f.slopes is None else len(f.slopes) for f in forms), default=0)
 
 
-def joint_slopes(
-    a: Form, b: Form, first: Reals | float, second: Reals | float
-) -> tuple[Reals | None, Frame | None]:
-    """Return the slopes of `first * a + second * b`, of aligned forms."""
-    if a.slopes is None or b.slopes is None:
-        one, factor = (a, first) if b.slopes is None else (b, second)
-        if one.slopes is None:
-            return None, None
-        unchanged = isinstance(factor, float) and factor == 1.0
-        return one.slopes if unchanged else one.slopes * factor, one.frame
-    long, short, by, other = a, b, first, second
-    if len(b.slopes) > len(a.slopes):
-        long, short, by, other = b, a, second, first
-    assert long.slopes is not None and short.slopes is not None
-    slopes, more = long.slopes * by, short.slopes * other
-    if len(more) == len(slopes):
-        return slopes + more, long.frame
-    count = len(more)
-    return np.concatenate([slopes[:count] + more, np.broadcast_to(
-        slopes[count:], (len(slopes) - count, *(slopes[:count] + more).shape[1:]))]), long.frame  # fmt: skip
+def padded(form: Form, count: int) -> Reals:
+    """Return slopes along so many symbols, zero along those that a form does not depend on."""
+    if form.slopes is None:
+        return np.zeros((count, *(1,) * form.centre.ndim))
+    missing = count - len(form.slopes)
+    if not missing:
+        return form.slopes
+    return np.pad(form.slopes, ((0, missing), *((0, 0),) * form.centre.ndim))
+
+
+def joint_slopes(a: Form, b: Form, first: Reals | float, second: Reals | float) -> Reals | None:
+    """Return the slopes of `first * a + second * b`, of forms of one frame."""
+    if a.slopes is None:
+        return None if b.slopes is None else b.slopes * second
+    if b.slopes is None:
+        return a.slopes * first
+    count = max(len(a.slopes), len(b.slopes))
+    return padded(a, count) * first + padded(b, count) * second
 
 
 def add(a: Form, b: Form, sign: float = 1.0) -> Form:
     """Return `a + b`, or `a - b` for the sign -1."""
-    a, b = aligned(a, b)
-    slopes, frame = joint_slopes(a, b, 1.0, sign)
+    (a, b), frame, _ = alike([a, b])
+    slopes = joint_slopes(a, b, 1.0, sign)
     centre = a.centre + b.centre if sign > 0 else a.centre - b.centre
     form = rounded(centre, slopes, a.radius + b.radius, a.size + b.size, a.dtype, None, frame)
     if a.low is None or b.low is None:
@@ -281,7 +291,8 @@ def add(a: Form, b: Form, sign: float = 1.0) -> Form:
     if sign < 0:
         first, last = -last, -first
     with np.errstate(invalid="ignore"):
-        form.low, form.high = _sum_end(low, first, a.dtype, -1), _sum_end(high, last, a.dtype, 1)
+        ends = _sum_end(low, first, a.dtype, -1), _sum_end(high, last, a.dtype, 1)
+        form.low, form.high = overflown(*ends, rounding(a.dtype).greatest)
     return form
 
 
@@ -299,9 +310,7 @@ def _sum_end(one: Reals, other: Reals, dtype: np.dtype, side: int) -> Reals:
     widened = np.where(exact & ~small, end, end + side * (kind.unit * np.abs(end) + kind.smallest))
     # A sum of numbers of one sign has that sign, or is zero.
     signed = (one * side <= 0) & (other * side <= 0)
-    widened = np.where(signed, side * np.minimum(side * widened, 0.0), widened)
-    widened = np.where(np.abs(widened) > kind.greatest, np.sign(widened) * np.inf, widened)
-    return np.where(np.isnan(widened), side * np.inf, widened)
+    return np.where(signed, side * np.minimum(side * widened, 0.0), widened)
 
 
 def negative(a: Form) -> Form:
@@ -326,7 +335,11 @@ def scaled(a: Form, by: Reals) -> Form:
         if a.low is not None and a.high is not None:
             one, other = a.low * by, a.high * by
             ends = np.minimum(one, other), np.maximum(one, other)
-        return rounded(a.centre * by, slopes, a.radius * scale, size, a.dtype, ends, a.frame)
+        # Times 0, 1, 2, 4 ... nothing is rounded.
+        exact = bool(((np.frexp(scale)[0] == 0.5) & (scale >= 1) | (scale == 0)).all())
+        return rounded(
+            a.centre * by, slopes, a.radius * scale, size, a.dtype, ends, a.frame, exact=exact
+        )
 
 
 def interval_product(a: Form, b: Form) -> tuple[Reals, Reals]:
@@ -348,11 +361,11 @@ def product(a: Form, b: Form) -> Form:
     for one, other in ((a, b), (b, a)):
         if is_point(one) and np.isfinite(one.centre).all():
             return scaled(other, one.centre)
-    a, b = aligned(a, b)
+    (a, b), frame, _ = alike([a, b])
     with np.errstate(invalid="ignore", over="ignore"):
         ends = interval_product(a, b)
         size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
-        slopes, frame = joint_slopes(a, b, b.centre, a.centre)
+        slopes = joint_slopes(a, b, b.centre, a.centre)
         centre = a.centre * b.centre
         radius = np.abs(a.centre) * b.radius + np.abs(b.centre) * a.radius + a.spread * b.spread
         if a.slopes is not None and b.slopes is not None:
@@ -368,59 +381,42 @@ def product(a: Form, b: Form) -> Form:
 def total(a: Form, axes: Sequence[int]) -> Form:
     """Return the sum over axes, whatever the order in which it is computed."""
     lead = tuple(axis + 1 for axis in axes)
-    count = int(np.prod([a.centre.shape[axis] for axis in lead], dtype=np.int64))
+    count = max(int(np.prod([a.centre.shape[axis] for axis in lead], dtype=np.int64)), 1)
     slopes = None if a.slopes is None else a.slopes.sum(tuple(axis + 2 for axis in axes))
-    size = a.size.sum(lead)
-    ends = None
+    size, ends = a.size.sum(lead), None
     if a.low is not None and a.high is not None:
         with np.errstate(invalid="ignore"):
-            low, high = a.low.sum(lead), a.high.sum(lead)
             margin = rounding(a.dtype).unit * count * size
-            # Only what is of one sign keeps it for certain.
-            ends = (
-                np.where((a.low >= 0).all(lead), np.maximum(low - margin, 0), low - margin),
-                np.where((a.high <= 0).all(lead), np.minimum(high + margin, 0), high + margin),
-            )
-            ends = np.where(np.isnan(ends[0]), -np.inf, ends[0]), np.where(
-                np.isnan(ends[1]), np.inf, ends[1]
-            )
+            low, high = a.low.sum(lead) - margin, a.high.sum(lead) + margin
+            # Numbers of one sign add up to one of that sign.
+            low = np.where((a.low >= 0).all(lead), np.maximum(low, 0), low)
+            ends = low, np.where((a.high <= 0).all(lead), np.minimum(high, 0), high)
+            ends = overflown(*ends, rounding(a.dtype).greatest)
     return rounded(
-        a.centre.sum(lead), slopes, a.radius.sum(lead), size, a.dtype, ends, a.frame,
-        units=max(count, 1),
+        a.centre.sum(lead), slopes, a.radius.sum(lead), size, a.dtype, ends, a.frame, units=count
+    )
+
+
+def joined(one: Form, other: Form) -> Form:
+    """Return a set that contains two: their hull, with the mean of their slopes."""
+    (a, b), frame, _ = alike([one, other])
+    gap = joint_slopes(a, b, 0.5, -0.5)
+    with np.errstate(invalid="ignore"):
+        apart = np.abs(a.centre - b.centre) / 2
+        if gap is not None:
+            apart = apart + np.abs(gap).sum(0)
+        radius = apart + np.maximum(a.radius, b.radius)
+    (low, high), (first, last) = a.bounds(), b.bounds()
+    return rounded(
+        a.centre / 2 + b.centre / 2, joint_slopes(a, b, 0.5, 0.5), radius,
+        np.maximum(a.size, b.size), a.dtype, (np.minimum(low, first), np.maximum(high, last)),
+        frame, exact=True,
     )  # fmt: skip
-
-
-def joined(cases: Sequence[Form]) -> Form:
-    """Return a set that contains several: their hull, with the mean of their slopes."""
-    whole = cases[0]
-    for other in cases[1:]:
-        a, b = aligned(whole, other)
-        slopes, frame = joint_slopes(a, b, 0.5, 0.5)
-        gap, _ = joint_slopes(a, b, 0.5, -0.5)
-        with np.errstate(invalid="ignore"):
-            apart = np.abs(a.centre - b.centre) / 2
-            if gap is not None:
-                apart = apart + np.abs(gap).sum(0)
-            radius = apart + np.maximum(a.radius, b.radius)
-        (low, high), (first, last) = a.bounds(), b.bounds()
-        ends = np.minimum(low, first), np.maximum(high, last)
-        size = np.maximum(a.size, b.size)
-        shape = np.broadcast_shapes(size.shape, ends[0].shape)
-        whole = rounded(
-            a.centre / 2 + b.centre / 2, slopes, radius, np.broadcast_to(size, shape), a.dtype,
-            ends, frame, exact=True,
-        )  # fmt: skip
-    return whole
 
 
 def chosen(masks: Sequence[np.ndarray], cases: Sequence[Form]) -> Form:
     """Return for each number the case whose mask holds; exactly one does."""
-    frames = {c.frame.number: c.frame for c in cases if c.frame is not None}
-    if len(frames) > 1:
-        newest = max(frames)
-        cases = [c if c.frame is None or c.frame.number == newest else c.unframed() for c in cases]
-    frame = next((c.frame for c in cases if c.frame is not None), None)
-    count = max((len(c.slopes) for c in cases if c.slopes is not None), default=0)
+    cases, frame, count = alike(cases)
 
     def pick(arrays: Sequence[np.ndarray]) -> np.ndarray:
         picked = arrays[-1]
@@ -428,13 +424,7 @@ def chosen(masks: Sequence[np.ndarray], cases: Sequence[Form]) -> Form:
             picked = np.where(mask, array, picked)
         return picked
 
-    def slopes_of(case: Form) -> np.ndarray:
-        if case.slopes is None:
-            return np.zeros((count, *(1,) * case.centre.ndim))
-        missing = count - len(case.slopes)
-        return np.pad(case.slopes, ((0, missing), *((0, 0),) * case.centre.ndim))
-
-    slopes = pick([slopes_of(case) for case in cases]) if count else None
+    slopes = pick([padded(case, count) for case in cases]) if count else None
     ends = [case.bounds() for case in cases]
     return Form(
         pick([c.centre for c in cases]), slopes, pick([c.radius for c in cases]),

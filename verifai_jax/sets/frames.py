@@ -70,7 +70,7 @@ def framed(values: Sequence[Form], boxes: int, features: int) -> list[Form]:
         pieces = [array[:, part].reshape(shape) for array in (centre, radius, size, low, high)]
         own = new[:, :, part].reshape(len(new), *shape)
         # Bounded numbers get no interval: what is computed with it would cost, and is no tighter.
-        ends = (None, None) if np.isfinite(pieces[1]).all() else pieces[3:]
+        ends = (None, None) if np.isfinite(pieces[1]).all() else (pieces[3], pieces[4])
         out.append(Form(pieces[0], own, pieces[1], pieces[2], value.dtype, *ends, frame))
         start += each
     return out
@@ -91,7 +91,8 @@ def _sides(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     own = np.arange(count)
     unit[:, own, own - count] += scale == 0
     rows = np.arange(len(unit))
-    rest, own_sides, turned = unit, np.empty_like(unit[:, :, :count]), np.empty_like(unit[:, :, :count])
+    rest, own_sides = unit, np.empty_like(unit[:, :, :count])
+    turned = np.empty_like(own_sides)
     for k in range(count):
         # The longest of what is not spanned yet.
         longest = np.argmax(np.square(rest).sum(1), axis=1)

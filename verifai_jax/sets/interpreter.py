@@ -60,6 +60,14 @@ class Interpreter:
     def __init__(self, boxes: int, features: int, known: Mapping[str, Known] | None = None) -> None:
         self.boxes, self.features, self.known = boxes, features, known or {}
 
+    def __call__(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
+        """Evaluate a traced program; what is not defined becomes a set that is everything.
+
+        **Raises:** `MissingRule` for an operation without a rule, with its name and its line.
+        """
+        with np.errstate(all="ignore"):
+            return self.closed(program, inputs)
+
     def program(
         self, program: Program, constants: Sequence[ArrayLike], inputs: Sequence[Value]
     ) -> list[Value]:

@@ -64,7 +64,7 @@ class Whole:
 
 def _within(low: Numbers, high: Numbers, dtype: np.dtype) -> Whole:
     """Return an interval, or all numbers of the type where it may wrap around."""
-    if dtype == bool:
+    if dtype == np.bool_:
         return Whole(low, high, dtype)
     info = np.iinfo(dtype)
     wraps = (low < info.min) | (high > min(info.max, 2**62))
@@ -86,7 +86,10 @@ def _by_corners(operation: Callable[..., Numbers]) -> Callable[[Whole, Whole], W
 
 def _logic(operation: Callable[..., np.ndarray]) -> Callable[[Whole, Whole], Whole]:
     def applied(a: Whole, b: Whole) -> Whole:
-        if a.dtype != bool and not (a.is_point and b.is_point):
+        if a.dtype != np.bool_ and not (a.is_point and b.is_point):
+            if operation is np.bitwise_and and (b if b.is_point else a).low.min() >= 0:
+                mask = b if b.is_point else a
+                return Whole(np.zeros_like(mask.low), mask.high, a.dtype)
             raise NotImplementedError("a bitwise operation on whole numbers that vary in a box")
         return Whole(operation(a.low, b.low), operation(a.high, b.high), a.dtype)
 
@@ -96,7 +99,7 @@ def _logic(operation: Callable[..., np.ndarray]) -> Callable[[Whole, Whole], Who
 def _exclusive(a: Whole, b: Whole) -> Whole:
     if a.is_point and b.is_point:
         return Whole(a.low ^ b.low, a.low ^ b.low, a.dtype)
-    if a.dtype != bool:
+    if a.dtype != np.bool_:
         raise NotImplementedError("a bitwise operation on whole numbers that vary in a box")
     return Whole.truth(
         (a.true & b.false) | (a.false & b.true), (a.true & b.true) | (a.false & b.false)
@@ -104,26 +107,21 @@ def _exclusive(a: Whole, b: Whole) -> Whole:
 
 
 def _divided(a: Whole, b: Whole) -> Whole:
-    safe = (b.low > 0) | (b.high < 0)
-    low, high = np.where(safe, b.low, 1), np.where(safe, b.high, 1)
+    _check_divisor(b)
     trunc = lambda x, y: np.sign(x) * np.sign(y) * (np.abs(x) // np.abs(y))  # noqa: E731
-    found = _by_corners(trunc)(a, Whole(low, high, b.dtype))
-    info = np.iinfo(a.dtype)
-    return Whole(
-        np.where(safe, found.low, info.min), np.where(safe, found.high, info.max), a.dtype
-    )
+    return _by_corners(trunc)(a, b)
 
 
 def _left(a: Whole, b: Whole) -> Whole:
-    if a.is_point and b.is_point and np.all(b.low != 0):
-        rest = np.sign(a.low) * (np.abs(a.low) % np.abs(b.low))
-        return Whole(rest, rest, a.dtype)
-    most = np.maximum(np.maximum(np.abs(b.low), np.abs(b.high)) - 1, 0)
-    info = np.iinfo(a.dtype)
-    zero = (b.low <= 0) & (b.high >= 0)
-    low = np.where(a.low >= 0, 0, np.maximum(-most, a.low))
-    high = np.where(a.high <= 0, 0, np.minimum(most, a.high))
-    return Whole(np.where(zero, info.min, low), np.where(zero, info.max, high), a.dtype)
+    _check_divisor(b)
+    most = np.maximum(np.abs(b.low), np.abs(b.high)) - 1
+    low, high = np.maximum(a.low, -most), np.minimum(a.high, most)
+    return Whole(np.where(a.low >= 0, 0, low), np.where(a.high <= 0, 0, high), a.dtype)
+
+
+def _check_divisor(b: Whole) -> None:
+    if np.any((b.low <= 0) & (b.high >= 0)):
+        raise NotImplementedError("a division by whole numbers that may be zero")
 
 
 OPERATIONS: dict[str, Callable[[Whole, Whole], Whole]] = {
@@ -149,7 +147,7 @@ def absolute(a: Whole) -> Whole:
 
 def inverted(a: Whole) -> Whole:
     """Return the other truth value, or the other bits."""
-    if a.dtype == bool:
+    if a.dtype == np.bool_:
         return Whole(1 - a.high, 1 - a.low, a.dtype)
     return Whole(~a.high, ~a.low, a.dtype)
 

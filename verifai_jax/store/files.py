@@ -36,13 +36,15 @@ def checksum(content: "bytes | memoryview | pa.Buffer", before: int = 0) -> int:
     return zlib.crc32(content, before)
 
 
-def write_complete(path: Path, content: "pa.Buffer | bytes") -> Path:
+def write_complete(path: Path, content: "pa.Buffer | bytes", locked: bool = True) -> Path:
     """Write a file such that a reader never meets a half of it; return its path.
+
+    - `locked`: as of `replacing`. A folder that is gone stays so then: the files of a run are of
+      use together.
 
     **Raises:** `OSError` where it cannot be written, as `replacing`; what was at `path` stays.
     """
-    # A folder that is gone stays so: the files of a run are of use together.
-    with replacing(path, locked=True) as partial:
+    with replacing(path, locked=locked) as partial:
         partial.write_bytes(content)
     return path
 
@@ -79,13 +81,15 @@ def replacing_all(folder: Path, names: Sequence[str]) -> Iterator[Path]:
         raise unwritable(folder, error, "The results are in memory all the same") from error
 
 
-def write_record(path: Path, record: Mapping[str, Any]) -> dict[str, Any]:
+def write_record(path: Path, record: Mapping[str, Any], locked: bool = True) -> dict[str, Any]:
     """Write plain data as JSON with a checksum, whole; return it as it is read back.
+
+    - `locked`: as of `write_complete`.
 
     **Raises:** `OSError` where it cannot be written.
     """
     stored = json.loads(json.dumps(record))
-    write_complete(path, f"{json.dumps(sealed(stored), indent=2)}\n".encode())
+    write_complete(path, f"{json.dumps(sealed(stored), indent=2)}\n".encode(), locked)
     return stored
 
 

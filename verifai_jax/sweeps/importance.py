@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.core.lazy import lazy_import
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.statistics.confidence_sequences import verdict_kind
@@ -58,7 +59,7 @@ MAX_CELLS = 8
 
 
 @dataclass(frozen=True, eq=False)
-class HyperparameterImportance:
+class HyperparameterImportance(InNotebook):
     """The importance of each hyper-parameter for failing and for the return.
 
     **Fields:**

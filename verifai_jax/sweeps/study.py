@@ -17,6 +17,7 @@ from typing import Any
 
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.source_collection import made_here, sources_of
 from verifai_jax.core.sources import Maker, Sources
 from verifai_jax.features import FeatureSpace
@@ -30,7 +31,7 @@ from verifai_jax.sweeps.trainer import STEPS, StudyError, Trainer
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class Study:
+class Study(InNotebook):
     """A sweep to be made: hyper-parameters, their trainer, and the safety of a policy.
 
     **Arguments:**

@@ -18,7 +18,7 @@ from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.problem.problem import Problem, ProblemError
 from verifai_jax.verification.boxes import BROKEN, OPEN, OUTSIDE, PROVED, Boxes
 from verifai_jax.verification.enclosure import TOGETHER, Enclosure
-from verifai_jax.verification.result import Verification, load_verification
+from verifai_jax.verification.result import Verification, described, load_verification
 
 REST = 0.08
 """Share of the seconds that is kept for the samples of what stays undecided."""
@@ -103,12 +103,10 @@ def verify(
     work.sample(samples)
     seconds = time.perf_counter() - started
     return Verification(
-        name=problem.name,
+        **described(problem),
         columns=problem.space.coordinates,
         boxes=work.boxes,
         shares=enclosure.shares(work.boxes.low), upper_shares=enclosure.shares(work.boxes.high),
-        features={name: repr(domain) for name, domain in problem.space.domains.items()},
-        formulas={name: str(formula) for name, formula in problem.formulas.items()},
         precision=precision,
         confidence=confidence,
         looked_at=work.looked_at + (0 if before is None else before.looked_at),
@@ -149,7 +147,7 @@ class _Work:
                 new = np.isinf(self.boxes.least[open_ones])
                 open_ones = open_ones[can | new]
                 if not len(open_ones):
-                    return "all boxes are decided, or too narrow to be split"
+                    return "all boxes are decided or too narrow"
                 if end is not None:
                     count = min(count, max(int(rate * (end - now)), 0))
                 if limit is not None:
@@ -176,11 +174,14 @@ class _Work:
         passes = proper & ~failing.any(1) & (robustness[:, 0] - slope >= 0)
         fails = proper & failing.all(1) & (robustness[:, 0] + slope <= 0)
         worth = np.flatnonzero(passes | fails | ~proper)
+        moves = np.zeros(some.low.shape)
         if len(worth):
             bounds = self.enclosure(some.low[worth], some.high[worth])
             some.least[worth], some.greatest[worth] = bounds.low, bounds.high
+            moves[worth] = bounds.moves
             state = np.where(bounds.holds, PROVED, np.where(bounds.high < 0, BROKEN, OPEN))
-            state = np.where((state == BROKEN) & ~bounds.inside, OPEN, state)
+            # A box that the constraint cuts is split until it does so no more: its mass is unknown.
+            state = np.where(bounds.inside, state, OPEN)
             state = np.where(bounds.outside, OUTSIDE, state)
             # A simulation outside of its bounds would be a mistake of this program.
             seen = robustness[worth]
@@ -195,7 +196,7 @@ class _Work:
         kept[rows[split]] = False
         for name in ("state", "least", "greatest", "witness", "confirmed"):
             getattr(self.boxes, name)[rows] = getattr(some, name)
-        along = self.influence(some, robustness, can)
+        along = self.influence(some, robustness, moves, can)
         halves = some[split].halves(along[split], self.enclosure)
         self.boxes = self.boxes[kept].with_more(halves)
 
@@ -225,17 +226,24 @@ class _Work:
         return robustness, failing
 
     def influence(
-        self, some: Boxes, robustness: Float[np.ndarray, "n k"], can: np.ndarray
+        self, some: Boxes, robustness: np.ndarray, moves: np.ndarray, can: np.ndarray
     ) -> Int[np.ndarray, " n"]:
-        """Return the coordinate along which each box is to be split."""
-        middle, up, down = robustness[:, :1], robustness[:, 1::2], robustness[:, 2::2]
+        """Return the coordinate along which each box is to be split.
+
+        That is the one that changes the robustness most, or, as far as bounds are wider than what
+        simulations see, the one that moves the signals most, and with them what is not linear.
+        """
+        # What counts most is that a point has a verdict, or is accepted, and its neighbour is not.
+        values = np.where(np.isnan(robustness), 1e30, np.clip(robustness, -1e29, 1e29))
+        middle, up, down = values[:, :1], values[:, 1::2], values[:, 2::2]
         change = np.abs(up - down) + 2 * np.abs(up + down - 2 * middle)
-        change = np.where(np.isfinite(change), change, 0.0)
-        change = change / np.maximum(change.max(1, keepdims=True), 1e-30)
-        width = some.high - some.low
+        seen = values.max(1) - values.min(1) + 1e-30
+        excess = np.clip(some.greatest - some.least, 0, 1e29) - seen
+        loose = np.where(moves.any(1), np.clip(excess / (excess + seen), 0, 1), 0)[:, None]
         # A coordinate without influence at these points may have one between them.
-        width = width / width.max(1, keepdims=True)
-        return np.argmax(np.where(can, change + 0.1 * width, -1.0), axis=1)
+        width = 0.1 * _relative(some.high - some.low)
+        score = (1 - loose) * _relative(change) + loose * _relative(moves) + width
+        return np.argmax(np.where(can, score, -1.0), axis=1)
 
     def confirm(self) -> None:
         """Find out which failing points of open boxes fail for certain."""
@@ -276,3 +284,8 @@ class _Work:
             f"{self.contradicted} boxes have a simulation outside of their bounds, and stay "
             "undecided: this is a mistake of verifai_jax, please report it",
         )
+
+
+def _relative(numbers: Float[np.ndarray, "n dim"]) -> Float[np.ndarray, "n dim"]:
+    """Return numbers as shares of the greatest in their row."""
+    return numbers / np.maximum(numbers.max(1, keepdims=True), 1e-300)

@@ -45,9 +45,7 @@ class Boxes:
     samples: Int[np.ndarray, " n"]
 
     @classmethod
-    def between(
-        cls, low: Float[np.ndarray, "n dim"], high: Float[np.ndarray, "n dim"]
-    ) -> "Boxes":
+    def between(cls, low: Float[np.ndarray, "n dim"], high: Float[np.ndarray, "n dim"]) -> "Boxes":
         """Return open boxes."""
         n, infinite = len(low), np.full(len(low), np.inf)
         return cls(
@@ -100,7 +98,7 @@ class Boxes:
     @property
     def has_witness(self) -> Bool[np.ndarray, " n"]:
         """Whether a point of the box fails as simulated."""
-        return np.isfinite(self.witness).all(axis=1) if self.low.shape[1] else self.confirmed
+        return np.asarray(~np.isnan(self.witness).any(axis=1))
 
     def splittable(self, enclosure: Enclosure) -> Bool[np.ndarray, "n dim"]:
         """Return which coordinates of each box can be split."""
@@ -125,8 +123,9 @@ class Boxes:
                 own = coordinate == j
                 first, last = (np.searchsorted(edges, end[own]) for end in (low, high))
                 middle[own] = edges[(first + last) // 2]
-        left, right = Boxes.between(self.low, self.high.copy()), Boxes.between(
-            self.low.copy(), self.high
+        left, right = (
+            Boxes.between(self.low, self.high.copy()),
+            Boxes.between(self.low.copy(), self.high),
         )
         left.high[rows, coordinate] = right.low[rows, coordinate] = middle
         known = self.has_witness

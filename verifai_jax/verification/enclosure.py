@@ -22,7 +22,7 @@ from verifai_jax.core.fingerprint import without_unused
 from verifai_jax.core.precision import in_precision
 from verifai_jax.evaluation.verdicts import boolean_semantics, trace_verdict
 from verifai_jax.problem.problem import Problem
-from verifai_jax.sets import Form, Interpreter, MissingRule, Whole
+from verifai_jax.sets import Form, Interpreter, Whole
 from verifai_jax.sets.interpreter import Value, as_form, as_whole, constant
 from verifai_jax.systems.ode import sin_cos
 
@@ -40,6 +40,7 @@ class Bounds(NamedTuple):
     - `low`, `high`: of the least robustness over the formulas; infinite where nothing is known.
     - `holds`: whether no point of the box breaks a formula.
     - `inside`, `outside`: whether the constraint accepts all points, or none.
+    - `moves`: how far each coordinate moves the signals of the formulas, added up.
     """
 
     low: Float[np.ndarray, " n"]
@@ -47,6 +48,7 @@ class Bounds(NamedTuple):
     holds: Bool[np.ndarray, " n"]
     inside: Bool[np.ndarray, " n"]
     outside: Bool[np.ndarray, " n"]
+    moves: Float[np.ndarray, "n dim"]
 
 
 class Enclosure:
@@ -67,9 +69,11 @@ class Enclosure:
             key = jax.random.key(0)
             where = space.where
 
-            def verdict(features: PyTree) -> tuple[Array, Array]:
+            def verdict(features: PyTree) -> tuple[Array, Array, list[Array]]:
                 accepted = jnp.array(True) if where is None else jnp.asarray(where(features))
-                return trace_verdict(problem, problem.system(features, key))[0], accepted
+                trace = problem.system(features, key)
+                signals = [jnp.asarray(trace.signals[name]) for name in problem.monitored]
+                return trace_verdict(problem, trace)[0], accepted, signals
 
             def truth(features: PyTree) -> Array:
                 return boolean_semantics(problem, problem.system(features, key))
@@ -78,12 +82,15 @@ class Enclosure:
             self._truth = _program(truth, form)
             self._known = _known_functions(precision)
             self._values = jax.jit(jax.vmap(space.unflatten))
-            self._parts = [
-                None if domain.monotone else _program(
-                    domain.from_unit, jax.ShapeDtypeStruct((domain.size,), precision)
-                )
-                for _, domain in space.root.fields
-            ]  # fmt: skip
+            # Name by name in the order of the leaves: which coordinates, and the program of domains
+            # whose numbers are no monotone functions of one coordinate each.
+            self._fields, start = {}, 0
+            for name, domain in space.root.fields:
+                unit = jax.ShapeDtypeStruct((domain.size,), precision)
+                part = None if domain.monotone else _program(domain.from_unit, unit)
+                self._fields[name] = slice(start, start + domain.size), part
+                start += domain.size
+            self._forms = {name: jax.tree.leaves(form[name]) for name in sorted(form)}
         self._edges = [
             None if not count else np.cumsum([0.0, *(weights or (1 / count,) * count)])
             for count, weights in zip(space.levels, space.weights, strict=True)
@@ -121,15 +128,15 @@ class Enclosure:
 
         The last is whether the map of its domain to its ends is exact.
         """
-        probes = np.concatenate([np.zeros((1, self.dim)), np.eye(self.dim),
-                                 np.full((1, self.dim), 0.25), np.full((1, self.dim), 0.75)])  # fmt: skip
+        levels = [np.full((1, self.dim), level) for level in (0.0, 0.25, 0.75)]
+        probes = np.concatenate([levels[0], np.eye(self.dim), *levels[1:]])
         leaves = self._features(self.ends(probes, probes)[0] if self.dim else probes)
         symbols = [(leaf[1:-2] != leaf[0]).astype(float) for leaf in leaves]
         scale = [np.maximum(np.abs(leaf[-2]), np.abs(leaf[-1])) for leaf in leaves]
-        exact: list[bool] = []
-        form = self.problem.space.feature_form
-        for name, domain in sorted(self.problem.space.root.fields):
-            exact += [domain.uniform] * len(jax.tree.leaves(form[name]))
+        exact = [
+            self.problem.space.domains[name].uniform
+            for name, forms in self._forms.items() for _ in forms
+        ]  # fmt: skip
         return symbols, scale, exact
 
     def shares(self, points: Corners) -> Corners:
@@ -144,7 +151,10 @@ class Enclosure:
             for j in np.flatnonzero(flat.any(1)):
                 if self._edges[j] is None:
                     at = int(np.argmax(flat[j]))
-                    value, (low, high) = leaf.reshape(len(leaf), -1)[:, at], end.reshape(2, -1)[:, at]
+                    value, (low, high) = (
+                        leaf.reshape(len(leaf), -1)[:, at],
+                        end.reshape(2, -1)[:, at],
+                    )
                     shares[:, j] = (value - low) / (high - low)
         return shares
 
@@ -170,7 +180,7 @@ class Enclosure:
 
     def _bounds(self, leaves: Sequence[Value], count: int) -> Bounds:
         with np.errstate(all="ignore"):
-            rho, accepted = self._evaluated(self._verdict, leaves, count)
+            rho, accepted, *signals = self._evaluated(self._verdict, leaves, count)
             ends = as_form(rho).bounds()
             low, high = (np.broadcast_to(end, (count, end.shape[1])) for end in ends)
             truth = np.broadcast_to(as_whole(accepted).low, (count,)) > 0
@@ -182,39 +192,36 @@ class Enclosure:
                 (kept,) = self._evaluated(self._truth, leaves, count)
                 true = np.broadcast_to(as_whole(kept).low, (count, low.shape[1])) > 0
                 holds = holds | (open_ones & np.all((low > 0) | true, axis=1))
-        return Bounds(least, high.min(1), holds, truth, outside)
+            moves = np.zeros((count, self.dim))
+            for form in signals:
+                if isinstance(form, Form) and form.slopes is not None:
+                    slopes = np.abs(form.slopes[: self.dim]).reshape(self.dim, -1, form.slopes[0, 0].size)
+                    moves += slopes.max(2).T / max(np.median(slopes.max((0, 2))), 1e-300)
+        return Bounds(least, high.min(1), holds, truth, outside, moves)
 
     def _evaluated(self, program: Any, leaves: Sequence[Value], count: int) -> list[Value]:
         interpreter = Interpreter(count, self.dim, self._known)
         with in_precision(self.precision):
-            return interpreter.closed(program, leaves)
+            return interpreter(program, leaves)
 
     def _leaves(self, low: Corners, high: Corners) -> list[Value]:
         """Return the features of boxes as sets, in the order of the leaves of their tree."""
         first, last = self.ends(low, high)
         begins, ends = self._features(first), self._features(last)
-        sets: dict[str, list[Value]] = {}
-        form = self.problem.space.feature_form_in(self.precision)
-        names = [name for name, _ in self.problem.space.root.fields]
-        order = {name: jax.tree.leaves(form[name]) for name in sorted(names)}
-        at = {}
-        for name in sorted(names):
-            at[name] = sum(len(order[other]) for other in at)
-        start = 0
-        for (name, domain), part in zip(self.problem.space.root.fields, self._parts, strict=True):
-            span = slice(start, start + domain.size)
-            start += domain.size
+        sets: list[Value] = []
+        for name, forms in self._forms.items():
+            span, part = self._fields[name]
             if part is None:
-                sets[name] = [
-                    self._leaf(at[name] + i, each.dtype, begins, ends, low, high)
-                    for i, each in enumerate(order[name])
+                count = len(sets)
+                sets += [
+                    self._leaf(count + i, each.dtype, begins, ends, low, high)
+                    for i, each in enumerate(forms)
                 ]
-            else:
-                symbols = np.eye(self.dim)[:, span]
-                unit = Form.leaf(first[:, span], last[:, span], symbols, np.dtype(self.precision))
-                with np.errstate(all="ignore"):
-                    sets[name] = self._evaluated(part, [unit], len(low))
-        return [leaf for name in sorted(names) for leaf in sets[name]]
+                continue
+            symbols = np.eye(self.dim)[:, span]
+            unit = Form.leaf(first[:, span], last[:, span], symbols, np.dtype(self.precision))
+            sets += self._evaluated(part, [unit], len(low))
+        return sets
 
     def _leaf(
         self, i: int, dtype: np.dtype, begins: Sequence[np.ndarray], ends: Sequence[np.ndarray],
@@ -238,6 +245,7 @@ class Enclosure:
 
 def _rows(value: Value, block: slice) -> Value:
     """Return the sets of some boxes."""
+
     def cut(array: np.ndarray, lead: int) -> np.ndarray:
         axis = lead - 1
         if array.shape[axis] == 1:
@@ -263,9 +271,7 @@ def _known_functions(precision: str) -> dict[str, Any]:
     step = jax.make_jaxpr(sin_cos)(number).jaxpr.eqns
     if len(step) != 1 or "call_jaxpr" not in step[0].params:
         return {}
-    sin, cos = (
-        jax.make_jaxpr(function)(number).jaxpr.eqns[0] for function in (jnp.sin, jnp.cos)
-    )
+    sin, cos = (jax.make_jaxpr(function)(number).jaxpr.eqns[0] for function in (jnp.sin, jnp.cos))
 
     def both(t: Interpreter, inputs: list[Value]) -> list[Value]:
         low, high = as_form(inputs[0]).bounds()
@@ -276,5 +282,3 @@ def _known_functions(precision: str) -> dict[str, Any]:
         return [t.step(each, inputs)[0] for each in (sin, cos)]
 
     return {str(step[0].params["call_jaxpr"]): both}
-
-

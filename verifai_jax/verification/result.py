@@ -17,11 +17,11 @@ from jaxtyping import Bool, Float
 
 from verifai_jax.core.figure import Drawn
 from verifai_jax.core.notebook import InNotebook, frame_html, picture_html
-from verifai_jax.core.text import counted, format_percent, format_seconds
+from verifai_jax.core.text import counted, format_percent
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.confidence_sequences import anytime_interval
 from verifai_jax.store.files import DamagedError, read_record, write_record
-from verifai_jax.verification.boxes import BROKEN, OPEN, OUTSIDE, PROVED, Boxes
+from verifai_jax.verification.boxes import BROKEN, OUTSIDE, PROVED, Boxes
 
 KIND = "verification"
 
@@ -140,29 +140,36 @@ class Verification(Drawn, InNotebook):
         return pd.DataFrame(rows).sort_values("mass", ascending=False, kind="stable")
 
     def __str__(self) -> str:
-        def share(part: Part) -> str:
-            return f"{format_percent(part.mass)} of the prior, {format_percent(part.volume)} of the volume"
+        def line(name: str, part: Part, text: str) -> str:
+            if not part.mass:
+                return f"  {name:<12} nothing"
+            mass, volume = map(format_percent, part)
+            return f"  {name:<12} {mass} of the prior, {volume} of the volume: {text}"
 
         low, high = self.probability
+        proved, broken, undecided = self.proved, self.broken, self.undecided
+        shares = [format_percent(part.mass) for part in (proved, broken, undecided)]
         sure = format_percent(self.confidence)
+        count = counted(int(self.boxes.samples.sum()), "sample")
         lines = [
-            f"{self.name}: {format_percent(self.proved.mass)} of the prior is proved, "
-            f"{format_percent(self.broken.mass)} broken, "
-            f"{format_percent(self.undecided.mass)} undecided",
-            f"  proved       {share(self.proved)}: no point of it fails",
-            f"  broken       {share(self.broken)}: boxes with a point that fails for certain; in "
-            f"{format_percent(self.throughout.mass)} of the prior every point does",
-            f"  undecided    {share(self.undecided)}: fails with at most "
-            f"{format_percent(self.failure_bound)} of it, at {sure} by "
-            f"{counted(int(self.boxes.samples.sum()), 'sample')}",
+            f"{self.name}: {shares[0]} of the prior is proved, {shares[1]} broken, {shares[2]} "
+            "undecided",
+            line("proved", proved, "no point of it fails"),
+            line(
+                "broken", broken, "boxes with a point that fails for certain; in "
+                f"{format_percent(self.throughout.mass)} of the prior every point does",
+            ),
+            line(
+                "undecided", undecided, f"at most {format_percent(self.failure_bound)} of it "
+                f"fails, at {sure} by {count}",
+            ),
             f"  failing      {format_percent(low)} of the prior at least, "
-            f"{format_percent(high)} at most at {sure}",
+            f"{format_percent(high)} at most{f' at {sure}' * (undecided.mass > 0)}",
             f"  boxes        {len(self.boxes):,} of {self.looked_at:,} that were looked at, "
-            f"{self.simulations:,} simulations, {format_seconds(round(self.seconds, 1))}; "
-            f"{self.stopped}",
+            f"{self.simulations:,} simulations in {self.seconds:z.1f} s, stopped: {self.stopped}",
             "  verified     the system in discrete time as it is simulated, in real arithmetic and "
             f"with the rounding of {self.precision}; no differential equation",
-        ]
+        ]  # fmt: skip
         return "\n".join([*lines, *(f"  note         {note}" for note in self.notes)])
 
     __repr__ = __str__
@@ -175,12 +182,8 @@ class Verification(Drawn, InNotebook):
 
         **Raises:** `ValueError` that says what differs.
         """
-        for what, then, now in (
-            ("name", self.name, problem.name),
-            ("features", dict(self.features), {n: repr(d) for n, d in problem.space.domains.items()}),
-            ("formulas", dict(self.formulas), {n: str(f) for n, f in problem.formulas.items()}),
-            ("precision", self.precision, precision),
-        ):
+        for what, now in {**described(problem), "precision": precision}.items():
+            then = getattr(self, what)
             if then != now:
                 raise ValueError(
                     f"verify cannot go on with the result of another problem: its {what} was "
@@ -192,17 +195,28 @@ class Verification(Drawn, InNotebook):
 
         **Arguments:**
 
-        - `path`: of the file.
+        - `path`: of the file, whose folder is made.
 
         **Returns:** the path.
+
+        **Raises:** `OSError` that names the file, for whatever the file system refuses.
         """
         plain = {name: value for name, value in vars(self).items()
                  if name in self.__dataclass_fields__}  # fmt: skip
         for name in ("shares", "upper_shares"):
             plain[name] = plain[name].tolist()
         arrays = {name: array.tolist() for name, array in asdict(self.boxes).items()}
-        write_record(Path(path), {"kind": KIND, **plain, "boxes": arrays})
+        write_record(Path(path), {"kind": KIND, **plain, "boxes": arrays}, locked=False)
         return Path(path)
+
+
+def described(problem: Problem) -> dict[str, Any]:
+    """Return what a result records of its problem."""
+    return {
+        "name": problem.name,
+        "features": {name: repr(domain) for name, domain in problem.space.domains.items()},
+        "formulas": {name: str(formula) for name, formula in problem.formulas.items()},
+    }
 
 
 def load_verification(path: str | Path) -> Verification:
@@ -227,5 +241,3 @@ def load_verification(path: str | Path) -> Verification:
     for name in ("columns", "notes"):
         record[name] = tuple(record[name])
     return Verification(**record)
-
-

@@ -32,6 +32,7 @@ from verifai_jax.analysis.data.samples import (
 )
 from verifai_jax.core.checks import check_count, check_positive
 from verifai_jax.core.figure import Drawn
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_features, format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
@@ -46,7 +47,7 @@ _STARTS = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Clusters(Drawn):
+class Clusters(Drawn, InNotebook):
     """A partition of `samples`.
 
     **Fields:** `assigned` `[n]`: cluster of each row looked at, 0 the largest, -1 noise; `method`;

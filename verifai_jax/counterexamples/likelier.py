@@ -1,9 +1,12 @@
-"""Likelier failures over discrete features, by changes of one and of two of them at a time.
+"""Likelier failures than those found so far, from samples around them and from other choices.
 
-    exchange_cells(candidates, rng)                     # goes on from the failures found so far
+    draw_around_elite(candidates, rng)                  # cross-entropy, with elites by likelihood
+    exchange_cells(candidates, rng)                     # discrete features, two at a time
 
-All single changes of a failure are simulated. Of pairs, those that make it likelier are tried in
-the order of the robustness that the single changes predict for both together, as if they added up.
+Samples lie around the likeliest failures, spread as these are, with the choices of one of them. Of
+discrete features, all single changes of a failure are simulated. Of pairs, those that make it
+likelier are tried in the order of the robustness that the single changes predict for both together,
+as if they added up.
 """
 
 import numpy as np
@@ -20,8 +23,48 @@ TRIED = 256
 """Pairs of changes at a time: a failure that is found among them ends the round."""
 SINGLES = 400
 """Single changes at most, of which pairs are made."""
+ELITE, MANY, SAMPLES = 24, 200, 96
+"""Likeliest failures whose spread is that of samples, few and many; samples of a round."""
+SIZES = (1.3, 0.5, 0.2, 0.07)
+"""Factors on that spread, in which a narrow valley of failures is followed too."""
+FRUITLESS = 4
+"""Rounds without a likelier failure after which no more are drawn."""
 CLOSER = 1e-9
 """Fall of the distance that counts."""
+
+
+def draw_around_elite(candidates: Candidates, rng: np.random.Generator) -> None:
+    """Sample around the likeliest failures, fit to the likeliest of all, and so on.
+
+    **Arguments:**
+
+    - `candidates`: simulates, and remembers what failed, within its limit.
+    - `rng`: of the samples.
+    """
+    nominal, fruitless = candidates.nominal, 0
+    free = nominal.cube.continuous
+    while candidates.left > 0 and fruitless < FRUITLESS:
+        pool = _likeliest(candidates, MANY)
+        best = float(nominal.distance(pool[:1])[0])
+        away = nominal.departure(pool)[:, free]
+        parents = np.minimum(rng.geometric(0.15, SAMPLES) - 1, len(pool) - 1)
+        # A random combination of departures has their covariance: of the likeliest failures, or of
+        # many, which know the directions in which failures go on.
+        moved = np.zeros((SAMPLES, nominal.space.dim))
+        for row, parent in enumerate(parents):
+            some = away[: rng.choice([ELITE, MANY])]
+            step = rng.standard_normal(len(some)) @ (some - some.mean(axis=0)) / len(some) ** 0.5
+            own = 0.2 * rng.standard_normal(len(free)) * some.std(axis=0)
+            middle = some.mean(axis=0) if rng.random() < 0.25 else away[parent]
+            moved[row, free] = middle + rng.choice(SIZES) * (step + own)
+        points = pool[parents].astype(np.float64)
+        points[:, free] = nominal.point_at(moved)[:, free]
+        points = nominal.settle(points)
+        # What is less likely than all of the elite can be no better, whether it fails or not.
+        nearer = nominal.distance(points) < nominal.distance(pool[-1:])
+        candidates(points[nearer] if nearer.any() else points)
+        after = float(nominal.distance(_likeliest(candidates, 1))[0])
+        fruitless = 0 if after < (1 - 1e-3) * best else fruitless + 1
 
 
 def exchange_cells(candidates: Candidates, rng: np.random.Generator) -> None:
@@ -34,17 +77,17 @@ def exchange_cells(candidates: Candidates, rng: np.random.Generator) -> None:
     """
     done: set[bytes] = set()
     while candidates.left > 0:
-        parents = [u for u in _likeliest(candidates) if u.tobytes() not in done]
+        parents = [u for u in _likeliest(candidates, PARENTS) if u.tobytes() not in done]
         if not parents:
             return
         done.add(parents[0].tobytes())
         _improve(candidates, parents[0], rng)
 
 
-def _likeliest(candidates: Candidates) -> Points:
+def _likeliest(candidates: Candidates, count: int) -> Points:
     failures = candidates.points[candidates.failing]
     order = np.argsort(candidates.nominal.distance(failures), kind="stable")
-    return failures[order[:PARENTS]]
+    return failures[order[:count]]
 
 
 def _improve(candidates: Candidates, u: Point, rng: np.random.Generator) -> None:
