@@ -241,7 +241,7 @@ def steps() -> None:
             with jax.enable_x64(True):
                 last: Any = system({}, jax.random.key(0)).signals["x"]
                 finer: Any = system.refined(2)({}, jax.random.key(0)).signals["x"]
-            errors.append([abs(float(each[-1, 0]) - math.exp(-1)) for each in (last, finer)])
+            errors.append([abs(float(each[-1]) - math.exp(-1)) for each in (last, finer)])
         assert abs(math.log2(errors[0][0] / errors[1][0]) - order) < 0.3, (method, errors)
         assert math.isclose(errors[0][1], errors[1][0], rel_tol=1e-6), (method, errors)
 
