@@ -32,7 +32,7 @@ LAYERS = (
     {"hardening"},
     {"plotting"},
     {"reports"},
-    {"traceability"},
+    {"traceability", "qualification"},
     {"cli", "testing"},
 )
 """Rooms from the ground up: each may import itself and the layers below its own."""

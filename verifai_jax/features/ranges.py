@@ -31,7 +31,7 @@ class FeatureRanges:
     **Arguments:**
 
     - `space`: the feature space.
-    - `precision`: of features, `"float32"` or `"float64"`.
+    - `precision`: the precision of features, `"float32"` or `"float64"`.
     """
 
     def __init__(self, space: FeatureSpace, precision: str) -> None:

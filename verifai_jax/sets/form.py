@@ -64,7 +64,7 @@ class Form:
     - `slopes`: `[symbols, boxes, *shape]`; None for a set that depends on no symbol.
     - `size`: a bound of the absolute value.
     - `low`, `high`: an interval of its own; None without one.
-    - `frame`: of the symbols that are not features; None without them.
+    - `frame`: the frame of the symbols that are not features; None without them.
     - `dtype`: the type in which the simulation computes it.
     """
 

@@ -59,9 +59,9 @@ def verify(
     - `budget`: seconds, about; 60 if `boxes` is left out too. One may stop at any time with Ctrl-C.
     - `boxes`: number of boxes to look at, at most.
     - `samples`: simulations from the prior of what stays undecided, which bound how often it fails.
-    - `confidence`: of that bound, which holds whenever one stops.
-    - `seed`: of the samples.
-    - `precision`: of the simulations that are verified, `"float32"` or `"float64"`.
+    - `confidence`: the confidence of that bound, which holds whenever one stops.
+    - `seed`: the seed of the samples.
+    - `precision`: the precision of the simulations that are verified, `"float32"` or `"float64"`.
     - `resume`: an earlier result of the same problem, or its file, to go on with.
     - `progress`: as in `falsify`.
 

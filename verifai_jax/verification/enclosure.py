@@ -57,7 +57,7 @@ class Enclosure:
     **Arguments:**
 
     - `problem`: a checked one.
-    - `precision`: of simulations, `"float32"` or `"float64"`.
+    - `precision`: the precision of simulations, `"float32"` or `"float64"`.
     """
 
     def __init__(self, problem: Problem, precision: str) -> None:
