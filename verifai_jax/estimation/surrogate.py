@@ -119,11 +119,10 @@ class Surrogate:
         self.scale = max(float(y.std()), 1e-6)
         size = max(128, power_of_two(len(z)))
         pad = size - len(z)
-        data: Any = TrainingData(  # pyright: ignore
-            np.pad(_boxed(z), ((0, pad), (0, 0))),
-            np.pad(y / self.scale, (0, pad)).astype(np.float32),
-            np.arange(size) < len(z),
-        )
+        x: Any = np.pad(_boxed(z), ((0, pad), (0, 0)))
+        targets: Any = np.pad(y / self.scale, (0, pad)).astype(np.float32)
+        mask: Any = np.arange(size) < len(z)
+        data = TrainingData(x, targets, mask)
         self.hyper, self.posterior = _fitted(self.process, self.hyper, data)
 
     def predict(

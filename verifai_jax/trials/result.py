@@ -46,7 +46,7 @@ class RealTrials(InNotebook):
     @property
     def simulated(self) -> Rate:
         """The failure rate of the simulation alone."""
-        predicted = self.background["predicted"]
+        predicted = self.background["predicted"].to_numpy(bool)
         return clopper_pearson(int(predicted.sum()), len(predicted), self.rate.confidence)
 
     def predictions(self, predicted: bool) -> Rate | None:
@@ -63,8 +63,13 @@ class RealTrials(InNotebook):
     @property
     def wrong(self) -> "pd.DataFrame":
         """The trials whose verdict is not the predicted one."""
-        known = self.table[[verdict is not None for verdict in self.table["failed"]]]
+        known = self._known
         return known[known["failed"].astype(bool) != known["predicted"]]
+
+    @property
+    def _known(self) -> Any:
+        """The trials with a verdict."""
+        return self.table[[verdict is not None for verdict in self.table["failed"]]]
 
     def rules(self, **options: Any) -> "Rules":
         """Describe by a few boxes of the features where the simulation is wrong; see `vj.rules`.
@@ -76,7 +81,7 @@ class RealTrials(InNotebook):
         **Raises:** `ValueError` where all predictions are right, or all wrong.
         """
         columns = list(self.problem.space.columns)
-        known = self.table[[verdict is not None for verdict in self.table["failed"]]]
+        known = self._known
         rows = known[columns].assign(violated=known.index.isin(self.wrong.index))
         return find_rules(Samples.of(rows, "all", columns, self.problem.space), **options)
 
