@@ -82,7 +82,7 @@ MIN_FAILING = 10
 UNDERSTATED = 1.2
 """Factor on the logarithms of the interval: samples of a proposal that was fitted to a model of the
 failures seldom show the weights beyond its edges."""
-LOOKS, MIN_LOOK = 4, 40
+LOOKS, MIN_LOOK = 4, 60
 """Looks at the interval after the first one, where it decides when to stop, and samples of that."""
 
 
