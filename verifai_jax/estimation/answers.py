@@ -225,7 +225,18 @@ def splitting_answer(
     runs: list[SplittingRun],
     counts: Counts,
 ) -> Answer:
-    """Answer by the mean of these runs and of as many more as the budget allows."""
+    """Answer by the mean of these runs and of as many more as the budget allows.
+
+    Where the first level of each is that of the failures, it counts samples of the prior: these
+    are counted, since that is more precise, and certain where all of them fail.
+    """
+    if all(run.levels == [-np.inf] for run in runs):
+        counts = counts + monte_carlo.sample_prior(limit_state, rng, limit_state.left)
+        answer = monte_carlo_answer(counts, plan)
+        answer.notes.append(
+            "failures are so probable that splitting would have one level; its samples are counted"
+        )
+        return answer
     size = runs[0].first[0]
     cost = splitting_cost(runs[0], size)
     # Half as large, where that gives two instead of one.

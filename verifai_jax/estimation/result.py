@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from verifai_jax.core.figure import Drawn
 from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.text import format_percent, format_probability
 from verifai_jax.statistics.binomial import simulations_until
 
 if TYPE_CHECKING:
@@ -131,9 +131,10 @@ class Estimate(Drawn, InNotebook):
                 f"{self.upper_bound:z.2g} ({sure} bound)"
             ]
         else:
+            ends = (format_probability(end) for end in (self.low, self.high))
             lines = [
-                f"{self.name}: fails with probability {self.probability:z.3g} "
-                f"({sure} interval {self.low:z.3g} to {self.high:z.3g}), by {METHODS[self.method]}"
+                f"{self.name}: fails with probability {format_probability(self.probability)} "
+                f"({sure} interval {' to '.join(ends)}), by {METHODS[self.method]}"
             ]
         without = f", {self.no_verdict:,} without a verdict" if self.no_verdict else ""
         lines.append(

@@ -14,7 +14,6 @@ reliability analysis, Probabilistic Engineering Mechanics 33 (2013), for the res
 """
 
 from functools import partial
-from typing import Any
 
 import jax
 import numpy as np

@@ -13,7 +13,7 @@ from jaxtyping import Array, Key
 from verifai_jax.core.figure import Drawn
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.notebook import InNotebook, picture_html
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.text import format_percent, format_probability
 from verifai_jax.counterexamples import explain, shrink
 from verifai_jax.counterexamples._explain import Explained
 from verifai_jax.counterexamples.shrunk import Shrunk
@@ -224,8 +224,9 @@ class Modes(Drawn, InNotebook):
             ]
         else:
             lines = [
-                f"{self.name}: fails with probability {self.probability:z.3g} ({sure} interval "
-                f"{self.low:z.3g} to {self.high:z.3g}), in {len(self.modes)} "
+                f"{self.name}: fails with probability {format_probability(self.probability)} "
+                f"({sure} interval {format_probability(self.low)} to "
+                f"{format_probability(self.high)}), in {len(self.modes)} "
                 f"mode{'s' if len(self.modes) != 1 else ''}"
             ]
         if self.changed:

@@ -133,8 +133,9 @@ def falsify(
       the shape of the trace.
     - `objective`: what the search makes better: `"robustness"`, how badly the property breaks, or
       `"likelihood"`, how probable a failure is under the features' distributions
-      (`search.Likeliest`). `vj.shrink(run, by="likelihood")` goes on from there to the likeliest
-      failure, and `run.improbability()` says how likely each is.
+      (`search.Likeliest`, around `cross_entropy` where no search is named). `vj.shrink(run,
+      by="likelihood")` goes on to the likeliest failure, and `run.improbability()` says how likely
+      each is.
     - `first`: features that are simulated before the search proposes any, and told to it where it
       learns: as in `simulate`. They count in the budget, and the run then has no failure rate.
     - `callbacks`: functions called after each round with the number of simulations and a dictionary
@@ -173,7 +174,8 @@ def falsify(
     check_engine(engine)
     asking, search = without_suggestions(search)
     default = search == AUTO
-    search = check_search(problem, "portfolio" if default else search)
+    usual = "cross_entropy" if objective == "likelihood" else "portfolio"
+    search = check_search(problem, usual if default else search)
     search = with_objective(search, objective, bool(diverse))
     check_objective(problem, search)
     check_rule(search, stop_when)

@@ -62,9 +62,9 @@ def real_trials(
     - `trials`: the path of a CSV or Parquet file, or a data frame: a column for each feature as in
       the table of a run, and `failed` (yes or no; empty where a trial may have failed), or
       `recording` with a file of signals for each trial, which the formulas judge.
-    - `simulations`: of the prior, which say how often a failure is predicted.
+    - `simulations`: the simulations of the prior, which say how often a failure is predicted.
     - `confidence`: probability with which the interval is to hold.
-    - `seed`: of the simulations.
+    - `seed`: the seed of the simulations.
     - `allocated`: the numbers of trials that are predicted to fail and not to fail were chosen
       beforehand, as `next_trials` does; without that trials are samples of the prior.
     - `at_any_time`: verdicts decided which trials were made, or when to stop.
@@ -98,7 +98,7 @@ def real_trials(
     sides = [~predicted, predicted]
     rate = stratified_rate(
         *((int(np.sum(failed & side)), int(np.sum(side))) for side in sides),
-        share=(int(background["predicted"].sum()), len(background)),
+        share=(int(np.sum(background["predicted"].to_numpy(bool))), len(background)),
         confidence=confidence,
         undecided=tuple(int(np.sum(open_ones & side)) for side in sides),  # pyright: ignore
         allocated=allocated,

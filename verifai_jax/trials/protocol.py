@@ -53,11 +53,11 @@ def trial_protocol(
     **Arguments:**
 
     - `problem`: its features are drawn from the prior; its formulas are the property.
-    - `path`: of the HTML file.
+    - `path`: the path of the HTML file.
     - `count`: number of trials, or of pairs.
     - `policies`: names of two policies to compare.
     - `trials`: features of the trials instead, such as those of `next_trials`.
-    - `seed`: of the features, the order and the codes.
+    - `seed`: the seed of the features, the order and the codes.
 
     **Returns:** the table.
 
@@ -80,7 +80,7 @@ def trial_protocol(
     if policies:
         order = np.concatenate([rng.permutation(2) for _ in range(len(table))])
         pairs = np.repeat(np.arange(len(table)), 2)
-        table = table.iloc[pairs].reset_index(drop=True)
+        table = table.take(pairs).reset_index(drop=True)
         table.insert(0, "policy", [key["code"][code] for code in order])
         table.insert(0, "pair", pairs + 1)
     table.insert(0, "trial", np.arange(1, len(table) + 1))

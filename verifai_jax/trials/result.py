@@ -32,7 +32,7 @@ class RealTrials(InNotebook):
       that is open), whether the simulation `predicted` that, and the simulated `robustness`.
     - `background`: features, `predicted` and `robustness` of the simulated samples of the prior.
     - `rate`: the failure rate in reality with its interval, from trials and simulations.
-    - `seed`: of the simulations.
+    - `seed`: the seed of the simulations.
     - `notes`: sentences on anything surprising.
     """
 
@@ -76,7 +76,7 @@ class RealTrials(InNotebook):
 
         **Arguments:**
 
-        - `options`: of `analysis.rules`.
+        - `options`: the options of `analysis.rules`.
 
         **Raises:** `ValueError` where all predictions are right, or all wrong.
         """
@@ -96,7 +96,7 @@ class RealTrials(InNotebook):
         **Arguments:**
 
         - `count`: number of trials.
-        - `seed`: of the draw.
+        - `seed`: the seed of the draw.
 
         **Returns:** the features, `predicted` and the simulated `robustness` of each.
         """

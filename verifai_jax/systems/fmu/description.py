@@ -72,9 +72,9 @@ class Description:
     """The description of an FMU, read from its archive.
 
     - `file`: the FMU.
-    - `version`: of FMI, 2 or 3.
-    - `name`: of the model.
-    - `identifier`: of the binary for co-simulation.
+    - `version`: the version of FMI, 2 or 3.
+    - `name`: the name of the model.
+    - `identifier`: the identifier of the binary for co-simulation.
     - `token`: by which the binary knows its description.
     - `variables`: by name.
     """
