@@ -36,6 +36,7 @@ from verifai_jax.cli.falsify import falsify
 from verifai_jax.cli.fmea import fmea
 from verifai_jax.cli.fuzz import fuzz
 from verifai_jax.cli.going_on import WORDS
+from verifai_jax.cli.harden import harden
 from verifai_jax.cli.list import list_targets
 from verifai_jax.cli.merge import merge
 from verifai_jax.cli.modes import modes
@@ -53,6 +54,7 @@ COMMANDS = (
     falsify,
     merge,
     fuzz,
+    harden,
     list_targets,
     replay,
     analyze,
