@@ -55,7 +55,9 @@ def test_a_study_is_hardened(tmp_path, monkeypatch):
     assert (tmp_path / "runs" / "harden-study").is_dir()
     assert (ended.exit_code == 1) == (not found["verdict"].startswith("safe"))
     again = CliRunner().invoke(main, words)
-    assert json.loads(again.stdout)["table"] == found["table"]
+    for one, other in zip(json.loads(again.stdout)["table"], found["table"], strict=True):
+        # The second call takes everything from the folder.
+        assert {**one, "seconds": 0} == {**other, "seconds": 0}
     refused = CliRunner().invoke(main, ["harden", "spec.py:TASK"])
     assert refused.exit_code == 2
     assert "Study" in refused.output
