@@ -60,4 +60,4 @@ def test_a_study_is_hardened(tmp_path, monkeypatch):
         assert {**one, "seconds": 0} == {**other, "seconds": 0}
     refused = CliRunner().invoke(main, ["harden", "spec.py:TASK"])
     assert refused.exit_code == 2
-    assert "Study" in refused.output
+    assert "unknown study in spec.py 'TASK'" in refused.output

@@ -237,7 +237,8 @@ def print_run(
 
     **Arguments:**
 
-    - `options`: of the command, which the record does not hold and whoever resumes it gives again.
+    - `options`: the options of the command, which the record does not hold and whoever resumes it
+      gives again.
 
     **Raises:** `CommandError` where no simulation has a verdict.
     """

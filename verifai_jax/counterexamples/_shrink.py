@@ -85,7 +85,7 @@ def shrink(
       features take the place of nominal ones, and the distance is the number of standard deviations
       at which a normal distribution is as improbable.
     - `budget`: simulations at most; a gradient counts as one.
-    - `seed`: of the random candidates.
+    - `seed`: the seed of the random candidates.
     - `others`: whether other counterexamples of the run are looked at too.
     - `stay`: whether every real feature stays on the side of nominal on which the row has it, so
       that failures of several kinds are shrunk each by itself.
@@ -105,7 +105,8 @@ def shrink(
     check_count("budget", budget)
     at = _origin(problem, by, nominal)
     if row is None and isinstance(at, Likeliest) and len(failing := run.table.counterexamples):
-        row = int(run.improbability(failing)["log_density"].idxmax())
+        density = run.improbability(failing)["log_density"].to_numpy(float)
+        row = int(failing.index.to_numpy()[np.argmax(density)])
     number, first = select_row(run, row)
     about_key = note_on_key(problem, number)
     problem = fix_key(problem, run, number)
@@ -299,7 +300,7 @@ class _Search:
 
         - `first` `[m, d]`: points that are returned at any rate.
         - `alike`: whether only failures with as few departures as the least one count.
-        - `cosine`: of the angle between directions, at most.
+        - `cosine`: the cosine of the angle between directions, at most.
         """
         failures, nominal = self.failures(), self.candidates.nominal
         if self.by == "count" and alike:

@@ -31,7 +31,7 @@ class Nominal:
 
     **Fields:**
 
-    - `space`: of the features.
+    - `space`: the space of the features.
     - `u` `[d]`: the point.
     - `low` and `high` `[d]`: ends of the coordinates within which points may depart.
     """

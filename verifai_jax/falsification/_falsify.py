@@ -21,6 +21,7 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.precision import in_precision, reproducible_settings
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.evaluation.backends import resolved
+from verifai_jax.falsification import cheap as cheaply
 from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
 from verifai_jax.falsification.model_changes import continued_with
@@ -92,6 +93,7 @@ def falsify(
     executor: "Executor | None" = None,
     keep_going: bool = False,
     engine: str = "xla",
+    cheap: Problem | None = None,
 ) -> Run:
     """Search the feature space for inputs under which the system breaks its property.
 
@@ -116,8 +118,9 @@ def falsify(
       starts. Its rows are not copied.
     - `folder`: where rows are kept on disk as they come; must not hold another run.
     - `precision`: `"float32"` or `"float64"`, of simulations and verdicts.
-    - `backend`: of a system that has several (`"mjx"`, `"native"`); the faster one that the search
-      can use when left out, as measured here. Name it for the same table on every machine.
+    - `backend`: the backend of a system that has several (`"mjx"`, `"native"`); the faster one that
+      the search can use when left out, as measured here. Name it for the same table on every
+      machine.
     - `confirm`: replay what violates the property in double precision and, where the system has
       finer steps, at a half and a quarter of its step, and do not claim what no longer does: it
       stays in the table, as `unconfirmed`. At most 1024 rows are replayed, or one for 128
@@ -151,6 +154,9 @@ def falsify(
       to zero. `"auto"` takes it if the budget is worth the compilation, which the run records. What
       cannot be translated (other precisions, unusual operations) is simulated by XLA, and the notes
       say why.
+    - `cheap`: a cheap model of the same features. It is searched first, with 20 times the budget;
+      at most a quarter of the budget is then spent on what it found, the gravest first and no two
+      alike, from which the search goes on. Only `problem` decides what fails.
 
     Ctrl-C ends the run and returns what is finished. What is likely a mistake of the problem is in
     the run's `notes`, and above the progress bar.
@@ -174,6 +180,15 @@ def falsify(
     check_objective(problem, search)
     check_rule(search, stop_when)
     check_guide(problem, search)
+    if cheap is not None:
+        cheaply.check_same_features(problem, cheap)
+        if first is not None:
+            raise ValueError("give either first, or a cheap model that finds what comes first")
+        found = falsify(
+            cheap, budget=min(cheaply.TIMES * budget, cheaply.MAX_CHEAP), seed=seed, confirm=False,
+            precision=precision, progress=False,
+        )  # fmt: skip
+        first = cheaply.gravest_rows(found, budget)
     given = check_first(problem, first, stop_when, precision)
     callbacks = check_callbacks(callbacks)
     earlier = earlier_rows(warm_start, problem)

@@ -41,7 +41,7 @@ Source = Literal["search", "first", "suggested"]
 class Batch(NamedTuple):
     """The points of a round.
 
-    - `points`: of the unit cube, or rows of given features (`given_rows`).
+    - `points`: the points of the unit cube, or rows of given features (`given_rows`).
     - `source`: who gave them.
     - `cut`: whether the budget cut the round.
     - `verdicts`: if workers have simulated them already.
@@ -63,9 +63,9 @@ class Learning:
 
     **Arguments:**
 
-    - `problem`: of the run.
-    - `search`: of the run.
-    - `key`: of the search.
+    - `problem`: the problem of the run.
+    - `search`: the search of the run.
+    - `key`: the key of the search.
 
     `surrogate` models the traces for a search that wants it, `coverage_ids` counts what was
     covered.
@@ -147,8 +147,8 @@ class Learning:
 
         - `batch`: its points, of the unit cube.
         - `objective`: what the search minimises at each of them.
-        - `verdicts`: of its simulations.
-        - `coverage_ids`: of its simulations, for a search that wants them.
+        - `verdicts`: the verdicts of its simulations.
+        - `coverage_ids`: the coverage of its simulations, for a search that wants them.
         """
         outcomes = None
         if verdicts.guidance is not None:

@@ -1,4 +1,4 @@
-"""How improbable the coordinates of a point are, in standard deviations.
+"""Improbability of the coordinates of a point, in standard deviations.
 
     improbability = Improbability(space)
     improbability.square(points)                    # [n, d], twice the loss of log-density
@@ -45,7 +45,7 @@ class Improbability:
 
     **Arguments:**
 
-    - `space`: of the features.
+    - `space`: the space of the features.
 
     **Raises:** `NoDensityError` for a domain whose values have no density, such as an automaton.
     """

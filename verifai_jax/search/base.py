@@ -38,7 +38,7 @@ class Observations(NamedTuple):
     - `rho`: robustness; negative is a failure.
     - `valid`: False for padding and for simulations without a verdict: such a row must not
       influence the search, whatever its other entries are (NaN included).
-    - `gradient`: of the smooth robustness with respect to `u`.
+    - `gradient`: the gradient of the smooth robustness with respect to `u`.
     - `clauses`: values of the clauses to violate together, without unit, all negative in a failure;
       very low where there are fewer than `CLAUSES`.
     - `clause_gradients`: their gradients with respect to `u`; zero in rounds whose plan does not
@@ -77,7 +77,7 @@ class TraceOptions:
     **Arguments:**
 
     - `initial`: points of the prior before the model has a say.
-    - `share`: of the points that the model proposes; the others are those of the search.
+    - `share`: the share of the points that the model proposes; the others are those of the search.
     - `capacity`: maximum number of rows that the model knows, the best half and the last ones.
     - `starts`: descents for each proposal, the best one of which is simulated.
     - `steps`: steps of a descent.
@@ -187,7 +187,8 @@ class Plan(NamedTuple):
       that are not valid.
     - `differentiate`: whether to compute the gradients of the clauses too, which costs as much as
       another simulation or two.
-    - `temperature`: of the smooth robustness to differentiate, row by row, without unit.
+    - `temperature`: the temperature of the smooth robustness to differentiate, row by row, without
+      unit.
     """
 
     rows: Int[Array, ""]
