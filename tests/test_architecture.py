@@ -14,6 +14,7 @@ LAYERS = (
     {"features", "mtl", "systems", "search", "clusters", "native_code", "sets"},
     {"rl", "problem", "perception", "events", "scenes", "blocks"},
     {"evaluation", "policies", "faults"},
+    {"verification"},
     {"falsification"},
     {
         "comparison",
@@ -25,14 +26,13 @@ LAYERS = (
         "analysis",
         "compositional",
         "requirements",
-        "verification",
     },
     {"failure_modes", "failure_table", "error_budgets", "trials"},
     {"sweeps", "augmentation", "checking"},
     {"hardening"},
     {"plotting"},
     {"reports"},
-    {"traceability"},
+    {"traceability", "qualification"},
     {"cli", "testing"},
 )
 """Rooms from the ground up: each may import itself and the layers below its own."""

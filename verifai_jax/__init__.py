@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from verifai_jax import policies as policies
     from verifai_jax import rl as rl
     from verifai_jax import search as search
+    from verifai_jax.analysis import boundary as boundary
     from verifai_jax.augmentation import Augmentation as Augmentation
     from verifai_jax.augmentation import SupervisedTask as SupervisedTask
     from verifai_jax.augmentation import augment as augment
@@ -99,6 +100,7 @@ if TYPE_CHECKING:
     from verifai_jax.problem import Problem as Problem
     from verifai_jax.problem import ProblemError as ProblemError
     from verifai_jax.problem import Rulebook as Rulebook
+    from verifai_jax.qualification import qualify as qualify
     from verifai_jax.scenes import ProgramError as ProgramError
     from verifai_jax.scenes import ScenicProgram as ScenicProgram
     from verifai_jax.scenes import scenic as scenic
@@ -142,6 +144,7 @@ if TYPE_CHECKING:
     from verifai_jax.traceability import TraceMatrix as TraceMatrix
     from verifai_jax.traceability import trace_matrix as trace_matrix
     from verifai_jax.trials import RealTrials as RealTrials
+    from verifai_jax.trials import calibrate as calibrate
     from verifai_jax.trials import compare_trials as compare_trials
     from verifai_jax.trials import real_trials as real_trials
     from verifai_jax.trials import trial_protocol as trial_protocol

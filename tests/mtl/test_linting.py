@@ -32,6 +32,7 @@ def drive(seed):
         "glucose": 130 + 55 * np.sin(t / 3),
         "carbs": 40 * np.exp(-((t - 5) ** 2)),
         "temp": 40 + 2 * t,
+        "mass": np.full(t.shape, 1450.0),
         "p": np.stack([np.cos(t), np.sin(t)], axis=1) * (1 + 0.02 * t)[:, None],
     }
     return Trace(signals, dt=0.1)
@@ -66,6 +67,8 @@ PLANTED = [
     ("never near", "always glucose < 1800"),
     ("never near", "always temp < 373"),
     ("never near", "always norm(p) < 20"),
+    ("never near", "always speed < 120"),
+    ("never near", "always mass < 9000"),
     ("never holds", "always glucose < 10"),
     ("never holds", "eventually speed > 90"),
     ("never holds", "eventually mode == 5"),
@@ -80,6 +83,7 @@ PLANTED = [
     # Until where weak until is meant.
     ("until", "speed < 30 until mode == 3"),
     ("until", "dist > 2 until speed > 40"),
+    ("until", "always (speed < 30 until brake)"),
     # Units.
     ("units", "always speed < limit"),
     ("units", "always (carbs > 20 -> eventually[0, 5] glucose < 180)"),
@@ -90,6 +94,8 @@ PLANTED = [
     ("no effect", "always (speed < 30 & speed < 40)"),
     ("no effect", "dist > 2 until eventually brake"),
     ("no effect", "always (dist > 3 | dist > 5)"),
+    ("always false", "always (speed > 5 & eventually speed < 3)"),
+    ("always true", "eventually (speed > 3 | speed < 3 | speed == 3)"),
     ("always false", "always (speed > 20 & speed < 3)"),
     ("always false", "eventually (speed > 20 & speed < 3)"),
     ("always true", "always (speed > 3 | speed < 5)"),
@@ -144,7 +150,6 @@ SOUND = [
     "always (speed > 27 -> eventually[0, 2] (speed < 27))",
     "always (dist < 6 -> speed > 5)",
     "always (dist > 30 -> eventually[0, 6] dist < 30)",
-    "always (brake <-> brake & speed > 0)",
     "always (speed - 15 < 14)",
     "always (abs(speed - 15) <= 14)",
     "always (max(speed, 20) < 30)",
@@ -165,6 +170,7 @@ SOUND = [
     "always (!(speed > 28.5) & !(dist < 3))",
     "always (2 * speed < 60)",
     "always (temp > 70 -> speed < 29)",
+    "always mass < 2000",
 ]
 
 

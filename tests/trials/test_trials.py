@@ -160,3 +160,23 @@ class TestPolicies:
             vj.compare_trials(pairs, "a", "a")
         with pytest.raises(ValueError, match="two policies; got one"):
             vj.trial_protocol(PROBLEM, "x.html", policies=("one",))
+
+
+@pytest.mark.thorough
+class TestCalibration:
+    def test_the_wear_of_the_brakes_is_found(self, trials):
+        def worn(features, key):
+            return brake({**features, "brake": features["wear"] * features["brake"]}, key)
+
+        space = {**PROBLEM.space.domains, "wear": vj.Box(0.5, 1.5)}
+        problem = vj.Problem("worn", space, worn, "always gap > 0")
+        found = vj.calibrate(problem, trials, ["wear"], simulations=6000)
+        low, high = found.samples["wear"].quantile([0.025, 0.975])
+        assert low < 0.93 < high
+        assert high - low < 0.3
+        assert "unexplained  0 trials" in str(found)
+        assert isinstance(found.problem.space.domains["wear"], vj.Empirical)
+        with pytest.raises(ValueError, match="1,200 simulations for 60 trials"):
+            vj.calibrate(problem, trials, ["wear"], simulations=500)
+        with pytest.raises(ValueError, match="wore"):
+            vj.calibrate(problem, trials, ["wore"])

@@ -206,3 +206,36 @@ def test_a_branch_and_bound_never_proves_the_corner_away():
     around = np.all((found.boxes.low <= point) & (point <= found.boxes.high), axis=1)
     assert not np.any(around & (found.verdicts == "proved"))
     assert 0.9 < found.proved.mass < 1 - 0.5e-9
+
+
+@pytest.mark.thorough
+def test_sines_of_this_package_are_as_tight_as_those_of_jax():
+    def system(f, key):
+        sine, cosine = vj.sin_cos(20 * f["x"])
+        return vj.Trace({"y": sine + cosine * jnp.ones(2)}, dt=1.0)
+
+    problem = vj.Problem("angle", {"x": vj.Box(-1, 1)}, system, "always y <= 2")
+    low = np.linspace(0, 0.99, 100)[:, None]
+    bounds = Enclosure(problem, "float32")(low, low + 0.01)
+    angle = 20 * (2 * (low + 0.01 * np.linspace(0, 1, 50)) - 1)
+    rho = 2 - np.sin(angle) - np.cos(angle)
+    assert np.all(bounds.low <= rho.min(1) + 1e-6)
+    assert np.all(bounds.high >= rho.max(1) - 1e-6)
+    assert np.max(rho.min(1) - bounds.low) < 0.03
+
+
+@pytest.mark.thorough
+def test_what_may_not_be_finite_is_not_proved():
+    """A simulation without a verdict is no counterexample, and no proof either."""
+
+    def system(f, key):
+        x = jnp.exp(f["x"] * jnp.arange(4.0))
+        return vj.Trace({"x": x, "y": jnp.ones(4)}, dt=1.0)
+
+    problem = vj.Problem("growth", {"x": vj.Box(0, 40)}, system, "always (y > 0 & x > 0)")
+    found = vj.verify(problem, boxes=60, samples=64, progress=False)
+    limit = np.log(3.4e38) / 3 / 40
+    assert found.proved.mass == pytest.approx(limit, abs=0.01)
+    assert found.proved.mass <= limit
+    assert found.broken.mass == 0
+    assert found.probability[1] > 0.2

@@ -42,6 +42,7 @@ from verifai_jax.cli.merge import merge
 from verifai_jax.cli.modes import modes
 from verifai_jax.cli.monitor import monitor
 from verifai_jax.cli.new import new
+from verifai_jax.cli.qualify import qualify
 from verifai_jax.cli.repair import repair
 from verifai_jax.cli.replay import replay
 from verifai_jax.cli.report import report
@@ -78,6 +79,7 @@ COMMANDS = (
     compare,
     report,
     trace,
+    qualify,
     trials,
     new,
 )

@@ -22,7 +22,7 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.counterexamples.candidates import Candidates
 from verifai_jax.counterexamples.fixed_key import fix_key, note_on_key
-from verifai_jax.counterexamples.likelier import draw_around_elite, exchange_cells
+from verifai_jax.counterexamples.likelier import draw_around_elite, exchange_cells, shift_in_time
 from verifai_jax.counterexamples.minimize_count import grow, minimize_count, revert_features
 from verifai_jax.counterexamples.minimize_distance import minimize_distance
 from verifai_jax.counterexamples.nominal import Likeliest, Nominal
@@ -105,7 +105,8 @@ def shrink(
     check_count("budget", budget)
     at = _origin(problem, by, nominal)
     if row is None and isinstance(at, Likeliest) and len(failing := run.table.counterexamples):
-        row = int(run.improbability(failing)["log_density"].idxmax())
+        density = run.improbability(failing)["log_density"].to_numpy(float)
+        row = int(failing.index.to_numpy()[np.argmax(density)])
     number, first = select_row(run, row)
     about_key = note_on_key(problem, number)
     problem = fix_key(problem, run, number)
@@ -240,16 +241,28 @@ class _Search:
             revert_features(candidates, failures[0])
         if self.by == "likelihood":
             if len(nominal.cube.continuous):
+                # Slopes lead farther than samples do.
+                half, spent = candidates.limit, candidates.simulations
+                if candidates.differentiable:
+                    candidates.limit = min(half, spent + candidates.budget // 8)
                 draw_around_elite(candidates, self.rng)
+                candidates.limit = half
             if len(nominal.cube.discrete):
                 exchange_cells(candidates, self.rng)
         self.note()
-        self.follow(self.starts())
+        likely = self.by == "likelihood"
+        self.follow(self.starts(), rounds=15 if likely else 60)
         candidates.limit = candidates.budget - 2 * nominal.space.dim
-        self.follow(self.starts()[:1])
+        self.follow(self.starts()[:1], rounds=15 if likely else 60)
         # A boundary of many pieces has a nearest point on each: some of those next to this one.
         search_alongside(candidates, self.failures()[0], self.rng)
-        self.follow(self.starts(self.failures()[:1], cosine=0.97)[1:], rounds=10)
+        for _ in range(8 if likely else 1):
+            before = self.failures()[0]
+            if likely:
+                shift_in_time(candidates, before)
+            self.follow(self.starts(self.failures()[:1], cosine=0.97)[1:], rounds=10)
+            if np.array_equal(self.failures()[0], before):
+                break
         for _ in range(2):
             if candidates.left < candidates.budget // 20:
                 break

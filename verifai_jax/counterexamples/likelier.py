@@ -1,6 +1,7 @@
 """Likelier failures than those found so far, from samples around them and from other choices.
 
     draw_around_elite(candidates, rng)                  # cross-entropy, with elites by likelihood
+    shift_in_time(candidates, u)
     exchange_cells(candidates, rng)                     # discrete features, two at a time
 
 Samples lie around the likeliest failures, spread as these are, with the choices of one of them. Of
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.counterexamples.candidates import Candidates
+from verifai_jax.features import Array, Signal
 
 Point = Float[np.ndarray, " d"]
 Points = Float[np.ndarray, "n d"]
@@ -27,6 +29,8 @@ ELITE, MANY, SAMPLES = 24, 200, 96
 """Likeliest failures whose spread is that of samples, few and many; samples of a round."""
 SIZES = (1.3, 0.5, 0.2, 0.07)
 """Factors on that spread, in which a narrow valley of failures is followed too."""
+SHIFTS = (-8, -4, -2, -1, 1, 2, 4, 8)
+"""Items by which a failure is moved in time."""
 FRUITLESS = 4
 """Rounds without a likelier failure after which no more are drawn."""
 CLOSER = 1e-9
@@ -39,7 +43,7 @@ def draw_around_elite(candidates: Candidates, rng: np.random.Generator) -> None:
     **Arguments:**
 
     - `candidates`: simulates, and remembers what failed, within its limit.
-    - `rng`: of the samples.
+    - `rng`: the rng of the samples.
     """
     nominal, fruitless = candidates.nominal, 0
     free = nominal.cube.continuous
@@ -67,13 +71,37 @@ def draw_around_elite(candidates: Candidates, rng: np.random.Generator) -> None:
         fruitless = 0 if after < (1 - 1e-3) * best else fruitless + 1
 
 
+def shift_in_time(candidates: Candidates, u: Point) -> None:
+    """Try a failure earlier and later: signals and arrays moved by some of their items.
+
+    What breaks at another instant is another piece of the boundary, to which no slope leads.
+    """
+    nominal = candidates.nominal
+    series = []
+    for name, own in nominal.groups:
+        domain = nominal.space.domains[name]
+        if isinstance(domain, Array | Signal) and own.size > domain.domain.size:
+            series.append(own.reshape(-1, domain.domain.size))
+    points = []
+    for some in [series, *([one] for one in series)] if series else []:
+        for shift in SHIFTS:
+            point = u.copy()
+            for own in some:
+                later, count = np.arange(len(own)) - shift, len(own)
+                inside = (later >= 0) & (later < count)
+                point[own] = np.where(inside[:, None], u[own[later % count]], nominal.u[own])
+            points.append(point)
+    if points:
+        candidates(np.array(points))
+
+
 def exchange_cells(candidates: Candidates, rng: np.random.Generator) -> None:
     """Change cells of the likeliest failures until no change of two makes any likelier.
 
     **Arguments:**
 
     - `candidates`: simulates, and remembers what failed, within its limit.
-    - `rng`: of the order of changes that are predicted alike.
+    - `rng`: the rng of the order of changes that are predicted alike.
     """
     done: set[bytes] = set()
     while candidates.left > 0:

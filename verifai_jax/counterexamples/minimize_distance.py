@@ -155,8 +155,8 @@ def boundary_steps(
 ) -> Departures:
     """Return departures at, and on the way to, the nearest points of the linearised boundary.
 
-    - `costs`: of a coordinate that departs by next to nothing anywhere, over its whole range; 0 for
-      no more than that. Without it a linear model goes on to an end of the range.
+    - `costs`: the costs of a coordinate that departs by next to nothing anywhere, over its whole
+      range; 0 for no more than that. Without it a linear model goes on to an end of the range.
     """
     nominal = candidates.nominal
     ends = np.zeros((2, len(track.u)))

@@ -20,6 +20,7 @@ from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import SimulationProgress, shows_progress
 from verifai_jax.estimation.answers import (
     Answer,
+    Cheap,
     Plan,
     bound_from_pilot,
     chains_for,
@@ -37,8 +38,9 @@ from verifai_jax.estimation.monte_carlo import AT_ONCE
 from verifai_jax.estimation.moved_priors import notice_own_chance
 from verifai_jax.estimation.normal_space import LimitState
 from verifai_jax.estimation.result import METHODS, WEIGHTED, Estimate
-from verifai_jax.estimation.surrogate import estimate_by_surrogate
+from verifai_jax.estimation.surrogate import FITTING, estimate_by_surrogate
 from verifai_jax.evaluation.backends import resolved
+from verifai_jax.falsification.cheap import check_same_features
 from verifai_jax.falsification.validation import SLOW, can_be_slow
 from verifai_jax.problem.dependence import depends_on_key, without_derivative
 from verifai_jax.problem.problem import Problem
@@ -50,6 +52,11 @@ if TYPE_CHECKING:
 GRADIENTS_FROM = 3
 """Continuous coordinates from which the searches for failing regions take gradients."""
 
+CHEAP_BATCH = 4096
+"""Simulations of a cheap model at once."""
+WITHIN = 1.5
+"""Factor from the estimate to the ends of the interval, at which an estimate with a cheap model
+ends."""
 SPEEDS = ("auto", "slow", "fast")
 """Values of `simulations_are`."""
 
@@ -72,6 +79,7 @@ def estimate(
     executor: "Executor | None" = None,
     simulations_are: Literal["auto", "slow", "fast"] = "auto",
     within: float | None = None,
+    cheap: Problem | None = None,
 ) -> Estimate:
     """Estimate the probability, under the prior of the features, that a simulation fails.
 
@@ -101,6 +109,9 @@ def estimate(
       takes half a second or longer, if the budget is 200 or more.
     - `within`: with slow simulations, the factor from the estimate to the ends of the interval at
       which they may end before the budget, such as 1.5.
+    - `cheap`: a cheap model of the same features, which says where failures may be. It is simulated
+      some 100 000 times; every claim rests on simulations of `problem` alone. Simulations are
+      `"slow"` then, and end at `within=1.5` where nothing else is said.
 
     **Returns:** the estimate with its interval and a guaranteed bound. Ctrl-C gives the estimate
     from the finished simulations. A simulation without a verdict (not finite, raised, out of time)
@@ -123,6 +134,8 @@ def estimate(
         raise unknown_name("simulations_are", simulations_are, SPEEDS)
     if within is not None and not within > 1:
         raise ValueError(f"within must be a factor above 1, such as 1.5; got {within}")
+    if cheap is not None:
+        check_same_features(problem, cheap)
     in_precision(precision)
     problem.space.check_where()
     share = SHARE_OF_REPLICATE if method == "splitting" else SHARE_OF_LEVEL
@@ -148,14 +161,16 @@ def estimate(
             draws=depends_on_key(choice.problem),
             one_by_one=choice.problem.black_box and executor is None,
         )
+        slow = simulations_are == "slow" or cheap is not None
         plan = Plan(confidence, chains, simulated.clamped, within)
-        slow = simulations_are == "slow"
+        if cheap is not None:
+            plan = replace(
+                plan, within=within or WITHIN, cheap=_robustness_of(cheap, precision, seed)
+            )
         if choice.problem.black_box:
-            before = time.perf_counter()
             notice_own_chance(limit_state, np.random.default_rng((seed, 1)))
-            each = (time.perf_counter() - before) / max(limit_state.simulations, 1)
             if simulations_are == "auto" and can_be_slow(choice.problem, executor):
-                slow = each >= SLOW
+                slow = slow or limit_state.seconds >= SLOW
         if slow and method is None and problem.space.dim:
             method = "surrogate"
         try:
@@ -246,6 +261,13 @@ def _result(
         stopped=limit_state.ended,
         drawn=answer.drawn,
     )
+
+
+def _robustness_of(cheap: Problem, precision: str, seed: int) -> Cheap:
+    cheap = resolved(cheap, batch=CHEAP_BATCH, budget=FITTING, precision=precision).problem
+    cheap.check()
+    simulate = DoublePrecisionEvaluator(cheap, CHEAP_BATCH, precision, seed)
+    return lambda u: np.asarray(simulate(u)[0], float)
 
 
 def _differentiates(problem: Problem) -> bool:

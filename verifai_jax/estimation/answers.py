@@ -1,7 +1,8 @@
 """Answers: what samples, splitting runs and bounds say of a probability, with their notes."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -29,6 +30,9 @@ CHAIN = 10
 UNDERSTATED = 1.6
 """Factor on the relative error of a run: chains start from those of the previous level."""
 
+Cheap: TypeAlias = Callable[[Float[np.ndarray, "n d"]], Float[np.ndarray, " n"]]
+"""From points of the unit cube to the robustness of a cheap model."""
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -39,12 +43,14 @@ class Plan:
     - `clamped`: True at coordinates whose domain ends in an outermost value.
     - `within`: factor from the estimate to an end of the interval that is short enough; None to
       spend the budget.
+    - `cheap`: the robustness of a cheap model at points of the unit cube; None without one.
     """
 
     confidence: float
     chains: int
     clamped: Bool[np.ndarray, " d"]
     within: float | None = None
+    cheap: Cheap | None = None
 
 
 @dataclass

@@ -14,9 +14,9 @@ reliability analysis, Probabilistic Engineering Mechanics 33 (2013), for the res
 """
 
 from functools import partial
-from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -26,6 +26,7 @@ from verifai_jax.estimation import importance
 from verifai_jax.estimation.answers import (
     WORST_TAIL,
     Answer,
+    Cheap,
     Plan,
     bound_answer,
     bound_from_pilot,
@@ -35,7 +36,7 @@ from verifai_jax.estimation.fitting import effective_size
 from verifai_jax.estimation.importance import ImportanceSamples
 from verifai_jax.estimation.mixture import Mixture
 from verifai_jax.estimation.monte_carlo import Counts
-from verifai_jax.estimation.normal_space import Ended, LimitState
+from verifai_jax.estimation.normal_space import Ended, LimitState, to_unit_cube
 from verifai_jax.estimation.splitting import SplittingRun, run_splitting
 from verifai_jax.search.gaussian_process import GaussianProcess, Hyper, Posterior, TrainingData
 
@@ -61,6 +62,8 @@ surrogate among them that makes splitting superfluous."""
 SETTLED = 0.01
 """Expected share of the surrogate's failures that are none, or are missed, at which it is good, and
 all learning is spent on looking for others."""
+SETTLED_BY_CHEAP = 0.05
+"""The same with a cheap model, at which learning ends."""
 EXPLORED = 3
 """One of so many simulations of a round goes where the surrogate knows least, whatever it says
 there: it is wrong about failures that its points gave no hint of."""
@@ -76,36 +79,50 @@ FIRST_LOOK = 0.3
 """Share of the final samples after which it is asked whether the proposal meets failures at all."""
 MIN_FAILING = 10
 """Failures among these below which the proposal is given up: their weights say too little."""
-LOOKS = 4
-"""Further looks at the interval, where it decides when to stop."""
+UNDERSTATED = 1.2
+"""Factor on the logarithms of the interval: samples of a proposal that was fitted to a model of the
+failures seldom show the weights beyond its edges."""
+LOOKS, MIN_LOOK = 4, 40
+"""Looks at the interval after the first one, where it decides when to stop, and samples of that."""
 
 
 class Surrogate:
     """A Gaussian process on the robustness over normal space.
 
+    With a cheap model of the same features it is a process on what a multiple of the cheap
+    robustness leaves over (Kennedy, O'Hagan, Predicting the output from a complex computer code
+    when fast approximations are available, Biometrika 87, 2000). A cheap model of no use has the
+    multiple zero.
+
     **Arguments:**
 
     - `dim`: number of coordinates.
+    - `cheap`: the robustness of the cheap model at points of the unit cube; none when left out.
     """
 
-    def __init__(self, dim: int) -> None:
+    def __init__(self, dim: int, cheap: Cheap | None = None) -> None:
         self.process = GaussianProcess((False,) * dim)
-        self.hyper, self.scale, self.middle = self.process.first(), 1.0, 0.0
+        self.hyper, self.scale = self.process.first(), 1.0
         self.posterior: Posterior | None = None
+        self.cheap, self.cheap_unit = cheap, 0.0
+        self.trend = np.zeros(2)
+        """Constant, and multiple of the cheap robustness."""
 
     def learn(self, z: Float[np.ndarray, "n d"], rho: Float[np.ndarray, " n"]) -> None:
         """Learn the robustness of all points so far; the last ones count if they are too many."""
         z, rho = z[-CAPACITY:], rho[-CAPACITY:]
         # Linear near zero, where the sign is, and logarithmic where it is far away.
-        self.unit = max(float(np.median(np.abs(rho))), 1e-30)
-        y = np.arcsinh(rho / self.unit)
-        self.middle, self.scale = float(y.mean()), max(float(y.std()), 1e-6)
+        y = np.arcsinh(rho / max(float(np.median(np.abs(rho))), 1e-30))
+        basis = self._basis(z)
+        self.trend = np.linalg.lstsq(basis, y, rcond=None)[0]
+        y = y - basis @ self.trend
+        self.scale = max(float(y.std()), 1e-6)
         size = max(128, power_of_two(len(z)))
         pad = size - len(z)
-        data: Any = TrainingData(  # pyright: ignore
-            np.pad(_boxed(z), ((0, pad), (0, 0))),
-            np.pad((y - self.middle) / self.scale, (0, pad)).astype(np.float32),
-            np.arange(size) < len(z),
+        data = TrainingData(
+            jnp.asarray(np.pad(_boxed(z), ((0, pad), (0, 0)))),
+            jnp.asarray(np.pad(y / self.scale, (0, pad)), jnp.float32),
+            jnp.asarray(np.arange(size) < len(z)),
         )
         self.hyper, self.posterior = _fitted(self.process, self.hyper, data)
 
@@ -120,7 +137,16 @@ class Surrogate:
             mean, std = _predicted(self.process, self.posterior, padded)
             parts.append((np.asarray(mean)[: len(part)], np.asarray(std)[: len(part)]))
         mean, std = (np.concatenate(column) for column in zip(*parts, strict=True))
-        return mean.astype(float) + self.middle / self.scale, std.astype(float)
+        return mean + self._basis(z) @ self.trend / self.scale, std.astype(float)
+
+    def _basis(self, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n 2"]:
+        if self.cheap is None:
+            return np.column_stack([np.ones(len(z)), np.zeros(len(z))])
+        rho = self.cheap(to_unit_cube(z))
+        known = np.isfinite(rho)
+        rho = np.where(known, rho, np.max(rho, where=known, initial=0.0))
+        self.cheap_unit = self.cheap_unit or max(float(np.median(np.abs(rho))), 1e-30)
+        return np.column_stack([np.ones(len(z)), np.arcsinh(rho / self.cheap_unit)])
 
     def covariance(self, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n n"]:
         """Return the covariance of the values at points."""
@@ -150,9 +176,12 @@ def _covariance(process: GaussianProcess, posterior: Posterior, x: Array) -> Arr
 
 
 def estimate_by_surrogate(limit_state: LimitState, rng: np.random.Generator, plan: Plan) -> Answer:
-    """Estimate with few simulations: half of them learn, the others are the estimate."""
+    """Estimate with few simulations: half of them learn, the others are the estimate.
+
+    With a cheap model fewer learn, since it knows where failures may be.
+    """
     limit_state.rows = []
-    surrogate = Surrogate(limit_state.dim)
+    surrogate = Surrogate(limit_state.dim, plan.cheap)
     counts = Counts(0, 0, 0)
     try:
         counts = _first_design(limit_state, rng)
@@ -214,6 +243,8 @@ def _learn(limit_state: LimitState, rng: np.random.Generator, surrogate: Surroga
         mean, std = surrogate.predict(population)
         wrong = ndtr(-np.abs(mean) / std)
         doubt = float(wrong.sum() / max(np.sum(mean < 0), 1.0))
+        if surrogate.cheap is not None and doubt < SETTLED_BY_CHEAP:
+            return
         population, explored = population[:CHUNK], size if doubt < SETTLED else size // EXPLORED
         covariance = surrogate.covariance(population)
         chosen = _in_doubt(mean[:CHUNK], covariance, size - explored)
@@ -305,20 +336,22 @@ def _sample(
 
     **Returns:** the samples, and the confidence of an interval that may have been looked at before.
     """
-    left = max(limit_state.left, 1)
+    left, confidence = max(limit_state.left, 1), plan.confidence
     sizes = [max(1, round(FIRST_LOOK * left))]
-    looks = 1 if plan.within is None else LOOKS
-    sizes += [(left - sizes[0]) // looks] * looks
-    # Each look has an equal part of the error, so that their intervals hold together.
-    confidence = 1 - (1 - plan.confidence) / (1 if plan.within is None else LOOKS + 1)
+    sizes.append(left - sizes[0])
+    if plan.within is not None:
+        sizes = [max(MIN_LOOK, left >> LOOKS), *(left >> i for i in range(LOOKS, 0, -1))]
+        # Each look has an equal part of the error, so that their intervals hold together.
+        confidence = 1 - (1 - confidence) / len(sizes)
     found: ImportanceSamples | None = None
     for size in sizes:
+        size = min(size, limit_state.left)
         if found is not None and size < 1:
             break
-        new = importance.sample_proposal(limit_state, rng, proposal, size, plan.clamped)
+        new = importance.sample_proposal(limit_state, rng, proposal, max(size, 1), plan.clamped)
         found = new if found is None else found.join(new)
         low, high = found.interval(confidence)
-        enough = plan.within is not None and low > 0 and high <= plan.within**2 * low
+        enough = plan.within and low > 0 and (high / low) ** UNDERSTATED <= plan.within**2
         if enough or limit_state.ended or found.failing.sum() < MIN_FAILING:
             break
     assert found is not None
@@ -346,6 +379,7 @@ def _answer(
         return answer
     mean = samples.mean
     low, high = samples.interval(confidence)
+    low, high = (mean.mean * (end / mean.mean) ** UNDERSTATED for end in (low, high))
     answer = Answer(counts, min(mean.mean, 1.0), low, high, "surrogate", mean.effective, mean.cv)
     right = float(np.mean((surrogate.predict(samples.points)[0] < 0) == samples.failing))
     worth = (1 - mean.mean) / (mean.mean * mean.cv**2)

@@ -26,7 +26,7 @@ class Likelihood:
 
     **Arguments:**
 
-    - `space`: of the features.
+    - `space`: the space of the features.
 
     **Raises:** `NoDensityError` for a space whose features have no density.
     """
@@ -58,9 +58,9 @@ class Likelihood:
 
         **Arguments:**
 
-        - `points`: of a round, in the unit cube.
+        - `points`: the points of a round, in the unit cube.
         - `rho`: what a search would minimise; positive where a failure is not claimed.
-        - `verdicts`: of their simulations.
+        - `verdicts`: the verdicts of their simulations.
         """
         points = np.asarray(points, np.float64)
         failing = verdicts.violated & (rho <= 0)

@@ -45,7 +45,7 @@ class Improbability:
 
     **Arguments:**
 
-    - `space`: of the features.
+    - `space`: the space of the features.
 
     **Raises:** `NoDensityError` for a domain whose values have no density, such as an automaton.
     """

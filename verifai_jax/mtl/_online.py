@@ -28,7 +28,7 @@ from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import Evaluator
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.semantics import Kind, Semantics, hard
-from verifai_jax.mtl.stepping import Cell, advance, first_cells
+from verifai_jax.mtl.stepping import advance, first_cells
 from verifai_jax.mtl.streams import Plan, streams
 
 
@@ -37,7 +37,7 @@ class State(NamedTuple):
 
     count: Array
     last: tuple[Array, ...]
-    cells: tuple[Cell, ...]
+    cells: tuple[Array, ...]
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Online:
     def init(self) -> State:
         """Return the state before any sample."""
         leaves = tuple(jnp.asarray(jnp.nan) for _ in self.plan.leaves)
-        return State(jnp.int32(0), leaves, first_cells(self.plan, jnp))
+        return State(jnp.int32(0), leaves, first_cells(self.plan))
 
     def step(self, state: State, sample: Mapping[str, Any]) -> State:
         """Return the state after one more sample: numbers (or vectors `[k]`) by signal name.
@@ -120,7 +120,7 @@ def _step(monitor: Online, state: State, sample: dict[str, Any]) -> State:
     evaluator = Evaluator(signals, 1, monitor.dt, kind=monitor.kind)
     margins = [(evaluator.value(f, 0, 0)[0], sign) for f, sign in monitor.plan.leaves]
     last = tuple(jnp.asarray(m if sign > 0 else -m, dtype) for m, sign in margins)
-    _, cells = advance(monitor.plan, jnp, state.count, last, state.cells)
+    _, cells = advance(monitor.plan, state.count, last, state.cells)
     return State(state.count + 1, last, cells)
 
 
@@ -133,10 +133,10 @@ def _end_with(monitor: Online, state: State, unknown: float | None) -> Array:
         leaves = tuple(jnp.full_like(leaf, unknown) for leaf in leaves)
     settling, ends = plan.outputs[0].wait - 1, plan.outputs[0].ends
 
-    def more(i: Array, cells: tuple[Cell, ...]) -> tuple[Cell, ...]:
-        return advance(plan, jnp, state.count + i, leaves, cells)[1]
+    def more(i: Array, cells: tuple[Array, ...]) -> tuple[Array, ...]:
+        return advance(plan, state.count + i, leaves, cells)[1]
 
-    def settled() -> tuple[Cell, ...]:
+    def settled() -> tuple[Array, ...]:
         return jax.lax.fori_loop(0, settling, more, state.cells)
 
     if settling and ends:
@@ -144,5 +144,5 @@ def _end_with(monitor: Online, state: State, unknown: float | None) -> Array:
         cells = jax.lax.cond(state.count > settling, lambda: state.cells, settled)
     else:
         cells = settled()
-    (value,), _ = advance(plan, jnp, state.count + settling, leaves, cells)
-    return jnp.asarray(value)
+    (value,), _ = advance(plan, state.count + settling, leaves, cells)
+    return value

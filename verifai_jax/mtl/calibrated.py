@@ -84,8 +84,8 @@ class PredictiveMonitor:
 
     - `horizon`: seconds that it looks ahead.
     - `slack`: by how much a prediction is too high in at most a share `alpha` of runs.
-    - `caught`: of the calibrating runs that violated the formula, those with an alarm before that;
-      None if there was none.
+    - `caught`: the caught of the calibrating runs that violated the formula, those with an alarm
+      before that; None if there was none.
     """
 
     formula: Formula
@@ -134,7 +134,7 @@ def predictive_monitor(
     - `alpha`: probability of a false alarm in a run, and of a bound that is too high.
     - `lags`: samples ago that a prediction sees.
     - `model`: a regressor of scikit-learn's kind; a quadratic function if None.
-    - `seed`: of the division into runs that teach and runs that calibrate.
+    - `seed`: the seed of the division into runs that teach and runs that calibrate.
 
     **Raises:** `ValueError` for too few runs without violation; `IntervalError` for a horizon that
     is not a multiple of the sampling period.
@@ -223,7 +223,7 @@ def domain_monitor(
     - `signals`: names of those that are compared; all if None.
     - `alpha`: probability of an alarm in a run that is like the tested ones.
     - `lags`: samples ago that are compared too.
-    - `seed`: of the division into runs that are compared with and runs that calibrate.
+    - `seed`: the seed of the division into runs that are compared with and runs that calibrate.
 
     **Raises:** `ValueError` for too few runs, and for a NaN.
     """

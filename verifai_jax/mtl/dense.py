@@ -54,7 +54,7 @@ def dense_gradient(
     **Arguments:**
 
     - `formula`: its text, as for `mine`.
-    - `values`: of all parameters.
+    - `values`: the values of all parameters.
     """
     template = read_parametric(formula)
     slopes: dict[str, float] = {}

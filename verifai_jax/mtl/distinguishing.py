@@ -90,7 +90,7 @@ def distinguish(
       the first that tells them apart is taken; signals that move freely when left out.
     - `end`: what comes after the last sample, `"hold"` or `"truncate"`; of a problem it is its own.
     - `dt`, `duration`: of a free trace, in seconds; they follow from the windows when left out.
-    - `budget`, `seed`: simulations of the search, and the seed of everything that is drawn at random.
+    - `budget`, `seed`: simulations of the search, and the seed of everything random in it.
 
     **Returns:** the trace, if one was found; that none was found proves nothing.
 

@@ -391,9 +391,8 @@ def _apply(name: str, values: list[Array | float]) -> Array | float:
             for other in others:
                 first = operation(first, other)
             return first
-    return {"abs": jnp.abs, "sqrt": jnp.sqrt, "sin": jnp.sin, "cos": jnp.cos, "exp": jnp.exp}[name](
-        first
-    )
+    functions = {"abs": jnp.abs, "sqrt": jnp.sqrt, "sin": jnp.sin, "cos": jnp.cos, "exp": jnp.exp}
+    return functions[name](first)
 
 
 def _power(base: Array | float, exponent: Array | float) -> Array | float:

@@ -7,7 +7,7 @@ known. An error offers texts that settle it, each of which was read before it is
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.mtl import formula as ast
@@ -237,9 +237,9 @@ class ExpressionBuilder:
         return Part(value, *self._span(tree))
 
     def _call(self, tree: Tree) -> Part:
-        name, *arguments = tree.children
+        name, *arguments = cast("list[Any]", tree.children)
         span = self._span(tree)
-        if name == "pow" and len(arguments) == 2:
+        if str(name) == "pow" and len(arguments) == 2:
             base, exponent = (self._expression(self._build(c)) for c in arguments)
             return Part(base**exponent, *span)
         if str(name) not in FUNCTIONS:

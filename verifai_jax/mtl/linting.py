@@ -31,10 +31,12 @@ from verifai_jax.mtl.requirements import Requirement, Requirements, requirements
 from verifai_jax.mtl.rewriting import nnf, replaced
 from verifai_jax.mtl.units import plain_unit, unit_of, units_of
 
-FAR, NEVER = 3.0, 0.5
+FAR, NEVER = 2.5, 0.5
 """Distances of a bound from all values, in widths of their range, from which on a predicate that
-always holds, and one that never does, are suspicious: 3 lets a limit of 30 m/s pass where speeds
-go from 0 to 10, and finds degrees that are compared with radians, and metres with feet."""
+always holds, and one that never does, are suspicious: 2.5 lets a limit of 30 m/s pass where speeds
+go from 0 to 10, and finds 120 km/h where they go from 0 to 33 m/s, and degrees for radians."""
+STILL = 0.2
+"""Share of the value of a signal that never changes, which stands for the width of its range."""
 
 Check = Iterator["Finding"]
 
@@ -62,7 +64,7 @@ def lint(
     requirements = requirements_of(formulas)
     traces = {} if signals is None else named_traces(signals)
     names = dict.fromkeys(name for trace in traces.values() for name in trace.signals)
-    read = dict.fromkeys(name for each in requirements for name in each.formula.signals())
+    read = dict.fromkeys(name for each in requirements for name in each.formalized.signals())
     said = {name: unit for trace in traces.values() for name, unit in trace.units.items()}
     known = units_of([*names, *read], said | dict(units or {}))
     found: list[Finding] = []
@@ -92,7 +94,7 @@ class _Linter:
 
     @property
     def formula(self) -> Formula:
-        return self.requirement.formula
+        return self.requirement.formalized
 
     def findings(self) -> list[Finding]:
         """Return what all checks find, one finding for each kind and part."""
@@ -299,7 +301,8 @@ class _Linter:
         names = leaf.signals()
         sizes = [np.abs(e.values.signals[n]).max() for e in self.recordings for n in names]
         # Flags, modes and counts are often constant, so that a bound next to one says nothing.
-        return spread or (float(max(sizes)) if max(sizes) > 3 or max(sizes) % 1 else math.inf)
+        still = STILL * float(max(sizes)) if max(sizes) > 3 or max(sizes) % 1 else math.inf
+        return spread or still
 
     def _far(self, leaf: Formula, never: bool, nearest: float) -> Finding:
         ranges = []
@@ -318,7 +321,9 @@ class _Linter:
 
     def _witnesses(self) -> Check:
         """Find untils that fail because their right side never comes, and that are never needed."""
-        for part, (word, _) in _written(self.formula).items():
+        written = _written(self.formula)
+        guarded = {part for word, parts in written.values() if word == "implies" for part in parts}
+        for part, (word, _) in written.items():
             if word != "until" or not isinstance(part, ast.Until):
                 continue
             weak = part.left.weak_until(part.right, part.interval.start, part.interval.end)
@@ -326,7 +331,8 @@ class _Linter:
             only = [
                 each.name
                 for each in self.recordings
-                if not (self._within(each, part.right, each.values.truth) > 0).any()
+                # Of one that is asked again and again the last may be asked too late.
+                if not (part in guarded and self._comes(each, part.right))
                 and not each.values.holds(self.formula)
                 and each.values.holds(changed)
             ]
@@ -344,6 +350,9 @@ class _Linter:
                     f"{part.right} holds at once wherever {part} is asked, so that {part.left} is "
                     f"never asked in {self._all}",
                 )  # fmt: skip
+
+    def _comes(self, each: _Recording, part: Formula) -> bool:
+        return bool((self._within(each, part, each.values.truth) > 0).any())
 
     def _at_once(self, part: ast.Until) -> bool:
         """Return whether the right side holds wherever the until is asked."""

@@ -1,29 +1,27 @@
-"""One step of a plan, in JAX or NumPy: a function of the memory before it, which it leaves alone.
+"""One step of a plan in JAX, a pure function.
 
-    cells = first_cells(plan, jnp)
-    results, cells = advance(plan, jnp, now, leaves, cells)
+    cells = first_cells(plan)
+    results, cells = advance(plan, now, leaves, cells)
 
-A step reads whole windows. `watch` compiles steps that do not, from the code of `c_monitor`.
+It reads whole windows, which is quick for a batch. The steps of `watch` update them.
 """
 
 from collections.abc import Callable, Sequence
-from types import ModuleType
 
 import jax
-import numpy as np
+import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from verifai_jax.mtl.streams import Op, Plan
 from verifai_jax.mtl.tree import missing_case
 
-Cell = Array | np.ndarray
-"""What an operation keeps, a vector or a number."""
-Value = Float[Array, ""] | Float[np.ndarray, ""] | np.floating | float
+Value = Float[Array, ""]
+Instant = Int[Array, ""]
 
 
-def first_cells(plan: Plan, xp: ModuleType) -> tuple[Cell, ...]:
-    """Return the memory before any sample, in the default precision of `xp`."""
-    cells: list[Cell] = []
+def first_cells(plan: Plan) -> tuple[Array, ...]:
+    """Return the memory before any sample."""
+    cells: list[Array] = []
     for op in plan.ops:
         top = op.sign * plan.top
         starts = {
@@ -31,78 +29,67 @@ def first_cells(plan: Plan, xp: ModuleType) -> tuple[Cell, ...]:
             "until": [top, -top], "since": [top, -top], "accumulate": [-top], "reach": [-top, top],
         }.get(op.kind, [])  # fmt: skip
         shape = (op.n,) if op.kind in ("delay", "window", "until", "since") else ()
-        cells.extend(xp.full(shape, start) for start in starts)
+        cells.extend(jnp.full(shape, start) for start in starts)
     return tuple(cells)
 
 
 def advance(
-    plan: Plan,
-    xp: ModuleType,
-    now: Int[Array, ""] | int,
-    leaves: Sequence[Value],
-    cells: Sequence[Cell],
-) -> tuple[list[Value], tuple[Cell, ...]]:
+    plan: Plan, now: Instant, leaves: Sequence[Value], cells: Sequence[Array]
+) -> tuple[list[Value], tuple[Array, ...]]:
     """Compute the results of one more sample.
 
     **Arguments:**
 
-    - `xp`: `jax.numpy` or `numpy`.
     - `now`: number of the sample.
     - `leaves`: margins of the plan's leaves.
     - `cells`: memory before the step.
 
     **Returns:** the result of each formula, NaN where it has none yet, and the memory after it.
     """
-    step = _Step(xp, now, leaves, cells)
+    step = _Step(now, leaves, cells)
     values: list[Value] = []
     for op in plan.ops:
         values.append(step.value(op, [values[i] for i in op.inputs]))
     results = [
-        xp.where(now >= delay, values[slot], xp.nan) if delay else values[slot]
+        jnp.where(now >= delay, values[slot], jnp.nan) if delay else values[slot]
         for slot, delay, *_ in plan.outputs
     ]
     return results, tuple(step.after)
 
 
 class _Step:
-    def __init__(
-        self,
-        xp: ModuleType,
-        now: Int[Array, ""] | int,
-        leaves: Sequence[Value],
-        cells: Sequence[Cell],
-    ) -> None:
-        self.xp, self.now, self.leaves = xp, now, leaves
+    def __init__(self, now: Instant, leaves: Sequence[Value], cells: Sequence[Array]) -> None:
+        self.now, self.leaves = now, leaves
         self.before = iter(cells)
-        self.after: list[Cell] = []
+        self.after: list[Array] = []
 
-    def push(self, value: Value) -> Array | np.ndarray:
+    def push(self, value: Value) -> Array:
         """Keep a stream's last values, and return them, the newest last, after the one before."""
         before = next(self.before)
-        newest = self.xp.asarray(value, before.dtype)
-        joined = self.xp.concatenate([before, newest[None]])
+        newest = jnp.asarray(value, before.dtype)
+        joined = jnp.concatenate([before, newest[None]])
         self.after.append(joined[1:])
         return joined
 
     def keep(self, value: Value) -> Value:
-        self.after.append(self.xp.asarray(value))
+        self.after.append(jnp.asarray(value))
         return value
 
     def value(self, op: Op, inputs: Sequence[Value]) -> Value:
-        best, worst = (self.xp.maximum, self.xp.minimum)[:: op.sign]
+        best, worst = (jnp.maximum, jnp.minimum)[:: op.sign]
         index = self.now - op.n
         match op.kind:
             case "leaf":
                 return self.leaves[op.n]
             case "number":
-                return self.xp.asarray(op.number)
+                return jnp.asarray(op.number)
             case "join":
                 joined, *others = inputs
                 for other in others:
                     joined = best(joined, other)
                 return joined
             case "begun":
-                return self.xp.where(index >= 0, inputs[0], op.number)
+                return jnp.where(index >= 0, inputs[0], op.number)
             case "delay":
                 return self.push(inputs[0])[0]
             case "window":
@@ -117,39 +104,38 @@ class _Step:
             case "accumulate":
                 before = next(self.before)
                 both = best(before, inputs[0])
-                self.keep(self.xp.where(self.within(op, index), both, before))
+                self.keep(jnp.where(self.within(op, index), both, before))
                 # What is still to come in the window is what the stream gives now.
-                return self.begun(index, self.xp.where(index <= op.end, both, before))
+                return self.begun(index, jnp.where(index <= op.end, both, before))
             case "reach":
                 return self.reach(op, index, inputs, best, worst)
         raise missing_case("the online monitor", op)
 
-    def within(self, op: Op, index: Int[Array, ""] | int) -> Value:
+    def within(self, op: Op, index: Instant) -> Array:
         return (index >= op.start) & (index <= op.end)
 
-    def begun(self, index: Int[Array, ""] | int, value: Value) -> Value:
-        return self.xp.where(index >= 0, value, self.xp.nan)
+    def begun(self, index: Instant, value: Value) -> Value:
+        return jnp.where(index >= 0, value, jnp.nan)
 
-    def witness(self, op: Op, lefts: Cell, rights: Cell) -> Value:
+    def witness(self, op: Op, lefts: Array, rights: Array) -> Value:
         if op.kind == "since":
             lefts, rights = lefts[::-1], rights[::-1]
         if op.sign < 0:
             lefts, rights = -lefts, -rights
-        top = self.xp.full((1,), self.xp.inf, lefts.dtype)
-        before = self.xp.concatenate([top, lefts[:-1]])
-        running = np.minimum.accumulate if self.xp is np else jax.lax.cummin
-        return op.sign * self.xp.minimum(rights, running(before)).max()
+        top = jnp.full((1,), jnp.inf, lefts.dtype)
+        before = jnp.concatenate([top, lefts[:-1]])
+        return op.sign * jnp.minimum(rights, jax.lax.cummin(before)).max()
 
     def reach(
-        self, op: Op, index: Int[Array, ""] | int, inputs: Sequence[Value],
+        self, op: Op, index: Instant, inputs: Sequence[Value],
         best: Callable[[Value, Value], Value], worst: Callable[[Value, Value], Value],
     ) -> Value:  # fmt: skip
         found, kept = next(self.before), next(self.before)
         left, right = inputs
         through = worst(kept, left)
         here = best(found, worst(right, kept))
-        self.keep(self.xp.where(self.within(op, index), here, found))
-        self.keep(self.xp.where(index >= 0, through, kept))
+        self.keep(jnp.where(self.within(op, index), here, found))
+        self.keep(jnp.where(index >= 0, through, kept))
         # A window still ahead is reached through `left` as it is now.
-        coming = best(found, worst(right, self.xp.where(index >= op.start, kept, through)))
-        return self.begun(index, self.xp.where(index <= op.end, coming, found))
+        coming = best(found, worst(right, jnp.where(index >= op.start, kept, through)))
+        return self.begun(index, jnp.where(index <= op.end, coming, found))

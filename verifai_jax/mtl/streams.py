@@ -81,12 +81,8 @@ class Plan(NamedTuple):
     @property
     def memory(self) -> int:
         """Samples that the windows hold."""
-        pairs = ("until", "since")
-        held = (op.n * (1 + (op.kind in pairs)) for op in self.ops if op.kind in (*pairs, *_HOLD))
-        return sum(held)
-
-
-_HOLD = ("delay", "window")
+        held = {"delay": 1, "window": 1, "until": 2, "since": 2}
+        return sum(op.n * held.get(op.kind, 0) for op in self.ops)
 
 
 def streams(

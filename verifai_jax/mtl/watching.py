@@ -5,8 +5,8 @@
     monitor.interval()                                # whatever may still come
     monitor.finish()                                  # if this was the last sample
 
-The machine's own compiler makes the step, from the code of `export_c`. Where there is none, NumPy
-does the same, in tens of microseconds. `online` is the monitor within JAX.
+The machine's own compiler makes the step, from the code of `export_c`. Where there is none, Python
+does the same, in some microseconds. `online` is the monitor within JAX.
 """
 
 import ctypes
@@ -25,9 +25,8 @@ from verifai_jax.core.machine_code import Unavailable, compiler, library_file
 from verifai_jax.mtl.c_margins import MarginCode, margin_code
 from verifai_jax.mtl.c_monitor import HEAD, HELPERS, monitor_code
 from verifai_jax.mtl.formula import Formula
-from verifai_jax.mtl.host_values import HostValues
+from verifai_jax.mtl.python_machine import PythonMachine
 from verifai_jax.mtl.semantics import Semantics, hard
-from verifai_jax.mtl.stepping import advance, first_cells
 from verifai_jax.mtl.streams import Plan, streams
 
 R = TypeVar("R")
@@ -57,60 +56,8 @@ void ahead(const monitor *m, monitor *scratch, long n, int held, double leaf, do
 """
 
 
-class NumPyMachine:
-    """The state of a monitor, and its step, for machines without a compiler.
-
-    - `out`: what the last step gave, one number a formula.
-    """
-
-    def __init__(self, plan: Plan, front: MarginCode) -> None:
-        self.out = np.full(len(plan.outputs), np.nan)
-        self._plan, self._columns = plan, front.columns
-        self._width = max((index + 1 for _, index in front.columns if index is not None), default=0)
-        self._leaves: list[float] = [np.nan] * len(plan.leaves)
-        self._cells = first_cells(plan, np)
-        self._now = 0
-
-    def step(self, sample: Sequence[float]) -> None:
-        """Take in one sample."""
-        self.steps(np.array([sample], float))
-
-    def steps(self, rows: np.ndarray) -> np.ndarray:
-        """Take in samples `[time, columns]`, and return what came out `[time, formulas]`."""
-        signals: dict[str, np.ndarray] = {}
-        for k, (name, index) in enumerate(self._columns):
-            if index is None:
-                signals[name] = rows[:, k]
-            else:
-                vector = signals.setdefault(name, np.full((len(rows), self._width), np.nan))
-                vector[:, index] = rows[:, k]
-        values = HostValues(signals, 1.0)
-        of = values.truth if self._plan.top == 1 else values
-        leaves = np.array([sign * of(f) for f, sign in self._plan.leaves]).reshape(-1, len(rows)).T
-        out = np.empty((len(rows), len(self.out)))
-        for k, leaf in enumerate(leaves):
-            self._leaves = list(leaf)
-            out[k], self._cells = advance(self._plan, np, self._now, list(leaf), self._cells)
-            self._now += 1
-        self.out[:] = out[-1]
-        return out
-
-    def ahead(self, steps: int, leaf: float | None) -> np.ndarray:
-        """Return what further steps would give `[steps, formulas]`; the state stays.
-
-        **Arguments:**
-
-        - `leaf`: the margin of all leaves from now on, or None to hold what they are.
-        """
-        leaves = self._leaves if leaf is None else [leaf] * len(self._leaves)
-        out, cells = np.empty((steps, len(self.out))), self._cells
-        for k, row in enumerate(out):
-            row[:], cells = advance(self._plan, np, self._now + k, leaves, cells)
-        return out
-
-
 class CompiledMachine:
-    """The same in machine code.
+    """The machine of `python_machine` in machine code.
 
     **Raises:** `Unavailable` where it cannot be compiled.
     """
@@ -179,9 +126,9 @@ class Watch(Generic[R]):
         self._read = _reader(front.columns)
         self._result = result
         try:
-            self._machine: CompiledMachine | NumPyMachine = CompiledMachine(plan, front)
+            self._machine: CompiledMachine | PythonMachine = CompiledMachine(plan, front)
         except Unavailable:
-            self._machine = NumPyMachine(plan, front)
+            self._machine = PythonMachine(plan, front.columns)
         self.compiled = isinstance(self._machine, CompiledMachine)
         self._step, self._out = self._machine.step, self._machine.out
 

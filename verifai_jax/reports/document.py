@@ -20,6 +20,7 @@ from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import Judgement
 from verifai_jax.problem.problem import Problem
+from verifai_jax.reports.assessment import with_assessment
 from verifai_jax.reports.comparison_report import comparison_page
 from verifai_jax.reports.errors_section import with_errors
 from verifai_jax.reports.estimate_report import estimate_page
@@ -44,6 +45,7 @@ def write_report(
     modes: int | None = None,
     problem: Problem | None = None,
     errors: ErrorBudget | None = None,
+    assessment: bool = False,
     progress: bool | None = None,
 ) -> Path:
     """Write the evidence report on a result as one HTML file, and its claims as JSON next to it.
@@ -65,6 +67,8 @@ def write_report(
     - `problem`: the problem of an estimate, or the baseline of a comparison, for its property and
       prior.
     - `errors`: how wrong the number can be, as `vj.error_budget` says: a section and a claim.
+    - `assessment`: whether sections for an assessor follow: the claims as a tree, the nine steps of
+      credibility with boxes to be filled in, and a page to be signed.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     **Returns:** the path of the HTML file.
@@ -86,7 +90,8 @@ def write_report(
                 )
             space = result.problem.space if result.problem else None
             _check(about, space, result.table.features)
-            page = run_page(result, about, traces, studies, modes)
+            words = None if errors is not None else " --assessment" * assessment
+            page = run_page(result, about, traces, studies, modes, words)
         case Sweep():
             _check(about, result.space, result.hyperparameters)
             page = sweep_page(result, about)
@@ -110,6 +115,8 @@ def write_report(
             )
     if errors is not None:
         page = with_errors(page, errors)
+    if assessment:
+        page = with_assessment(page)
     with replacing(path) as partial:
         partial.write_text(render(page), encoding="utf-8", newline="\n")
     claims = json.dumps(page.claims, indent=2, allow_nan=False)

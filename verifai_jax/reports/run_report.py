@@ -89,6 +89,7 @@ def run_page(
     traces: int | None = None,
     studies: bool | None = None,
     modes: int | None = None,
+    words: str | None = "",
 ) -> Page:
     """Make the report on a run.
 
@@ -97,14 +98,17 @@ def run_page(
     - `run`: the run.
     - `about`: units and reasons of the features.
     - `traces`, `studies`, `modes`: as in `write_report`.
+    - `words`: further ones of the command that builds the report again; None if there is no command
+      for all of it.
     """
     found = study(run, traces, studies, modes)
     now = None if run.problem is None else run.problem.sources()
     model = Model.of(run.sources, now)
     links = tuple(chained(_inputs(run, model)))
     command = None
-    if run.folder is not None:
+    if run.folder is not None and words is not None:
         command = report_command(run.folder, about.units, about.reasons, traces, studies, modes)
+        command += words
         if run.problem is None:
             command += " --without-problem"
         elif run.target is None:

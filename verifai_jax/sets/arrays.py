@@ -9,7 +9,7 @@ import numpy as np
 
 from verifai_jax.sets import functions
 from verifai_jax.sets.elementwise import of_rank, select
-from verifai_jax.sets.form import Form, alike, is_point, padded, product, rounded, total
+from verifai_jax.sets.form import Form, alike, is_point, padded, product, rounded, total, unknown
 from verifai_jax.sets.interpreter import (
     Equation,
     Interpreter,
@@ -140,30 +140,6 @@ def _split(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     return parts
 
 
-def _taken(value: Value, positions: np.ndarray) -> Value:
-    """Return the elements at these positions of the flat array."""
-    return value.moved(lambda array, lead: array.reshape(*array.shape[:lead], -1)[..., positions])
-
-
-def _positions(t: Interpreter, step: Equation, inputs: list[Value], of: int) -> np.ndarray:
-    """Apply a step that only moves elements to the numbers of the elements themselves."""
-    arrays, start = [], 0
-    for number, value in enumerate(inputs):
-        if number < of:
-            size = int(np.prod(value.shape, dtype=np.int64))
-            arrays.append(np.arange(start, start + size, dtype=np.int32).reshape(value.shape))
-            start += size
-            continue
-        common = as_whole(value).common
-        if common is None:
-            raise NotImplementedError("indices that depend on the features")
-        arrays.append(common)
-    params = dict(step.params)
-    if "fill_value" in params:
-        params["fill_value"] = -1
-    return np.asarray(step.primitive.bind(*map(jnp.asarray, arrays), **params))
-
-
 @rule("dynamic_slice")
 def _dynamic_slice(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     """Return the window, or the hull of all windows where the index varies in a box."""
@@ -181,10 +157,8 @@ def _dynamic_slice(t: Interpreter, step: Equation, inputs: list[Value]) -> list[
         part = array.moved(lambda a, lead, window=window: a[(..., *window)])
         certain, possible = np.ones(1, bool), np.ones(1, bool)
         for i, (low, high) in zip(cell, ends, strict=True):
-            certain, possible = (
-                certain & (low == i) & (high == i),
-                possible & (low <= i) & (i <= high),
-            )
+            certain = certain & (low == i) & (high == i)
+            possible = possible & (low <= i) & (i <= high)
         # A box in which the first window is out of reach has another one for certain.
         which = Whole(certain.astype(np.int64), possible.astype(np.int64), np.dtype(bool))
         result = part if result is None else select(of_rank(which, part), [result, part])
@@ -192,43 +166,32 @@ def _dynamic_slice(t: Interpreter, step: Equation, inputs: list[Value]) -> list[
     return [result]
 
 
-@rule("gather")
-def _gather(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    positions = _positions(t, step, inputs, 1)
+_MOVED = {"gather": (0,), "dynamic_update_slice": (0, 1), "scatter": (0, 2), "pad": (0, 1)}
+"""Operands whose elements are moved; the others are indices, and what stands where nothing is."""
+
+
+@rule(*_MOVED)
+def _by_index(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    """Apply a step that only moves elements to the numbers of the elements, and move them so."""
+    arrays, start, flat = [], 0, []
+    for number, value in enumerate(inputs):
+        if number in _MOVED[step.primitive.name]:
+            size = int(np.prod(value.shape, dtype=np.int64))
+            arrays.append(np.arange(start, start + size, dtype=np.int32).reshape(value.shape))
+            start += size
+            flat.append(value.moved(lambda a, lead: a.reshape(*a.shape[:lead], -1)))
+        elif (common := as_whole(value).common) is not None:
+            arrays.append(common)
+        else:
+            raise NotImplementedError("indices that depend on the features")
+    params = dict(step.params)
+    if "fill_value" in params:
+        params["fill_value"] = -1
+    positions = np.asarray(step.primitive.bind(*map(jnp.asarray, arrays), **params))
     if (positions < 0).any():
         raise NotImplementedError("an index outside of its array")
-    return [_taken(inputs[0], positions)]
-
-
-@rule("dynamic_update_slice")
-def _update(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    positions = _positions(t, step, inputs, 2)
-    return [_taken(_flat(inputs[:2]), positions)]
-
-
-@rule("scatter")
-def _scatter(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    array, index, update = inputs
-    common = as_whole(index).common
-    if common is None:
-        raise NotImplementedError("indices that depend on the features")
-    size = int(np.prod(array.shape, dtype=np.int64))
-    numbers = jnp.arange(size, dtype=jnp.int32).reshape(array.shape)
-    more = jnp.arange(size, size + int(np.prod(update.shape, dtype=np.int64)), dtype=jnp.int32)
-    found = step.primitive.bind(
-        numbers, jnp.asarray(common), more.reshape(update.shape), **step.params
-    )
-    return [_taken(_flat([array, update]), np.asarray(found))]
-
-
-@rule("pad")
-def _pad(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    return [_taken(_flat(inputs), _positions(t, step, inputs, 2))]
-
-
-def _flat(values: Sequence[Value]) -> Value:
-    flat = [v.moved(lambda a, lead: a.reshape(*a.shape[:lead], -1)) for v in values]
-    return together(flat, lambda arrays, lead: np.concatenate(arrays, lead))
+    whole = together(flat, lambda arrays, lead: np.concatenate(arrays, lead))
+    return [whole.moved(lambda array, lead: array[..., positions])]
 
 
 # Sums, products, extremes
@@ -246,18 +209,18 @@ def _sum(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
 @rule("reduce_max", "reduce_min", "reduce_and", "reduce_or")
 def _extreme(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     (value,), axes = inputs, tuple(axis + 1 for axis in step.params["axes"])
-    least = step.primitive.name in ("reduce_min", "reduce_and")
-    extreme = np.min if least else np.max
-    initial = None
+    extreme, initial = (
+        (np.min, np.inf) if step.primitive.name in ("reduce_min", "reduce_and") else
+        (np.max, -np.inf)
+    )  # fmt: skip
     if isinstance(value, Whole):
-        if value.dtype == bool:
-            initial = 1 if least else 0
-        low, high = (extreme(end, axes, initial=initial) if initial is not None else
-                     extreme(end, axes) for end in (value.low, value.high))  # fmt: skip
+        first = 2**62 if initial > 0 else -(2**62)
+        if value.dtype == np.bool_:
+            first = int(initial > 0)
+        low, high = (extreme(end, axes, initial=first) for end in (value.low, value.high))
         return [Whole(low, high, value.dtype)]
     low, high = value.bounds()
-    nothing = ((low == -np.inf) & (high == np.inf)).any(axes)
-    initial = np.inf if least else -np.inf
+    nothing = unknown(low, high).any(axes)
     low, high = extreme(low, axes, initial=initial), extreme(high, axes, initial=initial)
     return [Form.between(np.where(nothing, -np.inf, low), np.where(nothing, np.inf, high),
                          value.dtype)]  # fmt: skip
@@ -304,7 +267,7 @@ def _argument(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value
         low, high = -high, -low
     best = low.max(axis + 1, keepdims=True)
     possible = high >= best
-    possible |= ((low == -np.inf) & (high == np.inf)).any(axis + 1, keepdims=True)
+    possible |= unknown(low, high).any(axis + 1, keepdims=True)
     count = value.shape[axis]
     number = np.arange(count).reshape([-1 if i == axis + 1 else 1 for i in range(low.ndim)])
     first = np.where(possible, number, count).min(axis + 1)
@@ -316,54 +279,42 @@ def _argument(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value
 def _dot(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     if isinstance(inputs[0], Whole):
         return t.concrete(step, inputs)
-    (contracted, batched) = step.params["dimension_numbers"]
-    sides = []
-    for value, inner, outer in zip(inputs, contracted, batched, strict=True):
-        form = as_form(value)
-        free = [a for a in range(len(form.shape)) if a not in inner and a not in outer]
-        order = (*outer, *free, *inner)
-        shape = form.shape
-        sizes = [tuple(shape[a] for a in axes) for axes in (outer, free, inner)]
-        flat = tuple(int(np.prod(size, dtype=np.int64)) for size in sizes)
-
-        def arrange(
-            array: np.ndarray, lead: int, order: tuple[int, ...] = order,
-            flat: tuple[int, ...] = flat,
-        ) -> np.ndarray:  # fmt: skip
-            axes = (*range(lead), *(axis + lead for axis in order))
-            return array.transpose(axes).reshape(*array.shape[:lead], *flat)
-
-        sides.append((form.moved(arrange), sizes))
-    (a, _), (b, _) = sides
-    to = step.outvars[0].aval.shape
+    (contracted, batched), (a, b) = step.params["dimension_numbers"], map(as_form, inputs)
+    letters = iter("abcdefghijklmnopqrstuvw")
+    joint = [next(letters) for _ in batched[0]], [next(letters) for _ in contracted[0]]
+    names: list[str] = []
+    for form, outer, inner in zip((a, b), batched, contracted, strict=True):
+        known = dict(zip((*outer, *inner), (*joint[0], *joint[1]), strict=True))
+        names.append("".join(known.get(i) or next(letters) for i in range(len(form.shape))))
+    free = ["".join(c for c in name if c not in joint[0] + joint[1]) for name in names]
+    result = "".join(joint[0]) + free[0] + free[1]
     dtype = np.dtype(step.outvars[0].aval.dtype)
-    if is_point(b) and np.isfinite(b.centre).all():
-        result = _times(a, b.centre[0], dtype)
-    elif is_point(a) and np.isfinite(a.centre).all():
-        swapped = _times(b, a.centre[0], dtype)
-        result = swapped.moved(lambda array, lead: np.swapaxes(array, -1, -2))
-    else:
-        left = a.moved(lambda array, lead: np.expand_dims(array, lead + 2))
-        right = b.moved(lambda array, lead: np.expand_dims(array, lead + 1))
-        result = total(product(left, right), (3,))
-    return [result.moved(lambda array, lead: array.reshape(*array.shape[:lead], *to))]
+    for form, other, (own, its) in ((a, b, names), (b, a, names[::-1])):
+        if is_point(other) and np.isfinite(other.centre).all():
+            text = f"...{own},{its}->...{result}"
+            terms = int(np.prod([form.shape[own.index(c)] for c in joint[1]], dtype=np.int64))
+            return [_times(form, other.centre[0], text, dtype, terms)]
+    axes = result + "".join(joint[1])
+
+    def spread(name: str, array: np.ndarray, lead: int) -> np.ndarray:
+        order = sorted(range(len(name)), key=lambda i: axes.index(name[i]))
+        sizes = {name[i]: array.shape[lead + i] for i in range(len(name))}
+        array = array.transpose(*range(lead), *(lead + i for i in order))
+        return array.reshape(*array.shape[:lead], *(sizes.get(c, 1) for c in axes))
+
+    a, b = (
+        form.moved(functools.partial(spread, name))
+        for form, name in zip((a, b), names, strict=True)
+    )
+    return [total(product(a, b), range(len(result), len(axes)))]
 
 
-def _times(a: Form, matrix: np.ndarray, dtype: np.dtype) -> Form:
-    """Return products of a form `[batch, rows, k]` and exact numbers `[batch, columns, k]`."""
-    other = np.swapaxes(matrix, -1, -2)
-    count = matrix.shape[-1]
-
-    def multiplied(array: np.ndarray, by: np.ndarray) -> np.ndarray:
-        if len(by) == 1 and array.shape[-3] == 1:
-            flat = np.ascontiguousarray(array).reshape(-1, array.shape[-1]) @ by[0]
-            return flat.reshape(*array.shape[:-1], by.shape[-1])
-        return array @ by
-
-    size = np.abs(other)
-    slopes = None if a.slopes is None else multiplied(a.slopes, other)
-    with np.errstate(invalid="ignore"):
-        return rounded(
-            multiplied(a.centre, other), slopes, multiplied(a.radius, size),
-            multiplied(a.size, size), dtype, None, a.frame, units=count + 1.0,
-        )  # fmt: skip
+def _times(a: Form, numbers: np.ndarray, names: str, dtype: np.dtype, terms: int) -> Form:
+    """Return sums of so many products of a form and exact numbers, as einsum names them."""
+    times = functools.partial(np.einsum, names, optimize=["einsum_path", (0, 1)])
+    slopes = None if a.slopes is None else times(a.slopes, numbers)
+    size = np.abs(numbers)
+    return rounded(
+        times(a.centre, numbers), slopes, times(a.radius, size), times(a.size, size), dtype,
+        None, a.frame, units=terms + 1.0,
+    )  # fmt: skip

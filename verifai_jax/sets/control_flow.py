@@ -1,7 +1,5 @@
 """Calls, branches and loops, on sets."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from verifai_jax.core.fingerprint import operands_of_scan
@@ -15,6 +13,7 @@ from verifai_jax.sets.interpreter import (
     Program,
     Value,
     as_whole,
+    constant,
     rule,
 )
 from verifai_jax.sets.whole import Whole
@@ -35,8 +34,9 @@ def _custom(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     for name in ("call_jaxpr", "fun_jaxpr", "call"):
         if name in step.params:
             program = step.params[name]
-            if t.known and len(program.jaxpr.eqns) < 64 and (known := t.known.get(str(program))):
-                return known(t, inputs)
+            known = None if t.known is None else t.known(program)
+            if known is not None:
+                return known(inputs)
             return t.closed(program, inputs)
     raise NotImplementedError("a function with a derivative of its own")
 
@@ -55,42 +55,18 @@ def _scan(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     order = range(length)[::-1] if params["reverse"] else range(length)
     for i in order:
         if frames:
-            carry = _framed(t, carry)
+            carry = framed(carry, t.boxes, t.features)
         now = [v.moved(lambda a, lead, i=i: a[(slice(None),) * lead + (i,)]) for v in stacked]
         results = t.closed(params["jaxpr"], [*shared, *carry, *now])
         carry = results[:count]
         outputs.append([v.unframed() if isinstance(v, Form) else v for v in results[count:]])
     if params["reverse"]:
         outputs = outputs[::-1]
-    collected: list[Value] = []
-    for number, variable in enumerate(step.outvars[count:]):
-        rows = [row[number] for row in outputs]
-        if type(variable).__name__ == "DropVar" or not rows:
-            collected.append(_nothing(variable.aval))
-            continue
-        collected.append(together(rows, lambda arrays, lead: np.stack(arrays, lead)))
-    return [*carry, *collected]
-
-
-def _framed(t: Interpreter, carry: Sequence[Value]) -> list[Value]:
-    """Return what a loop carries with the uncertainties of what varies as symbols."""
-    moving = [
-        i for i, v in enumerate(carry)
-        if isinstance(v, Form) and (v.slopes is not None or len(v.centre) > 1)
-    ]  # fmt: skip
-    new = framed([v for v in map(carry.__getitem__, moving) if isinstance(v, Form)], t.boxes,
-                 t.features)  # fmt: skip
-    out = list(carry)
-    for i, value in zip(moving, new, strict=True):
-        out[i] = value
-    return out
-
-
-def _nothing(form: Equation) -> Value:
-    """Return an array of no meaning, in this shape and type."""
-    if np.issubdtype(form.dtype, np.integer) or form.dtype == np.bool_:
-        return Whole.constant(np.zeros(form.shape), np.dtype(form.dtype))
-    return Form.constant(np.zeros(form.shape), np.dtype(form.dtype))
+    if not outputs:
+        forms = [variable.aval for variable in step.outvars[count:]]
+        return [*carry, *(constant(np.zeros(form.shape), form.dtype) for form in forms)]
+    stack = lambda arrays, lead: np.stack(arrays, lead)  # noqa: E731
+    return [*carry, *(together(rows, stack) for rows in zip(*outputs, strict=True))]
 
 
 @rule("cond")

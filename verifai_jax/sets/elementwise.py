@@ -1,10 +1,12 @@
 """Operations on single numbers, on sets of them."""
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.sets import functions, whole
-from verifai_jax.sets.form import Form, add, is_point, negative, product
+from verifai_jax.sets.form import Form, add, negative, product
 from verifai_jax.sets.interpreter import (
     Equation,
     Interpreter,
@@ -28,61 +30,50 @@ def _levelled(values: list[Value]) -> list[Value]:
     return [value if len(value.shape) == rank else value.moved(widen) for value in values]
 
 
-@rule("add", "add_any", "sub", "mul", "div", "rem", "max", "min", "pow", "atan2")
+_OF_TWO: dict[str, Callable[[Form, Form], Form]] = {
+    "add": add,
+    "add_any": add,
+    "sub": lambda a, b: add(a, b, -1.0),
+    "mul": product,
+    "div": functions.quotient,
+    "rem": functions.remainder,
+    "max": functions.greater,
+    "min": functions.lesser,
+    "pow": functions.power,
+    "atan2": functions.angle,
+}
+
+
+@rule(*_OF_TWO)
 def _two(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    name = step.primitive.name.replace("add_any", "add")
+    name = step.primitive.name
     if step.invars[0] is step.invars[1] and name == "mul" and isinstance(inputs[0], Form):
         return [functions.FUNCTIONS["square"](inputs[0])]
     a, b = _levelled(inputs)
-    if isinstance(a, Whole) and isinstance(b, Whole):
-        if name not in whole.OPERATIONS:
-            return t.concrete(step, inputs)
-        # What all boxes share may wrap around, as the machine's numbers do.
-        if a.common is not None and b.common is not None:
-            return t.concrete(step, inputs)
-        return [whole.OPERATIONS[name](a, b)]
-    if name == "pow" and isinstance(b, Whole):
-        b = _as_real(b, as_form(a).dtype)
-    a, b = as_form(a), as_form(b)
-    match name:
-        case "add" | "sub":
-            return [add(a, b, 1.0 if name == "add" else -1.0)]
-        case "mul":
-            return [product(a, b)]
-        case "div":
-            return [functions.quotient(a, b)]
-        case "rem":
-            return [functions.remainder(a, b)]
-        case "max":
-            return [functions.greater(a, b)]
-        case "min":
-            return [functions.lesser(a, b)]
-        case "pow":
-            return [functions.power(a, b)]
-    return [functions.angle(a, b)]
+    if isinstance(a, Form):
+        b = _as_real(b, a.dtype) if isinstance(b, Whole) else b
+        return [_OF_TWO[name](a, b)]
+    b = as_whole(b)
+    # What all boxes share may wrap around, as the machine's numbers do.
+    if name not in whole.OPERATIONS or (a.common is not None and b.common is not None):
+        return t.concrete(step, inputs)
+    return [whole.OPERATIONS[name](a, b)]
 
 
 @rule(*functions.FUNCTIONS)
 def _one(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     (value,), name = inputs, step.primitive.name
-    if isinstance(value, Whole):
-        if name == "abs":
-            return [whole.absolute(value)]
-        if name == "sign":
-            return [Whole(np.sign(value.low), np.sign(value.high), value.dtype)]
-        if name == "square":
-            size = whole.absolute(value)
-            return [whole.OPERATIONS["mul"](size, size)]
+    if isinstance(value, Form):
+        return [functions.FUNCTIONS[name](value)]
+    if name not in whole.FUNCTIONS:
         return t.concrete(step, inputs)
-    return [functions.FUNCTIONS[name](value)]
+    return [whole.FUNCTIONS[name](value)]
 
 
 @rule("neg")
 def _negative(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     (value,) = inputs
-    if isinstance(value, Form):
-        return [negative(value)]
-    return [whole.OPERATIONS["sub"](Whole(value.low * 0, value.low * 0, value.dtype), value)]
+    return [negative(value) if isinstance(value, Form) else whole.FUNCTIONS["neg"](value)]
 
 
 @rule("integer_pow")
@@ -101,9 +92,9 @@ def _round(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
 def _clamp(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     low, x, high = _levelled(inputs)
     if isinstance(x, Whole):
-        raised = whole.OPERATIONS["max"](x, as_whole(low))
-        return [whole.OPERATIONS["min"](raised, as_whole(high))]
-    return [functions.clamped(as_form(low), x, as_form(high))]
+        x = whole.OPERATIONS["max"](x, as_whole(low))
+        return [whole.OPERATIONS["min"](x, as_whole(high))]
+    return [functions.lesser(functions.greater(x, as_form(low)), as_form(high))]
 
 
 @rule("is_finite")
@@ -119,20 +110,12 @@ def _compare(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]
     if isinstance(a, Whole):
         b = as_whole(b)
         return [whole.compared(name, a.low - b.high, a.high - b.low)]
-    b = as_form(b)
-    if is_point(a) and is_point(b):
-        (one, _), (other, _) = a.bounds(), b.bounds()
-        with np.errstate(invalid="ignore"):
-            gap = np.sign(one - other)
-        # Infinities are equal to themselves.
-        gap = np.where(one == other, 0.0, gap)
-        return [whole.compared(name, gap, gap)]
-    return [whole.compared(name, *functions.difference(a, b).bounds())]
+    return [whole.compared(name, *functions.difference(a, as_form(b)).bounds())]
 
 
 @rule("not")
 def _not(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    return [whole.inverted(as_whole(inputs[0]))]
+    return [whole.FUNCTIONS["not"](as_whole(inputs[0]))]
 
 
 @rule("and", "or", "xor")
@@ -196,8 +179,8 @@ def _convert(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]
     info = np.iinfo(dtype)
     inside = (low > info.min) & (high < info.max)
     low, high = (np.where(inside, np.trunc(end), 0).astype(np.int64) for end in (low, high))
-    most = min(info.max, 2**62)
-    return [Whole(np.where(inside, low, info.min), np.where(inside, high, most), dtype)]
+    top = min(info.max, 2**62)
+    return [Whole(np.where(inside, low, info.min), np.where(inside, high, top), dtype)]
 
 
 def _whole_to_whole(value: Whole, dtype: np.dtype) -> Whole:
@@ -207,9 +190,9 @@ def _whole_to_whole(value: Whole, dtype: np.dtype) -> Whole:
     if value.is_point:
         wrapped = value.low.astype(dtype).astype(np.int64)
         return Whole(wrapped, wrapped, dtype)
-    most = min(info.max, 2**62)
-    fits = (value.low >= info.min) & (value.high <= most)
-    return Whole(np.where(fits, value.low, info.min), np.where(fits, value.high, most), dtype)
+    top = min(info.max, 2**62)
+    fits = (value.low >= info.min) & (value.high <= top)
+    return Whole(np.where(fits, value.low, info.min), np.where(fits, value.high, top), dtype)
 
 
 @rule(

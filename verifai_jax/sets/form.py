@@ -39,7 +39,7 @@ class Rounding(NamedTuple):
 
     unit: float
     smallest: float
-    greatest: float
+    highest: float
 
 
 @cache
@@ -64,7 +64,7 @@ class Form:
     - `slopes`: `[symbols, boxes, *shape]`; None for a set that depends on no symbol.
     - `size`: a bound of the absolute value.
     - `low`, `high`: an interval of its own; None without one.
-    - `frame`: of the symbols that are not features; None without them.
+    - `frame`: the frame of the symbols that are not features; None without them.
     - `dtype`: the type in which the simulation computes it.
     """
 
@@ -99,14 +99,13 @@ class Form:
     def between(cls, low: Reals, high: Reals, dtype: np.dtype) -> "Form":
         """Return intervals; ends that are NaN stand for everything."""
         kind = rounding(dtype)
-        low, high = overflown(low, high, kind.greatest)
+        low, high = overflown(low, high, kind.highest)
         # What is below the smallest normal number may be taken for zero.
         low = np.where((low > 0) & (low < kind.smallest), 0.0, low)
         high = np.where((high < 0) & (high > -kind.smallest), 0.0, high)
         bounded = np.isfinite(low) & np.isfinite(high)
-        with np.errstate(invalid="ignore"):
-            centre = np.where(bounded, low / 2 + high / 2, 0.0)
-            radius = np.where(bounded, np.maximum(high - centre, centre - low), np.inf)
+        centre = np.where(bounded, low / 2 + high / 2, 0.0)
+        radius = np.where(bounded, np.maximum(high - centre, centre - low), np.inf)
         size = np.maximum(np.abs(low), np.abs(high))
         radius = np.where((radius > 0) & bounded, radius + SLACK * size, radius)
         return cls(centre, None, radius, size, dtype, low, high)
@@ -170,6 +169,18 @@ class Form:
         ends = self.low, self.high
         return Form(self.centre, self.slopes, self.radius, self.size, dtype, *ends, self.frame)
 
+    def forget(self, where: np.ndarray) -> None:
+        """Let it be everything at some numbers."""
+        if not np.any(where):
+            return
+        self._bounds = self._spread = None
+        for name, value in (
+            ("centre", 0.0), ("slopes", 0.0), ("radius", np.inf), ("size", np.inf),
+            ("low", -np.inf), ("high", np.inf),
+        ):  # fmt: skip
+            if getattr(self, name) is not None:
+                setattr(self, name, np.where(where, value, getattr(self, name)))
+
     def unframed(self) -> "Form":
         """Return a set that depends on features alone: other symbols become part of the radius."""
         if self.frame is None or self.slopes is None:
@@ -181,13 +192,13 @@ class Form:
         return Form(self.centre, slopes, radius, self.size, self.dtype, self.low, self.high)
 
 
-def overflown(low: Reals, high: Reals, greatest: float) -> tuple[Reals, Reals]:
+def overflown(low: Reals, high: Reals, highest: float) -> tuple[Reals, Reals]:
     """Return an interval that is unbounded where its numbers may be beyond the greatest one."""
-    low = np.where(np.isnan(low) | (low < -greatest), -np.inf, low)
-    high = np.where(np.isnan(high) | (high > greatest), np.inf, high)
+    low = np.where(np.isnan(low) | (low < -highest), -np.inf, low)
+    high = np.where(np.isnan(high) | (high > highest), np.inf, high)
     # What is beyond it for certain is an infinity to the machine, and a number in real arithmetic.
-    low = np.where((low > greatest) & (low < np.inf), greatest, low)
-    return low, np.where((high < -greatest) & (high > -np.inf), -greatest, high)
+    low = np.where((low > highest) & (low < np.inf), highest, low)
+    return low, np.where((high < -highest) & (high > -np.inf), -highest, high)
 
 
 def unknown(low: Reals, high: Reals) -> Reals:
@@ -217,38 +228,20 @@ def rounded(
     kind = rounding(dtype)
     share, absolute = (SLACK, 0.0) if exact else (kind.unit * units, kind.smallest)
     radius = radius + (share * size + absolute)
-    if ends is not None and not exact:
-        low, high = ends
+    low, high = (None, None) if ends is None else ends
+    if low is not None and high is not None and not exact:
         low, high = low - share * np.abs(low), high + share * np.abs(high)
         low = np.where(np.abs(low) < kind.smallest, np.where(low < 0, -kind.smallest, 0.0), low)
         high = np.where(np.abs(high) < kind.smallest, np.where(high > 0, kind.smallest, 0.0), high)
-        ends = low, high
-    return settled(centre, slopes, radius, size, dtype, ends, frame)
-
-
-def settled(
-    centre: Reals,
-    slopes: Reals | None,
-    radius: Reals,
-    size: Reals,
-    dtype: np.dtype,
-    ends: tuple[Reals, Reals] | None,
-    frame: Frame | None,
-) -> Form:
-    """Return a form in which what may overflow, or is NaN, is unbounded."""
-    greatest = rounding(dtype).greatest
-    total = size.max(initial=0.0) + radius.max(initial=0.0)
-    low, high = (None, None) if ends is None else ends
-    if not total <= greatest / 2:
-        with np.errstate(invalid="ignore"):
-            wild = ~(size + radius <= greatest)
-        centre, size = np.where(wild, 0.0, centre), np.where(wild, np.inf, size)
-        radius = np.where(wild, np.inf, radius)
-        if slopes is not None:
-            slopes = np.where(wild, 0.0, slopes)
+    form = Form(centre, slopes, radius, size, dtype, low, high, frame)
+    if not size.max(initial=0.0) + radius.max(initial=0.0) <= kind.highest / 2:
+        # What may overflow, or is NaN, is unbounded.
+        wild = ~(size + radius <= kind.highest)
         if low is not None and high is not None:
-            low, high = overflown(low, high, greatest)
-    return Form(centre, slopes, radius, size, dtype, low, high, frame)
+            low, high = overflown(low, high, kind.highest)
+        form.forget(wild)
+        form.low, form.high = low, high
+    return form
 
 
 def alike(forms: Sequence[Form]) -> tuple[list[Form], Frame | None, int]:
@@ -290,9 +283,8 @@ def add(a: Form, b: Form, sign: float = 1.0) -> Form:
     (low, high), (first, last) = a.bounds(), b.bounds()
     if sign < 0:
         first, last = -last, -first
-    with np.errstate(invalid="ignore"):
-        ends = _sum_end(low, first, a.dtype, -1), _sum_end(high, last, a.dtype, 1)
-        form.low, form.high = overflown(*ends, rounding(a.dtype).greatest)
+    ends = _sum_end(low, first, a.dtype, -1), _sum_end(high, last, a.dtype, 1)
+    form.low, form.high = overflown(*ends, rounding(a.dtype).highest)
     return form
 
 
@@ -304,8 +296,7 @@ def _sum_end(one: Reals, other: Reals, dtype: np.dtype, side: int) -> Reals:
     # Knuth's error of the sum: it is zero where the sum is exact.
     exact = (one - (end - back)) + (other - back) == 0
     if dtype.itemsize < 8:
-        with np.errstate(over="ignore"):
-            exact &= end.astype(dtype).astype(np.float64) == end
+        exact &= end.astype(dtype).astype(np.float64) == end
     small = (end != 0) & (np.abs(end) < kind.smallest)
     widened = np.where(exact & ~small, end, end + side * (kind.unit * np.abs(end) + kind.smallest))
     # A sum of numbers of one sign has that sign, or is zero.
@@ -330,30 +321,28 @@ def scaled(a: Form, by: Reals) -> Form:
     """Return `a` times exact finite numbers."""
     slopes = None if a.slopes is None else a.slopes * by
     size, scale = a.size * np.abs(by), np.abs(by)
-    with np.errstate(invalid="ignore"):
-        ends = None
-        if a.low is not None and a.high is not None:
-            one, other = a.low * by, a.high * by
-            ends = np.minimum(one, other), np.maximum(one, other)
-        # Times 0, 1, 2, 4 ... nothing is rounded.
-        exact = bool(((np.frexp(scale)[0] == 0.5) & (scale >= 1) | (scale == 0)).all())
-        return rounded(
-            a.centre * by, slopes, a.radius * scale, size, a.dtype, ends, a.frame, exact=exact
-        )
+    ends = None
+    if a.low is not None and a.high is not None:
+        one, other = a.low * by, a.high * by
+        ends = np.minimum(one, other), np.maximum(one, other)
+    # Times 0, 1, 2, 4 ... nothing is rounded.
+    exact = bool(((np.frexp(scale)[0] == 0.5) & (scale >= 1) | (scale == 0)).all())
+    return rounded(
+        a.centre * by, slopes, a.radius * scale, size, a.dtype, ends, a.frame, exact=exact
+    )
 
 
 def interval_product(a: Form, b: Form) -> tuple[Reals, Reals]:
     """Return the interval of a product; everything where zero may meet an infinity."""
     (low, high), (first, last) = a.bounds(), b.bounds()
-    with np.errstate(invalid="ignore"):
-        ends = low * first, low * last, high * first, high * last
-        least = np.minimum(np.minimum(ends[0], ends[1]), np.minimum(ends[2], ends[3]))
-        greatest = np.maximum(np.maximum(ends[0], ends[1]), np.maximum(ends[2], ends[3]))
-    bad = np.isnan(least)
+    ends = low * first, low * last, high * first, high * last
+    lowest = np.minimum(np.minimum(ends[0], ends[1]), np.minimum(ends[2], ends[3]))
+    highest = np.maximum(np.maximum(ends[0], ends[1]), np.maximum(ends[2], ends[3]))
+    bad = np.isnan(lowest)
     # An interval with zero inside and one without an end: none of the four products is NaN.
     for ours, theirs in (((low, high), (first, last)), ((first, last), (low, high))):
         bad |= (ours[0] <= 0) & (ours[1] >= 0) & ~(np.isfinite(theirs[0]) & np.isfinite(theirs[1]))
-    return np.where(bad, -np.inf, least), np.where(bad, np.inf, greatest)
+    return np.where(bad, -np.inf, lowest), np.where(bad, np.inf, highest)
 
 
 def product(a: Form, b: Form) -> Form:
@@ -362,20 +351,19 @@ def product(a: Form, b: Form) -> Form:
         if is_point(one) and np.isfinite(one.centre).all():
             return scaled(other, one.centre)
     (a, b), frame, _ = alike([a, b])
-    with np.errstate(invalid="ignore", over="ignore"):
-        ends = interval_product(a, b)
-        size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
-        slopes = joint_slopes(a, b, b.centre, a.centre)
-        centre = a.centre * b.centre
-        radius = np.abs(a.centre) * b.radius + np.abs(b.centre) * a.radius + a.spread * b.spread
-        if a.slopes is not None and b.slopes is not None:
-            # The square of a symbol lies in [0, 1], not in [-1, 1].
-            count = min(len(a.slopes), len(b.slopes))
-            squares = a.slopes[:count] * b.slopes[:count]
-            centre = centre + squares.sum(0) / 2
-            radius = radius - np.abs(squares).sum(0) / 2
-        slack = (np.abs(a.centre) + a.spread) * (np.abs(b.centre) + b.spread) * SLACK
-        return rounded(centre, slopes, radius + slack, size, a.dtype, ends, frame)
+    ends = interval_product(a, b)
+    size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+    slopes = joint_slopes(a, b, b.centre, a.centre)
+    centre = a.centre * b.centre
+    radius = np.abs(a.centre) * b.radius + np.abs(b.centre) * a.radius + a.spread * b.spread
+    if a.slopes is not None and b.slopes is not None:
+        # The square of a symbol lies in [0, 1], not in [-1, 1].
+        count = min(len(a.slopes), len(b.slopes))
+        squares = a.slopes[:count] * b.slopes[:count]
+        centre = centre + squares.sum(0) / 2
+        radius = radius - np.abs(squares).sum(0) / 2
+    slack = (np.abs(a.centre) + a.spread) * (np.abs(b.centre) + b.spread) * SLACK
+    return rounded(centre, slopes, radius + slack, size, a.dtype, ends, frame)
 
 
 def total(a: Form, axes: Sequence[int]) -> Form:
@@ -385,13 +373,12 @@ def total(a: Form, axes: Sequence[int]) -> Form:
     slopes = None if a.slopes is None else a.slopes.sum(tuple(axis + 2 for axis in axes))
     size, ends = a.size.sum(lead), None
     if a.low is not None and a.high is not None:
-        with np.errstate(invalid="ignore"):
-            margin = rounding(a.dtype).unit * count * size
-            low, high = a.low.sum(lead) - margin, a.high.sum(lead) + margin
-            # Numbers of one sign add up to one of that sign.
-            low = np.where((a.low >= 0).all(lead), np.maximum(low, 0), low)
-            ends = low, np.where((a.high <= 0).all(lead), np.minimum(high, 0), high)
-            ends = overflown(*ends, rounding(a.dtype).greatest)
+        margin = rounding(a.dtype).unit * count * size
+        low, high = a.low.sum(lead) - margin, a.high.sum(lead) + margin
+        # Numbers of one sign add up to one of that sign.
+        low = np.where((a.low >= 0).all(lead), np.maximum(low, 0), low)
+        ends = low, np.where((a.high <= 0).all(lead), np.minimum(high, 0), high)
+        ends = overflown(*ends, rounding(a.dtype).highest)
     return rounded(
         a.centre.sum(lead), slopes, a.radius.sum(lead), size, a.dtype, ends, a.frame, units=count
     )
@@ -401,11 +388,10 @@ def joined(one: Form, other: Form) -> Form:
     """Return a set that contains two: their hull, with the mean of their slopes."""
     (a, b), frame, _ = alike([one, other])
     gap = joint_slopes(a, b, 0.5, -0.5)
-    with np.errstate(invalid="ignore"):
-        apart = np.abs(a.centre - b.centre) / 2
-        if gap is not None:
-            apart = apart + np.abs(gap).sum(0)
-        radius = apart + np.maximum(a.radius, b.radius)
+    apart = np.abs(a.centre - b.centre) / 2
+    if gap is not None:
+        apart = apart + np.abs(gap).sum(0)
+    radius = apart + np.maximum(a.radius, b.radius)
     (low, high), (first, last) = a.bounds(), b.bounds()
     return rounded(
         a.centre / 2 + b.centre / 2, joint_slopes(a, b, 0.5, 0.5), radius,

@@ -15,29 +15,31 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from verifai_jax.sets.form import SLACK, Form, Frame
+from verifai_jax.sets.form import SLACK, Form, Frame, alike
+from verifai_jax.sets.whole import Whole
 
 WIDEST = 24
 """Numbers that a loop carries at most for its symbols to be worth their cost, which is squared."""
 _NUMBERS = itertools.count(1)
 
 
-def framed(values: Sequence[Form], boxes: int, features: int) -> list[Form]:
+def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[Form | Whole]:
     """Return what a loop carries, its uncertainties as those of one frame of new symbols.
 
     **Arguments:**
 
-    - `values`: forms of any shapes.
+    - `carry`: values of any shapes; whole numbers, and what all boxes share, stay as they are.
     - `boxes`: size of the batch.
     - `features`: symbols of the features.
     """
+    kept = {i: v for i, v in enumerate(carry)
+            if isinstance(v, Form) and (v.slopes is not None or len(v.centre) > 1)}  # fmt: skip
+    values, out = [*kept.values()], list(carry)
     sizes = [int(np.prod(value.shape, dtype=np.int64)) for value in values]
     count = sum(sizes)
     if not count or count > WIDEST:
-        return [value.unframed() for value in values]
-    newest = max((v.frame.number for v in values if v.frame is not None), default=0)
-    values = [v if v.frame is None or v.frame.number == newest else v.unframed() for v in values]
-    old = max((0 if v.slopes is None else len(v.slopes) for v in values), default=0)
+        return [v.unframed() if isinstance(v, Form) else v for v in carry]
+    values, _, old = alike(values)
     old = max(old, features)
     slopes = np.zeros((old, boxes, count))
     centre, radius, size, low, high = (np.empty((boxes, count)) for _ in range(5))
@@ -64,14 +66,14 @@ def framed(values: Sequence[Form], boxes: int, features: int) -> list[Form]:
     radius = np.where(bounded, rest + 4 * SLACK * np.abs(noise).sum(2), np.inf)
     size = np.minimum(size, np.maximum(np.abs(low), np.abs(high)))
     frame = Frame(next(_NUMBERS), features)
-    out, start = [], 0
-    for value, each in zip(values, sizes, strict=True):
+    start = 0
+    for i, value, each in zip(kept, values, sizes, strict=True):
         part, shape = slice(start, start + each), (boxes, *value.shape)
         pieces = [array[:, part].reshape(shape) for array in (centre, radius, size, low, high)]
         own = new[:, :, part].reshape(len(new), *shape)
         # Bounded numbers get no interval: what is computed with it would cost, and is no tighter.
         ends = (None, None) if np.isfinite(pieces[1]).all() else (pieces[3], pieces[4])
-        out.append(Form(pieces[0], own, pieces[1], pieces[2], value.dtype, *ends, frame))
+        out[i] = Form(pieces[0], own, pieces[1], pieces[2], value.dtype, *ends, frame)
         start += each
     return out
 

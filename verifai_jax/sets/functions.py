@@ -65,33 +65,25 @@ class Function(NamedTuple):
 
     def __call__(self, x: Form) -> Form:
         """Return the set of its values on a set."""
-        with np.errstate(all="ignore"):
-            low, high = x.bounds()
-            return self._enclosed(x, low, high)
-
-    def _enclosed(self, x: Form, low: Reals, high: Reals) -> Form:
-        first, last = self.domain
+        (low, high), (first, last) = x.bounds(), self.domain
         outside = unknown(low, high) | (low < first) | (high > last) | (low > high)
         inside_low, inside_high = np.clip(low, first, last), np.clip(high, first, last)
-        flat = np.zeros_like(low)
-        points = self._points(flat, inside_low, inside_high)
+        points = self._points(np.zeros_like(low), inside_low, inside_high)
         values = [self.value(point) for point in points]
-        least, greatest = _extremes(values)
-        start, end = values[0], values[1]
-        slope = (end - start) / (inside_high - inside_low)
-        middle = np.isfinite(slope) & (inside_high > inside_low)
-        slope = np.where(middle, slope, 0.0)
+        lowest, highest = _extremes(values)
+        slope = (values[1] - values[0]) / (inside_high - inside_low)
+        slope = np.where(np.isfinite(slope) & (inside_high > inside_low), slope, 0.0)
         points = self._points(slope, inside_low, inside_high)
         below, above = _extremes([self.value(point) - slope * point for point in points])
         usable = np.isfinite(below) & np.isfinite(above) & np.isfinite(x.spread) & ~outside
         slope = np.where(usable, slope, 0.0)
-        size = np.maximum(np.abs(least), np.abs(greatest))
+        size = np.maximum(np.abs(lowest), np.abs(highest))
         offset = np.where(usable, below / 2 + above / 2, 0.0)
         error = np.where(usable, above / 2 - below / 2, np.inf)
         # Numbers of double precision between which the slope and the offset are rounded.
         error = error + 4 * SLACK * (np.abs(offset) + np.abs(slope) * (x.size + np.abs(x.centre)))
         radius = np.where(usable, np.abs(slope) * x.radius, 0.0) + error
-        ends = np.where(outside, -np.inf, least), np.where(outside, np.inf, greatest)
+        ends = np.where(outside, -np.inf, lowest), np.where(outside, np.inf, highest)
         if self.units:
             tiny = self.tiny * rounding(x.dtype).smallest
             ends, radius = (ends[0] - tiny, ends[1] + tiny), radius + tiny
@@ -112,10 +104,10 @@ class Function(NamedTuple):
 
 
 def _extremes(values: Sequence[Reals]) -> tuple[Reals, Reals]:
-    least, greatest = values[0], values[0]
+    lowest, highest = values[0], values[0]
     for value in values[1:]:
-        least, greatest = np.minimum(least, value), np.maximum(greatest, value)
-    return least, greatest
+        lowest, highest = np.minimum(lowest, value), np.maximum(highest, value)
+    return lowest, highest
 
 
 def _even(magnitude: Callable[[Reals], Reals]) -> Criticals:
@@ -132,7 +124,7 @@ def _single(at: Callable[[Reals], Reals]) -> Criticals:
     return lambda slope, low, high: (at(slope),)
 
 
-def _periodic(at: Callable[[Reals], Reals], period: float, both: bool = True) -> Criticals:
+def _periodic(at: Callable[[Reals], Reals], period: float) -> Criticals:
     """Return the points of both signs in all periods that an interval of one period may touch."""
 
     def criticals(slope: Reals, low: Reals, high: Reals) -> Sequence[Reals]:
@@ -146,14 +138,13 @@ def _sine(value: Callable[[Reals], Reals], criticals: Criticals) -> Callable[[Fo
     function = Function(value, criticals, range=(-1.0, 1.0))
 
     def enclosed(x: Form) -> Form:
-        with np.errstate(all="ignore"):
-            low, high = x.bounds()
-            wide = ~((high - low < np.pi) & (np.abs(low) < PERIODIC) & (np.abs(high) < PERIODIC))
-            form = function(x)
-            if not np.any(wide):
-                return form
-            end = np.where(np.isfinite(low) & np.isfinite(high), 1.0, np.inf)
-            return chosen([~wide, wide], [form, Form.between(-end, end, x.dtype)])
+        low, high = x.bounds()
+        wide = ~((high - low < np.pi) & (np.abs(low) < PERIODIC) & (np.abs(high) < PERIODIC))
+        form = function(x)
+        if not np.any(wide):
+            return form
+        end = np.where(np.isfinite(low) & np.isfinite(high), 1.0, np.inf)
+        return chosen([~wide, wide], [form, Form.between(-end, end, x.dtype)])
 
     return enclosed
 
@@ -171,46 +162,23 @@ def _whole(value: Callable[[Reals], Reals]) -> Callable[[Form], Form]:
 
 
 def _tangent(x: Form) -> Form:
-    with np.errstate(all="ignore"):
-        low, high = x.bounds()
-        branch = np.round((low / 2 + high / 2) / np.pi)
-        edge = np.pi / 2 - 1e-6
-        broken = (low <= branch * np.pi - edge) | (high >= branch * np.pi + edge)
-        broken |= np.maximum(np.abs(low), np.abs(high)) > PERIODIC
-        form = _TAN(x)
-        _make_unknown(form, broken)
-        return form
+    low, high = x.bounds()
+    branch = np.round((low / 2 + high / 2) / np.pi)
+    edge = np.pi / 2 - 1e-6
+    whole = (low > branch * np.pi - edge) & (high < branch * np.pi + edge)
+    return _but(_TAN(x), whole & (np.maximum(np.abs(low), np.abs(high)) < PERIODIC))
 
 
-def _make_unknown(form: Form, where: np.ndarray) -> None:
-    """Let a form be everything at some numbers."""
-    if not np.any(where):
-        return
-    form.radius, form.size = (
-        np.where(where, np.inf, form.radius),
-        np.where(where, np.inf, form.size),
-    )
-    if form.slopes is not None:
-        form.slopes = np.where(where, 0.0, form.slopes)
-    form.centre = np.where(where, 0.0, form.centre)
-    if form.low is not None and form.high is not None:
-        form.low = np.where(where, -np.inf, form.low)
-        form.high = np.where(where, np.inf, form.high)
-
-
-def _of_positive(function: Callable[[Form], Form], x: Form) -> Form:
-    """Return a function of positive numbers; everything for zero, which may be a negative one."""
-    form = function(x)
-    _make_unknown(form, np.broadcast_to(~(x.bounds()[0] > 0), form.centre.shape))
+def _but(form: Form, unless: np.ndarray) -> Form:
+    """Return a result that is everything, unless its operands are as they should be."""
+    form.forget(np.broadcast_to(~unless, form.centre.shape))
     return form
 
 
-def _reciprocal_of_sign(x: Form) -> Form:
+def _reciprocal(x: Form) -> Form:
     """Return `1 / x` of numbers of one sign; everything for those that may be zero."""
     low, high = x.bounds()
-    form = _RECIPROCAL(x)
-    _make_unknown(form, ~((low > 0) | (high < 0)))
-    return form
+    return _but(_RECIPROCAL(x), (low > 0) | (high < 0))
 
 
 _ROOT_PI = np.sqrt(np.pi)
@@ -241,7 +209,8 @@ FUNCTIONS: dict[str, Callable[[Form], Form]] = {
     "log": Function(np.log, _single(lambda a: 1 / a), _POSITIVE),
     "log1p": Function(np.log1p, _single(lambda a: 1 / a - 1), (-1.0, np.inf)),
     "sqrt": Function(np.sqrt, _single(lambda a: 1 / (4 * a * a)), _POSITIVE, range=_POSITIVE),
-    "rsqrt": lambda x: _of_positive(_RSQRT, x),
+    # Of zero, which may be a negative one, it is an infinity of either sign.
+    "rsqrt": lambda x: _but(_RSQRT(x), x.bounds()[0] > 0),
     # Of numbers that are not normal it has the size of the root of the smallest that is.
     "cbrt": Function(np.cbrt, _even(lambda a: (3 * a) ** -1.5), units=40.0, tiny=1e26),
     "tanh": Function(np.tanh, _even(lambda a: np.arccosh(1 / np.sqrt(a))), range=(-1.0, 1.0)),
@@ -259,9 +228,7 @@ FUNCTIONS: dict[str, Callable[[Form], Form]] = {
     "acos": Function(np.arccos, _even(lambda a: np.sqrt(1 - 1 / a**2)), (-1.0, 1.0)),
     "atan": Function(np.arctan, _even(lambda a: np.sqrt(1 / a - 1))),
     "erf": Function(special.erf, _even(lambda a: np.sqrt(-np.log(a * _ROOT_PI / 2)))),
-    "erfc": Function(
-        special.erfc, _even(lambda a: np.sqrt(-np.log(-a * _ROOT_PI / 2)))
-    ),
+    "erfc": Function(special.erfc, _even(lambda a: np.sqrt(-np.log(-a * _ROOT_PI / 2)))),
     "abs": Function(np.abs, _single(np.zeros_like), units=0.0, range=_POSITIVE),
     "square": _of_power(2),
     "sin": _sine(np.sin, _periodic(np.arccos, 2 * np.pi)),
@@ -296,18 +263,17 @@ def integer_power(x: Form, n: int) -> Form:
     if n == 0:
         return Form.constant(np.ones(x.shape), x.dtype)
     if n < 0:
-        return _reciprocal_of_sign(integer_power(x, -n))
+        return _reciprocal(integer_power(x, -n))
     return x if n == 1 else _of_power(n)(x)
 
 
 def quotient(a: Form, b: Form) -> Form:
     """Return `a / b`; everything where `b` may be zero."""
-    with np.errstate(all="ignore"):
-        if is_point(b) and np.all((b.centre != 0) & np.isfinite(b.centre)):
-            inverse = 1 / b.centre
-            if np.isfinite(inverse).all():
-                return _widened(scaled(a, inverse), 3.0)
-        return _widened(product(a, _reciprocal_of_sign(b)), 3.0)
+    if is_point(b) and np.all((b.centre != 0) & np.isfinite(b.centre)):
+        inverse = 1 / b.centre
+        if np.isfinite(inverse).all():
+            return _widened(scaled(a, inverse), 3.0)
+    return _widened(product(a, _reciprocal(b)), 3.0)
 
 
 def _widened(x: Form, units: float) -> Form:
@@ -322,23 +288,22 @@ def _widened(x: Form, units: float) -> Form:
 def greater(a: Form, b: Form) -> Form:
     """Return the maximum: `b + max(a - b, 0)`, which keeps what both depend on."""
     (low, high), (first, last) = a.bounds(), b.bounds()
-    with np.errstate(all="ignore"):
-        nothing = unknown(low, high) | unknown(first, last)
-        ours, theirs = (low >= last) & ~nothing, (first >= high) & ~nothing
-        least, most = np.maximum(low, first), np.maximum(high, last)
-        ends = np.where(nothing, -np.inf, least), np.where(nothing, np.inf, most)
-        if a.slopes is None and b.slopes is None:
-            return Form.between(*ends, a.dtype)
-        mixed = ~(ours | theirs)
-        if not np.any(mixed):
-            return chosen([ours, theirs], [a, b])
-        ramp = add(b, _RAMP(difference(a, b)))
-        size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
-        both = rounded(
-            ramp.centre, ramp.slopes, ramp.radius, np.broadcast_to(size, ramp.size.shape),
-            a.dtype, ends, ramp.frame, exact=True,
-        )  # fmt: skip
-        return chosen([ours, theirs, mixed], [a, b, both])
+    nothing = unknown(low, high) | unknown(first, last)
+    ours, theirs = (low >= last) & ~nothing, (first >= high) & ~nothing
+    lowest, top = np.maximum(low, first), np.maximum(high, last)
+    ends = np.where(nothing, -np.inf, lowest), np.where(nothing, np.inf, top)
+    if a.slopes is None and b.slopes is None:
+        return Form.between(*ends, a.dtype)
+    mixed = ~(ours | theirs)
+    if not np.any(mixed):
+        return chosen([ours, theirs], [a, b])
+    ramp = add(b, _RAMP(difference(a, b)))
+    size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+    both = rounded(
+        ramp.centre, ramp.slopes, ramp.radius, np.broadcast_to(size, ramp.size.shape),
+        a.dtype, ends, ramp.frame, exact=True,
+    )  # fmt: skip
+    return chosen([ours, theirs, mixed], [a, b, both])
 
 
 def lesser(a: Form, b: Form) -> Form:
@@ -349,36 +314,31 @@ def lesser(a: Form, b: Form) -> Form:
 def difference(a: Form, b: Form) -> Form:
     """Return `a - b` of numbers as they are, not rounded: what a comparison sees."""
     a, b = a.of_type(np.dtype(np.float64)), b.of_type(np.dtype(np.float64))
-    form = add(a, b, -1.0)
-    (low, high), (first, last) = a.bounds(), b.bounds()
-    nothing = unknown(low, high) | unknown(first, last)
-    _make_unknown(form, nothing)
-    return form
+    return _but(add(a, b, -1.0), ~(unknown(*a.bounds()) | unknown(*b.bounds())))
 
 
 def remainder(a: Form, b: Form) -> Form:
     """Return what a division leaves, with the sign of `a`."""
-    with np.errstate(all="ignore"):
-        (low, high), (first, last) = a.bounds(), b.bounds()
-        nothing = ~np.isfinite(low) | ~np.isfinite(high) | ~np.isfinite(first) | ~np.isfinite(last)
-        nothing = nothing | ~((first > 0) | (last < 0))
-        most = np.maximum(np.abs(first), np.abs(last))
-        # The remainder is exact, so that only the number of divisors has to be the same.
-        ends = [np.trunc(x / y * s) for x in (low, high) for y in (first, last)
-                for s in (1 - 1e-14, 1 + 1e-14)]  # fmt: skip
-        same = np.logical_and.reduce([end == ends[0] for end in ends]) & ~nothing
-        wide = Form.between(
-            np.where(nothing, -np.inf, np.where(low >= 0, 0.0, np.maximum(-most, low))),
-            np.where(nothing, np.inf, np.where(high <= 0, 0.0, np.minimum(most, high))),
-            a.dtype,
-        )
-        if not np.any(same):
-            return wide
-        count = np.where(same, ends[0], 0.0)
-        times = Form.between(count, count, a.dtype)
-        exact = add(a, product(times, b), -1.0)
-        exact.low = exact.high = None
-        return chosen([same, ~same], [exact, wide])
+    (low, high), (first, last) = a.bounds(), b.bounds()
+    nothing = ~np.isfinite(low) | ~np.isfinite(high) | ~np.isfinite(first) | ~np.isfinite(last)
+    nothing = nothing | ~((first > 0) | (last < 0))
+    top = np.maximum(np.abs(first), np.abs(last))
+    # The remainder is exact, so that only the number of divisors has to be the same.
+    ends = [np.trunc(x / y * s) for x in (low, high) for y in (first, last)
+            for s in (1 - 1e-14, 1 + 1e-14)]  # fmt: skip
+    same = np.logical_and.reduce([end == ends[0] for end in ends]) & ~nothing
+    wide = Form.between(
+        np.where(nothing, -np.inf, np.where(low >= 0, 0.0, np.maximum(-top, low))),
+        np.where(nothing, np.inf, np.where(high <= 0, 0.0, np.minimum(top, high))),
+        a.dtype,
+    )
+    if not np.any(same):
+        return wide
+    count = np.where(same, ends[0], 0.0)
+    times = Form.between(count, count, a.dtype)
+    exact = add(a, product(times, b), -1.0)
+    exact.low = exact.high = None
+    return chosen([same, ~same], [exact, wide])
 
 
 def power(a: Form, b: Form) -> Form:
@@ -389,7 +349,7 @@ def power(a: Form, b: Form) -> Form:
             return _widened(integer_power(a, int(exponent)), UNITS)
         if exponent == 0.5:
             return _widened(FUNCTIONS["sqrt"](a), UNITS)
-    return _of_positive(lambda x: FUNCTIONS["exp"](product(b, FUNCTIONS["log"](x))), a)
+    return _but(FUNCTIONS["exp"](product(b, FUNCTIONS["log"](a))), a.bounds()[0] > 0)
 
 
 def angle(y: Form, x: Form) -> Form:
@@ -412,18 +372,12 @@ def angle(y: Form, x: Form) -> Form:
         ends = np.full(ratio.centre.shape, by)
         return add(Form.between(ends, ends, y.dtype), FUNCTIONS["atan"](ratio))
 
-    with np.errstate(all="ignore"):
-        cases = [
-            turned(0.0, quotient(y, x)),
-            turned(np.pi / 2, negative(quotient(x, y))),
-            turned(-np.pi / 2, negative(quotient(x, y))),
-        ]
+    cases = [
+        turned(0.0, quotient(y, x)),
+        turned(np.pi / 2, negative(quotient(x, y))),
+        turned(-np.pi / 2, negative(quotient(x, y))),
+    ]
     return _widened(chosen([*masks, rest], [*cases, circle]), UNITS)
-
-
-def clamped(low: Form, x: Form, high: Form) -> Form:
-    """Return numbers moved between two ends."""
-    return lesser(greater(x, low), high)
 
 
 def selected(truth: np.ndarray, maybe: np.ndarray, no: Form, yes: Form) -> Form:

@@ -6,7 +6,7 @@ What an operation does is in the tables of `elementwise.py`, `arrays.py` and `co
 by the name of JAX's primitive.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import jax
@@ -27,7 +27,7 @@ Program: TypeAlias = Any
 """A `Jaxpr` or a `ClosedJaxpr`."""
 Rule: TypeAlias = Callable[["Interpreter", Equation, list[Value]], list[Value]]
 
-Known: TypeAlias = Callable[["Interpreter", list[Value]], list[Value]]
+Known: TypeAlias = Callable[[Program], Callable[[list[Value]], list[Value]] | None]
 
 RULES: dict[str, Rule] = {}
 """What each primitive does with sets, by its name."""
@@ -54,11 +54,11 @@ class Interpreter:
 
     - `boxes`: size of the batch.
     - `features`: number of symbols that stand for features.
-    - `known`: rules for functions with a derivative of their own, by the text of their program.
+    - `known`: a rule for a function with a derivative of its own, by its program; or None.
     """
 
-    def __init__(self, boxes: int, features: int, known: Mapping[str, Known] | None = None) -> None:
-        self.boxes, self.features, self.known = boxes, features, known or {}
+    def __init__(self, boxes: int, features: int, known: Known | None = None) -> None:
+        self.boxes, self.features, self.known = boxes, features, known
 
     def __call__(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
         """Evaluate a traced program; what is not defined becomes a set that is everything.
@@ -85,12 +85,9 @@ class Interpreter:
                 return constant(each.val, each.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
             return values[each]
 
-        last = _last_uses(program)
-        for index, step in enumerate(program.eqns):
+        for step in program.eqns:
             results = self.step(step, [read(each) for each in step.invars])
             values.update(zip(step.outvars, results, strict=True))
-            for variable in last.get(index, ()):
-                values.pop(variable, None)
         return [read(each) for each in program.outvars]
 
     def closed(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
@@ -134,20 +131,6 @@ def constant(value: ArrayLike, dtype: np.dtype) -> Value:
     if jnp.issubdtype(dtype, jnp.integer) or dtype == jnp.bool_:
         return Whole.constant(np.asarray(value), np.dtype(dtype))
     raise MissingRule(f"sets have no numbers of type {dtype}")
-
-
-def _last_uses(program: Program) -> dict[int, list[object]]:
-    """Return which variables no operation needs after which one."""
-    kept = {id(each) for each in program.outvars}
-    last: dict[int, tuple[int, object]] = {}
-    for index, step in enumerate(program.eqns):
-        for each in (*step.invars, *step.outvars):
-            if id(each) not in kept and not isinstance(each, jax.extend.core.Literal):
-                last[id(each)] = (index, each)
-    ends: dict[int, list[object]] = {}
-    for index, each in last.values():
-        ends.setdefault(index, []).append(each)
-    return ends
 
 
 def _where(step: Equation) -> str:

@@ -28,7 +28,7 @@ class Whole:
     @classmethod
     def truth(cls, true: np.ndarray, false: np.ndarray) -> "Whole":
         """Return truth values: where they are true for certain, and where false."""
-        return cls((true).astype(np.int64), (~false).astype(np.int64), np.dtype(bool))
+        return cls(true.astype(np.int64), (~false).astype(np.int64), np.dtype(bool))
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -37,7 +37,7 @@ class Whole:
 
     @property
     def is_point(self) -> bool:
-        """Whether each is one number."""
+        """True if each is one number."""
         return self.low is self.high or bool((self.low == self.high).all())
 
     @property
@@ -85,25 +85,20 @@ def _by_corners(operation: Callable[..., Numbers]) -> Callable[[Whole, Whole], W
 
 
 def _logic(operation: Callable[..., np.ndarray]) -> Callable[[Whole, Whole], Whole]:
+    """Return an operation on bits: of truth values, of single numbers, and with a mask."""
+
     def applied(a: Whole, b: Whole) -> Whole:
-        if a.dtype != np.bool_ and not (a.is_point and b.is_point):
-            if operation is np.bitwise_and and (b if b.is_point else a).low.min() >= 0:
-                mask = b if b.is_point else a
-                return Whole(np.zeros_like(mask.low), mask.high, a.dtype)
-            raise NotImplementedError("a bitwise operation on whole numbers that vary in a box")
-        return Whole(operation(a.low, b.low), operation(a.high, b.high), a.dtype)
+        if a.dtype == np.bool_ and operation is np.bitwise_xor:
+            true, false = a.true & b.false | a.false & b.true, a.true & b.true | a.false & b.false
+            return Whole.truth(true, false)
+        if a.dtype == np.bool_ or (a.is_point and b.is_point):
+            return Whole(operation(a.low, b.low), operation(a.high, b.high), a.dtype)
+        mask = b if b.is_point else a
+        if operation is np.bitwise_and and mask.low.min() >= 0:
+            return Whole(np.zeros_like(mask.low), mask.high, a.dtype)
+        raise NotImplementedError("a bitwise operation on whole numbers that vary in a box")
 
     return applied
-
-
-def _exclusive(a: Whole, b: Whole) -> Whole:
-    if a.is_point and b.is_point:
-        return Whole(a.low ^ b.low, a.low ^ b.low, a.dtype)
-    if a.dtype != np.bool_:
-        raise NotImplementedError("a bitwise operation on whole numbers that vary in a box")
-    return Whole.truth(
-        (a.true & b.false) | (a.false & b.true), (a.true & b.true) | (a.false & b.false)
-    )
 
 
 def _divided(a: Whole, b: Whole) -> Whole:
@@ -114,8 +109,8 @@ def _divided(a: Whole, b: Whole) -> Whole:
 
 def _left(a: Whole, b: Whole) -> Whole:
     _check_divisor(b)
-    most = np.maximum(np.abs(b.low), np.abs(b.high)) - 1
-    low, high = np.maximum(a.low, -most), np.minimum(a.high, most)
+    top = np.maximum(np.abs(b.low), np.abs(b.high)) - 1
+    low, high = np.maximum(a.low, -top), np.minimum(a.high, top)
     return Whole(np.where(a.low >= 0, 0, low), np.where(a.high <= 0, 0, high), a.dtype)
 
 
@@ -134,23 +129,36 @@ OPERATIONS: dict[str, Callable[[Whole, Whole], Whole]] = {
     "min": lambda a, b: Whole(np.minimum(a.low, b.low), np.minimum(a.high, b.high), a.dtype),
     "and": _logic(np.bitwise_and),
     "or": _logic(np.bitwise_or),
-    "xor": _exclusive,
+    "xor": _logic(np.bitwise_xor),
 }
 """Operations on two sets, by the name of JAX's primitive."""
 
 
-def absolute(a: Whole) -> Whole:
-    """Return absolute values."""
+def _absolute(a: Whole) -> Whole:
     low = np.where((a.low <= 0) & (a.high >= 0), 0, np.minimum(np.abs(a.low), np.abs(a.high)))
     return _within(low, np.maximum(np.abs(a.low), np.abs(a.high)), a.dtype)
 
 
-def inverted(a: Whole) -> Whole:
-    """Return the other truth value, or the other bits."""
+def _inverted(a: Whole) -> Whole:
     if a.dtype == np.bool_:
         return Whole(1 - a.high, 1 - a.low, a.dtype)
-    return Whole(~a.high, ~a.low, a.dtype)
+    top = np.iinfo(a.dtype).max if a.dtype.kind == "u" else -1
+    return Whole(top - a.high, top - a.low, a.dtype)
 
+
+def _squared(a: Whole) -> Whole:
+    size = _absolute(a)
+    return OPERATIONS["mul"](size, size)
+
+
+FUNCTIONS: dict[str, Callable[[Whole], Whole]] = {
+    "abs": _absolute,
+    "neg": lambda a: _within(-a.high, -a.low, a.dtype),
+    "not": _inverted,
+    "sign": lambda a: Whole(np.sign(a.low), np.sign(a.high), a.dtype),
+    "square": _squared,
+}
+"""Operations on one set, by the name of JAX's primitive."""
 
 COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
 

@@ -54,7 +54,7 @@ class Stratum(NamedTuple):
 class StratifiedRate:
     """A failure rate from two strata.
 
-    - `estimate`: of the rate; `low`, `high`: bounds of it.
+    - `estimate`: the estimate of the rate; `low`, `high`: bounds of it.
     - `confidence`: probability with which the bounds hold.
     - `trials`: in both strata together.
     - `pooled`: the interval of Clopper and Pearson of the same trials, without strata.

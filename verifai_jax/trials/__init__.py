@@ -12,6 +12,8 @@ from verifai_jax.core.lazy import attach
 
 if TYPE_CHECKING:
     from verifai_jax.trials._real_trials import real_trials as real_trials
+    from verifai_jax.trials.calibration import Calibration as Calibration
+    from verifai_jax.trials.calibration import calibrate as calibrate
     from verifai_jax.trials.policies import TrialComparison as TrialComparison
     from verifai_jax.trials.policies import compare_trials as compare_trials
     from verifai_jax.trials.protocol import trial_protocol as trial_protocol

@@ -12,7 +12,6 @@ simulation is worth.
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool
 
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.errors import suggests_options
@@ -62,9 +61,9 @@ def real_trials(
     - `trials`: the path of a CSV or Parquet file, or a data frame: a column for each feature as in
       the table of a run, and `failed` (yes or no; empty where a trial may have failed), or
       `recording` with a file of signals for each trial, which the formulas judge.
-    - `simulations`: of the prior, which say how often a failure is predicted.
+    - `simulations`: the simulations of the prior, which say how often a failure is predicted.
     - `confidence`: probability with which the interval is to hold.
-    - `seed`: of the simulations.
+    - `seed`: the seed of the simulations.
     - `allocated`: the numbers of trials that are predicted to fail and not to fail were chosen
       beforehand, as `next_trials` does; without that trials are samples of the prior.
     - `at_any_time`: verdicts decided which trials were made, or when to stop.
@@ -81,7 +80,7 @@ def real_trials(
     check_fraction("confidence", confidence)
     check_count("simulations", simulations)
     table, unread = read_trials(problem, trials, time=time, dt=dt)
-    features = table[list(problem.space.columns)]
+    features = table.loc[:, list(problem.space.columns)]
     same = simulate(
         problem, features, seed=seed, precision=precision, executor=executor, progress=progress
     )
@@ -98,7 +97,7 @@ def real_trials(
     sides = [~predicted, predicted]
     rate = stratified_rate(
         *((int(np.sum(failed & side)), int(np.sum(side))) for side in sides),
-        share=(int(background["predicted"].sum()), len(background)),
+        share=(int(np.sum(background["predicted"].to_numpy(bool))), len(background)),
         confidence=confidence,
         undecided=tuple(int(np.sum(open_ones & side)) for side in sides),  # pyright: ignore
         allocated=allocated,
@@ -107,7 +106,7 @@ def real_trials(
     notes = [f"{counted(n, 'recording')} without a verdict: {why}" for why, n in unread.items()]
     if not (allocated or at_any_time):
         notes += _unlike_prior(problem, features)
-    without = int(same.table.all["rho"].isna().sum()) if len(same.table.all) else 0
+    without = int(np.sum(np.isnan(same.table.all["rho"].to_numpy(float))))
     if without:
         notes.append(
             f"the simulation of {counted(without, 'trial')} has no verdict, and predicts no failure"
@@ -115,7 +114,7 @@ def real_trials(
     return RealTrials(problem, table, background, rate, seed, tuple(notes))
 
 
-def _predictions(run: Run) -> "dict[str, Bool[np.ndarray, ' n'] | pd.Series]":
+def _predictions(run: Run) -> dict[str, Any]:
     rows = run.table.all
     return {
         "predicted": rows["violated"].to_numpy(bool),

@@ -53,11 +53,11 @@ def trial_protocol(
     **Arguments:**
 
     - `problem`: its features are drawn from the prior; its formulas are the property.
-    - `path`: of the HTML file.
+    - `path`: the path of the HTML file.
     - `count`: number of trials, or of pairs.
     - `policies`: names of two policies to compare.
     - `trials`: features of the trials instead, such as those of `next_trials`.
-    - `seed`: of the features, the order and the codes.
+    - `seed`: the seed of the features, the order and the codes.
 
     **Returns:** the table.
 
@@ -74,13 +74,13 @@ def trial_protocol(
     if trials is None:
         drawn = problem.space.sample(jax.random.key(seed), count)
         trials = pd.DataFrame(problem.space.rows(drawn))
-    table = trials[columns].reset_index(drop=True)
+    table = trials.loc[:, columns].reset_index(drop=True)
     key = pd.DataFrame({"code": ["A", "B"], "policy": rng.permutation(list(policies))[:2]}
                        if policies else {"code": [], "policy": []})  # fmt: skip
     if policies:
         order = np.concatenate([rng.permutation(2) for _ in range(len(table))])
         pairs = np.repeat(np.arange(len(table)), 2)
-        table = table.iloc[pairs].reset_index(drop=True)
+        table = table.take(pairs).reset_index(drop=True)
         table.insert(0, "policy", [key["code"][code] for code in order])
         table.insert(0, "pair", pairs + 1)
     table.insert(0, "trial", np.arange(1, len(table) + 1))
@@ -99,7 +99,7 @@ def _page(problem: Problem, table: "pd.DataFrame", seed: int) -> str:
     head = [name for name in table.columns if name != "failed"]
     cells = "".join(f"<th>{escape(name)}</th>" for name in (*head, "failed", "remarks"))
     rows = []
-    for record in table[head].to_dict("records"):
+    for record in table.loc[:, head].to_dict("records"):
         values = (f"{v:z.6g}" if isinstance(v, float) else str(v) for v in record.values())
         texts = "".join(f"<td>{escape(text)}</td>" for text in values)
         rows.append(f"<tr>{texts}<td>&#9744; yes &#9744; no</td><td></td></tr>")

@@ -32,7 +32,7 @@ class RealTrials(InNotebook):
       that is open), whether the simulation `predicted` that, and the simulated `robustness`.
     - `background`: features, `predicted` and `robustness` of the simulated samples of the prior.
     - `rate`: the failure rate in reality with its interval, from trials and simulations.
-    - `seed`: of the simulations.
+    - `seed`: the seed of the simulations.
     - `notes`: sentences on anything surprising.
     """
 
@@ -47,7 +47,8 @@ class RealTrials(InNotebook):
     def simulated(self) -> Rate:
         """The failure rate of the simulation alone."""
         predicted = self.background["predicted"]
-        return clopper_pearson(int(predicted.sum()), len(predicted), self.rate.confidence)
+        count = int(np.sum(predicted.to_numpy(bool)))
+        return clopper_pearson(count, len(predicted), self.rate.confidence)
 
     def predictions(self, predicted: bool) -> Rate | None:
         """Return how often the trials fail that are predicted to, or those that are not.
@@ -63,21 +64,21 @@ class RealTrials(InNotebook):
     @property
     def wrong(self) -> "pd.DataFrame":
         """The trials whose verdict is not the predicted one."""
-        known = self.table[[verdict is not None for verdict in self.table["failed"]]]
-        return known[known["failed"].astype(bool) != known["predicted"]]
+        known = self.table.loc[[verdict is not None for verdict in self.table["failed"]]]
+        return known.loc[known["failed"].astype(bool) != known["predicted"]]
 
     def rules(self, **options: Any) -> "Rules":
         """Describe by a few boxes of the features where the simulation is wrong; see `vj.rules`.
 
         **Arguments:**
 
-        - `options`: of `analysis.rules`.
+        - `options`: the options of `analysis.rules`.
 
         **Raises:** `ValueError` where all predictions are right, or all wrong.
         """
         columns = list(self.problem.space.columns)
-        known = self.table[[verdict is not None for verdict in self.table["failed"]]]
-        rows = known[columns].assign(violated=known.index.isin(self.wrong.index))
+        known = self.table.loc[[verdict is not None for verdict in self.table["failed"]]]
+        rows = known.loc[:, columns].assign(violated=known.index.isin(self.wrong.index))
         return find_rules(Samples.of(rows, "all", columns, self.problem.space), **options)
 
     def next_trials(self, count: int = 1, *, seed: int = 0) -> "pd.DataFrame":
@@ -91,7 +92,7 @@ class RealTrials(InNotebook):
         **Arguments:**
 
         - `count`: number of trials.
-        - `seed`: of the draw.
+        - `seed`: the seed of the draw.
 
         **Returns:** the features, `predicted` and the simulated `robustness` of each.
         """

@@ -1,7 +1,6 @@
 """Branch and bound over boxes of the feature space: `verify`."""
 
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +23,10 @@ REST = 0.08
 """Share of the seconds that is kept for the samples of what stays undecided."""
 REACH = 0.45
 """Where a box is sampled, as a share of its width from the middle: inside, not on its faces."""
+CONTRADICTED = (
+    "boxes have a simulation outside of their bounds, and stay undecided: this is a mistake of "
+    "verifai_jax, please report it"
+)
 CANDIDATES = 4096
 """Failing points that are confirmed when the budget is spent, those of the largest boxes first."""
 
@@ -56,9 +59,9 @@ def verify(
     - `budget`: seconds, about; 60 if `boxes` is left out too. One may stop at any time with Ctrl-C.
     - `boxes`: number of boxes to look at, at most.
     - `samples`: simulations from the prior of what stays undecided, which bound how often it fails.
-    - `confidence`: of that bound, which holds whenever one stops.
-    - `seed`: of the samples.
-    - `precision`: of the simulations that are verified, `"float32"` or `"float64"`.
+    - `confidence`: the confidence of that bound, which holds whenever one stops.
+    - `seed`: the seed of the samples.
+    - `precision`: the precision of the simulations that are verified, `"float32"` or `"float64"`.
     - `resume`: an earlier result of the same problem, or its file, to go on with.
     - `progress`: as in `falsify`.
 
@@ -96,7 +99,7 @@ def verify(
         before.check_same(problem, precision)
     enclosure = Enclosure(problem, precision)
     found = Boxes.whole(enclosure) if before is None else before.boxes
-    work = _Work(problem, enclosure, found, precision, seed)
+    work = _Work(problem, enclosure, found, seed)
     end = None if seconds is None else started + seconds * (1 - REST)
     stopped = work.go_on(end, boxes)
     work.confirm()
@@ -106,45 +109,36 @@ def verify(
         **described(problem),
         columns=problem.space.coordinates,
         boxes=work.boxes,
-        shares=enclosure.shares(work.boxes.low), upper_shares=enclosure.shares(work.boxes.high),
+        shares=enclosure.ranges.shares(work.boxes.low),
+        upper_shares=enclosure.ranges.shares(work.boxes.high),
         precision=precision,
         confidence=confidence,
         looked_at=work.looked_at + (0 if before is None else before.looked_at),
         simulations=work.evaluator.simulations + (0 if before is None else before.simulations),
         seconds=seconds + (0 if before is None else before.seconds),
         stopped=stopped,
-        notes=work.notes(),
+        notes=(f"{work.contradicted} {CONTRADICTED}",) if work.contradicted else (),
         version=__version__,
     )  # fmt: skip
 
 
-@dataclass
 class _Work:
     """The boxes, and what looks at them."""
 
-    problem: Problem
-    enclosure: Enclosure
-    boxes: Boxes
-    precision: str
-    seed: int
-    looked_at: int = 0
-    contradicted: int = 0
-    evaluator: Evaluator = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.evaluator = Evaluator(
-            self.problem, batch=4096, precision=self.precision, seed=self.seed
-        )
+    def __init__(self, problem: Problem, enclosure: Enclosure, boxes: Boxes, seed: int) -> None:
+        self.problem, self.enclosure, self.boxes, self.seed = problem, enclosure, boxes, seed
+        self.looked_at = self.contradicted = 0
+        self.evaluator = Evaluator(problem, 4096, precision=enclosure.precision, seed=seed)
 
     def go_on(self, end: float | None, limit: int | None) -> str:
         """Look at boxes, the most probable first; return why it stopped."""
-        most, count, rate = TOGETHER * available_cores(), 32, 1e6
+        top, count, rate = TOGETHER * available_cores(), 32, 1e6
         try:
             while True:
                 now = time.perf_counter()
                 open_ones = np.flatnonzero(self.boxes.state == OPEN)
                 can = self.boxes[open_ones].splittable(self.enclosure).any(1)
-                new = np.isinf(self.boxes.least[open_ones])
+                new = np.isinf(self.boxes.lowest[open_ones])
                 open_ones = open_ones[can | new]
                 if not len(open_ones):
                     return "all boxes are decided or too narrow"
@@ -157,7 +151,7 @@ class _Work:
                 mass = self.boxes.mass[open_ones]
                 self.look_at(open_ones[np.argsort(-mass, kind="stable")[:count]])
                 rate = count / (time.perf_counter() - now)
-                count = min(2 * count, most)
+                count = min(2 * count, top)
                 decided = float(self.boxes.mass[self.boxes.state != OPEN].sum())
                 say_done(self.looked_at, limit, f"{100 * decided:z.3g} % decided")
         except KeyboardInterrupt:
@@ -177,7 +171,7 @@ class _Work:
         moves = np.zeros(some.low.shape)
         if len(worth):
             bounds = self.enclosure(some.low[worth], some.high[worth])
-            some.least[worth], some.greatest[worth] = bounds.low, bounds.high
+            some.lowest[worth], some.highest[worth] = bounds.low, bounds.high
             moves[worth] = bounds.moves
             state = np.where(bounds.holds, PROVED, np.where(bounds.high < 0, BROKEN, OPEN))
             # A box that the constraint cuts is split until it does so no more: its mass is unknown.
@@ -194,7 +188,7 @@ class _Work:
         split = (some.state == OPEN) & can.any(1)
         kept = np.ones(len(self.boxes), bool)
         kept[rows[split]] = False
-        for name in ("state", "least", "greatest", "witness", "confirmed"):
+        for name in ("state", "lowest", "highest", "witness", "confirmed"):
             getattr(self.boxes, name)[rows] = getattr(some, name)
         along = self.influence(some, robustness, moves, can)
         halves = some[split].halves(along[split], self.enclosure)
@@ -238,8 +232,8 @@ class _Work:
         middle, up, down = values[:, :1], values[:, 1::2], values[:, 2::2]
         change = np.abs(up - down) + 2 * np.abs(up + down - 2 * middle)
         seen = values.max(1) - values.min(1) + 1e-30
-        excess = np.clip(some.greatest - some.least, 0, 1e29) - seen
-        loose = np.where(moves.any(1), np.clip(excess / (excess + seen), 0, 1), 0)[:, None]
+        wide = np.clip(some.highest - some.lowest, 1e-30, 1e29)
+        loose = np.where(moves.any(1), np.clip(1 - seen / wide, 0, 1), 0)[:, None]
         # A coordinate without influence at these points may have one between them.
         width = 0.1 * _relative(some.high - some.low)
         score = (1 - loose) * _relative(change) + loose * _relative(moves) + width
@@ -275,15 +269,6 @@ class _Work:
         np.add.at(self.boxes.failures, chosen, failing)
         failed = np.flatnonzero(verdicts.violated & failing)
         self.boxes.witness[chosen[failed]] = points[failed]
-
-    def notes(self) -> tuple[str, ...]:
-        """Return what a person should know."""
-        if not self.contradicted:
-            return ()
-        return (
-            f"{self.contradicted} boxes have a simulation outside of their bounds, and stay "
-            "undecided: this is a mistake of verifai_jax, please report it",
-        )
 
 
 def _relative(numbers: Float[np.ndarray, "n dim"]) -> Float[np.ndarray, "n dim"]:

@@ -28,7 +28,7 @@ class Boxes:
 
     - `low`, `high`: `[n, dim]`, corners.
     - `state`: `[n]`, `OPEN`, `PROVED`, `BROKEN` or `OUTSIDE`.
-    - `least`, `greatest`: `[n]`, bounds of the robustness; infinite where nothing is known.
+    - `lowest`, `highest`: `[n]`, bounds of the robustness; infinite where nothing is known.
     - `witness`: `[n, dim]`, a point that fails as simulated; NaN without one.
     - `confirmed`: `[n]`, whether the witness fails for certain.
     - `failures`, `samples`: `[n]`, of independent samples of the box.
@@ -37,8 +37,8 @@ class Boxes:
     low: Float[np.ndarray, "n dim"]
     high: Float[np.ndarray, "n dim"]
     state: Int[np.ndarray, " n"]
-    least: Float[np.ndarray, " n"]
-    greatest: Float[np.ndarray, " n"]
+    lowest: Float[np.ndarray, " n"]
+    highest: Float[np.ndarray, " n"]
     witness: Float[np.ndarray, "n dim"]
     confirmed: Bool[np.ndarray, " n"]
     failures: Int[np.ndarray, " n"]
@@ -59,15 +59,11 @@ class Boxes:
 
         **Raises:** `ValueError` for too many combinations.
         """
-        space = enclosure.problem.space
-        sides: list[list[tuple[float, float]]] = []
-        for j, (ordered, edges) in enumerate(
-            zip(space.ordered, map(enclosure.edges, range(space.dim)), strict=True)
-        ):
-            apart = edges is not None and (not ordered or j in space.lengths)
-            sides.append(
-                list(itertools.pairwise(edges)) if apart and edges is not None else [(0.0, 1.0)]
-            )
+        space, sides = enclosure.problem.space, list[list[tuple[float, float]]]()
+        for j, edges in enumerate(enclosure.ranges.edges):
+            apart = not space.ordered[j] or j in space.lengths
+            cells = [] if edges is None or not apart else itertools.pairwise(edges.tolist())
+            sides.append([*cells] or [(0.0, 1.0)])
         count = math.prod(map(len, sides))
         if count > CHOICES:
             raise ValueError(
@@ -97,14 +93,14 @@ class Boxes:
 
     @property
     def has_witness(self) -> Bool[np.ndarray, " n"]:
-        """Whether a point of the box fails as simulated."""
+        """True if a point of the box fails as simulated."""
         return np.asarray(~np.isnan(self.witness).any(axis=1))
 
     def splittable(self, enclosure: Enclosure) -> Bool[np.ndarray, "n dim"]:
         """Return which coordinates of each box can be split."""
         wide = self.high - self.low > NARROWEST
         for j in range(wide.shape[1]):
-            edges = enclosure.edges(j)
+            edges = enclosure.ranges.edges[j]
             if edges is not None:
                 inside = np.searchsorted(edges, self.high[:, j]) - np.searchsorted(
                     edges, self.low[:, j]
@@ -118,7 +114,7 @@ class Boxes:
         low, high = self.low[rows, coordinate], self.high[rows, coordinate]
         middle = low / 2 + high / 2
         for j in np.unique(coordinate):
-            edges = enclosure.edges(int(j))
+            edges = enclosure.ranges.edges[int(j)]
             if edges is not None:
                 own = coordinate == j
                 first, last = (np.searchsorted(edges, end[own]) for end in (low, high))

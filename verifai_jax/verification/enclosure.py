@@ -8,8 +8,9 @@ and evaluated with sets. What it says holds for each simulation whose features l
 the box's corners, in real arithmetic and in the precision of the simulation.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -21,16 +22,15 @@ from verifai_jax.core.cores import available_cores
 from verifai_jax.core.fingerprint import without_unused
 from verifai_jax.core.precision import in_precision
 from verifai_jax.evaluation.verdicts import boolean_semantics, trace_verdict
+from verifai_jax.features.ranges import FeatureRanges
 from verifai_jax.problem.problem import Problem
 from verifai_jax.sets import Form, Interpreter, Whole
-from verifai_jax.sets.interpreter import Value, as_form, as_whole, constant
+from verifai_jax.sets.functions import FUNCTIONS
+from verifai_jax.sets.interpreter import Value, as_form, as_whole
 from verifai_jax.systems.ode import sin_cos
 
 TOGETHER = 512
 """Boxes that are evaluated at once: the arrays of a step then fit the cache."""
-ROUNDINGS = 8
-"""Roundings by which the map from coordinates to a feature may fail to rise."""
-
 Corners = Float[np.ndarray, "n dim"]
 
 
@@ -57,7 +57,7 @@ class Enclosure:
     **Arguments:**
 
     - `problem`: a checked one.
-    - `precision`: of simulations, `"float32"` or `"float64"`.
+    - `precision`: the precision of simulations, `"float32"` or `"float64"`.
     """
 
     def __init__(self, problem: Problem, precision: str) -> None:
@@ -80,8 +80,6 @@ class Enclosure:
 
             self._verdict = _program(verdict, form)
             self._truth = _program(truth, form)
-            self._known = _known_functions(precision)
-            self._values = jax.jit(jax.vmap(space.unflatten))
             # Name by name in the order of the leaves: which coordinates, and the program of domains
             # whose numbers are no monotone functions of one coordinate each.
             self._fields, start = {}, 0
@@ -91,74 +89,7 @@ class Enclosure:
                 self._fields[name] = slice(start, start + domain.size), part
                 start += domain.size
             self._forms = {name: jax.tree.leaves(form[name]) for name in sorted(form)}
-        self._edges = [
-            None if not count else np.cumsum([0.0, *(weights or (1 / count,) * count)])
-            for count, weights in zip(space.levels, space.weights, strict=True)
-        ]
-        self._symbols, self._scale, self._exact = self._dependence()
-
-    # Boxes and their cells
-
-    def edges(self, coordinate: int) -> Float[np.ndarray, " cells"] | None:
-        """Return where the cells of a coordinate begin and end; None if it is continuous."""
-        return self._edges[coordinate]
-
-    def ends(self, low: Corners, high: Corners) -> tuple[Corners, Corners]:
-        """Return the points of the cube that have the least and the greatest features of boxes."""
-        low, high = low.copy(), high.copy()
-        for j, edges in enumerate(self._edges):
-            if edges is not None:
-                first = np.searchsorted(edges[:-1], low[:, j], side="right") - 1
-                last = np.searchsorted(edges[1:], high[:, j], side="left")
-                last = np.clip(last, first, len(edges) - 2)
-                middles = (edges[1:] + edges[:-1]) / 2
-                low[:, j], high[:, j] = middles[first], middles[last]
-        return low, high
-
-    def _features(self, points: Corners) -> list[np.ndarray]:
-        with in_precision(self.precision):
-            dtype = np.dtype(self.precision)
-            count = max(TOGETHER, -(-len(points) // TOGETHER) * TOGETHER)
-            padded = np.resize(points.astype(dtype), (count, self.dim))
-            leaves = jax.tree.leaves(self._values(padded))
-        return [np.asarray(leaf)[: len(points)].astype(np.float64) for leaf in leaves]
-
-    def _dependence(self) -> tuple[list[np.ndarray], list[np.ndarray], list[bool]]:
-        """Return for each leaf on which coordinate its numbers depend, their size, and more.
-
-        The last is whether the map of its domain to its ends is exact.
-        """
-        levels = [np.full((1, self.dim), level) for level in (0.0, 0.25, 0.75)]
-        probes = np.concatenate([levels[0], np.eye(self.dim), *levels[1:]])
-        leaves = self._features(self.ends(probes, probes)[0] if self.dim else probes)
-        symbols = [(leaf[1:-2] != leaf[0]).astype(float) for leaf in leaves]
-        scale = [np.maximum(np.abs(leaf[-2]), np.abs(leaf[-1])) for leaf in leaves]
-        exact = [
-            self.problem.space.domains[name].uniform
-            for name, forms in self._forms.items() for _ in forms
-        ]  # fmt: skip
-        return symbols, scale, exact
-
-    def shares(self, points: Corners) -> Corners:
-        """Return where the features of points lie between their least and greatest, from 0 to 1."""
-        shares = points.astype(float).copy()
-        leaves = self._features(points)
-        ends = self._features(np.array([[0.0] * self.dim, [1.0] * self.dim]))
-        for leaf, end, symbols, exact in zip(leaves, ends, self._symbols, self._exact, strict=True):
-            if exact or not np.issubdtype(leaf.dtype, np.floating):
-                continue
-            flat = symbols.reshape(self.dim, -1)
-            for j in np.flatnonzero(flat.any(1)):
-                if self._edges[j] is None:
-                    at = int(np.argmax(flat[j]))
-                    value, (low, high) = (
-                        leaf.reshape(len(leaf), -1)[:, at],
-                        end.reshape(2, -1)[:, at],
-                    )
-                    shares[:, j] = (value - low) / (high - low)
-        return shares
-
-    # Sets
+        self.ranges = FeatureRanges(space, precision)
 
     def __call__(self, low: Corners, high: Corners) -> Bounds:
         """Return bounds over boxes `[n, dim]` between these points of the unit cube.
@@ -185,9 +116,9 @@ class Enclosure:
             low, high = (np.broadcast_to(end, (count, end.shape[1])) for end in ends)
             truth = np.broadcast_to(as_whole(accepted).low, (count,)) > 0
             outside = np.broadcast_to(as_whole(accepted).high, (count,)) <= 0
-            least = low.min(1)
-            holds = least > 0
-            if np.any(open_ones := least == 0):
+            lowest = low.min(1)
+            holds = lowest > 0
+            if np.any(open_ones := lowest == 0):
                 # At exactly zero the comparison decides, as it does for a simulation.
                 (kept,) = self._evaluated(self._truth, leaves, count)
                 true = np.broadcast_to(as_whole(kept).low, (count, low.shape[1])) > 0
@@ -195,52 +126,36 @@ class Enclosure:
             moves = np.zeros((count, self.dim))
             for form in signals:
                 if isinstance(form, Form) and form.slopes is not None:
-                    slopes = np.abs(form.slopes[: self.dim]).reshape(self.dim, -1, form.slopes[0, 0].size)
-                    moves += slopes.max(2).T / max(np.median(slopes.max((0, 2))), 1e-300)
-        return Bounds(least, high.min(1), holds, truth, outside, moves)
+                    slopes = np.abs(form.slopes[: self.dim])
+                    slopes = slopes.reshape(*slopes.shape[:2], -1).max(2)
+                    moves += slopes.T / max(np.median(slopes.max(0)), 1e-300)
+        return Bounds(lowest, high.min(1), holds, truth, outside, moves)
 
     def _evaluated(self, program: Any, leaves: Sequence[Value], count: int) -> list[Value]:
-        interpreter = Interpreter(count, self.dim, self._known)
+        interpreter = Interpreter(count, self.dim, _known)
         with in_precision(self.precision):
             return interpreter(program, leaves)
 
     def _leaves(self, low: Corners, high: Corners) -> list[Value]:
         """Return the features of boxes as sets, in the order of the leaves of their tree."""
-        first, last = self.ends(low, high)
-        begins, ends = self._features(first), self._features(last)
+        first, last = self.ranges.ends(low, high)
+        between = self.ranges(low, high)
         sets: list[Value] = []
         for name, forms in self._forms.items():
             span, part = self._fields[name]
-            if part is None:
-                count = len(sets)
-                sets += [
-                    self._leaf(count + i, each.dtype, begins, ends, low, high)
-                    for i, each in enumerate(forms)
-                ]
+            if part is not None:
+                symbols = np.eye(self.dim)[:, span]
+                unit = Form.leaf(first[:, span], last[:, span], symbols, np.dtype(self.precision))
+                sets += self._evaluated(part, [unit], len(low))
                 continue
-            symbols = np.eye(self.dim)[:, span]
-            unit = Form.leaf(first[:, span], last[:, span], symbols, np.dtype(self.precision))
-            sets += self._evaluated(part, [unit], len(low))
+            for form in forms:
+                begin, end, symbols = between[len(sets)]
+                kind = np.dtype(form.dtype)
+                if jnp.issubdtype(kind, jnp.floating):
+                    sets.append(Form.leaf(begin, end, symbols, kind))
+                else:
+                    sets.append(Whole(begin.astype(np.int64), end.astype(np.int64), kind))
         return sets
-
-    def _leaf(
-        self, i: int, dtype: np.dtype, begins: Sequence[np.ndarray], ends: Sequence[np.ndarray],
-        low: Corners, high: Corners,
-    ) -> Value:  # fmt: skip
-        begin, end = begins[i], ends[i]
-        if not jnp.issubdtype(dtype, jnp.floating):
-            return Whole(begin.astype(np.int64), end.astype(np.int64), np.dtype(dtype))
-        symbols = self._symbols[i]
-        size = np.maximum(np.maximum(np.abs(begin), np.abs(end)), self._scale[i])
-        margin = ROUNDINGS * float(jnp.finfo(dtype).eps) * size * symbols.any(0)
-        moved = [margin, margin]
-        if self._exact[i]:
-            # The ends of the whole interval are values themselves, and nothing lies beyond.
-            moved = [
-                margin * (1 - np.tensordot(1.0 * at_end, symbols, (1, 0)))
-                for at_end in (low == 0, high == 1)
-            ]
-        return Form.leaf(begin - moved[0], end + moved[1], symbols, np.dtype(dtype))
 
 
 def _rows(value: Value, block: slice) -> Value:
@@ -262,23 +177,33 @@ def _program(function: Any, form: PyTree) -> Any:
     return closed.replace(jaxpr=used)
 
 
-def _known_functions(precision: str) -> dict[str, Any]:
-    """Return rules for functions of this package that sets should not go into, by their program.
+def _known(program: Any) -> Callable[[list[Value]], list[Value]] | None:
+    """Return a rule for a function of this package that sets should not go into.
 
     `sin_cos` reduces its argument by a whole number of quarter turns, which boxes have several of.
     """
-    number = jax.ShapeDtypeStruct((), precision)
-    step = jax.make_jaxpr(sin_cos)(number).jaxpr.eqns
-    if len(step) != 1 or "call_jaxpr" not in step[0].params:
-        return {}
-    sin, cos = (jax.make_jaxpr(function)(number).jaxpr.eqns[0] for function in (jnp.sin, jnp.cos))
+    if len(program.in_avals) != 1 or program.consts:
+        return None
+    (form,) = program.in_avals
+    return _sin_cos if str(program) == _text_of_sin_cos(form.shape, form.dtype) else None
 
-    def both(t: Interpreter, inputs: list[Value]) -> list[Value]:
-        low, high = as_form(inputs[0]).bounds()
-        limit = 1e5
-        if np.any((low < -limit) | (high > limit)):
-            everything = constant(np.array(np.nan), np.dtype(precision))
-            return [everything, everything]
-        return [t.step(each, inputs)[0] for each in (sin, cos)]
 
-    return {str(step[0].params["call_jaxpr"]): both}
+@cache
+def _text_of_sin_cos(shape: tuple[int, ...], dtype: np.dtype) -> str:
+    steps = jax.make_jaxpr(sin_cos)(jax.ShapeDtypeStruct(shape, dtype)).jaxpr.eqns
+    return str(steps[0].params.get("call_jaxpr"))
+
+
+def _sin_cos(inputs: list[Value]) -> list[Value]:
+    angle = as_form(inputs[0])
+    low, high = angle.bounds()
+    results = []
+    for name in ("sin", "cos"):
+        form = FUNCTIONS[name](angle)
+        # Its error is 1.2e-7, and beyond 1e5 it is NaN.
+        form.radius = form.radius + 2.4e-7
+        if form.low is not None and form.high is not None:
+            form.low, form.high = form.low - 2.4e-7, form.high + 2.4e-7
+        form.forget((low < -1e5) | (high > 1e5))
+        results.append(form)
+    return results

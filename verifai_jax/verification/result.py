@@ -37,11 +37,11 @@ class Part(NamedTuple):
 class Verification(Drawn, InNotebook):
     """The result of `verify`.
 
-    - `name`: of the problem; `columns`: its unit coordinates.
+    - `name`: the name of the problem; `columns`: its unit coordinates.
     - `boxes`: the partition of the unit cube; `shares`, `upper_shares`: the corners of the boxes as
       shares of the range of the features.
     - `features`, `formulas`, `precision`: what was verified.
-    - `confidence`: of bounds by samples.
+    - `confidence`: the confidence of bounds by samples.
     - `looked_at`: boxes that were looked at; `simulations`; `seconds`; `stopped`: why it ended.
     - `notes` for people; `version`.
     """
@@ -131,8 +131,8 @@ class Verification(Drawn, InNotebook):
             bound[i] = anytime_interval(*counts, self.confidence).high
         rows: dict[str, Any] = {
             "verdict": self.verdicts, "throughout": boxes.state == BROKEN, "mass": boxes.mass,
-            "volume": np.prod(self.upper_shares - self.shares, axis=1), "least": boxes.least,
-            "greatest": boxes.greatest, "failure_bound": bound,
+            "volume": np.prod(self.upper_shares - self.shares, axis=1), "lowest": boxes.lowest,
+            "highest": boxes.highest, "failure_bound": bound,
         }  # fmt: skip
         for j, column in enumerate(self.columns):
             rows[f"{column} from"] = self.shares[:, j]
@@ -195,7 +195,7 @@ class Verification(Drawn, InNotebook):
 
         **Arguments:**
 
-        - `path`: of the file, whose folder is made.
+        - `path`: the path of the file, whose folder is made.
 
         **Returns:** the path.
 

@@ -61,7 +61,7 @@ class Variable:
 
     @property
     def settable(self) -> bool:
-        """Whether a value can be given before a simulation begins."""
+        """True where a value can be given before a simulation begins."""
         return self.causality == "input" or (
             self.variability != "constant" and self.start is not None
         )
@@ -72,9 +72,9 @@ class Description:
     """The description of an FMU, read from its archive.
 
     - `file`: the FMU.
-    - `version`: of FMI, 2 or 3.
-    - `name`: of the model.
-    - `identifier`: of the binary for co-simulation.
+    - `version`: the version of FMI, 2 or 3.
+    - `name`: the name of the model.
+    - `identifier`: the identifier of the binary for co-simulation.
     - `token`: by which the binary knows its description.
     - `variables`: by name.
     """

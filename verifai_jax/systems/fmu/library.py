@@ -52,7 +52,7 @@ class Instance:
 
     **Arguments:**
 
-    - `description`: of the FMU.
+    - `description`: the description of the FMU.
     - `folder`: where the FMU is unpacked.
 
     **Raises:** `FMUError` where the binary cannot be loaded or does not make an instance.
