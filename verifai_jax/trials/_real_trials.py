@@ -9,7 +9,7 @@ the trials. `statistics.stratified_rate` makes an interval of both, which is val
 simulation is worth.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
