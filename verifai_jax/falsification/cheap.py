@@ -60,7 +60,7 @@ def gravest_rows(run: Run, cheap: Problem, budget: int) -> "pd.DataFrame":
     count = max(1, min(budget // 4, MAX_ROWS))
     space = cheap.space
     rows: Any = run.table.all.dropna(subset=["rho"]).sort_values("rho", kind="stable")
-    failing = int(rows["violated"].sum())
+    failing = int(np.sum(rows["violated"].to_numpy(bool)))
     wanted = max(failing, int(LOWEST * len(rows)), count)
     candidates = rows.iloc[: min(wanted, MAX_CANDIDATES)]
     points: Float[np.ndarray, "n d"] = space.points(candidates)

@@ -131,7 +131,9 @@ def calibrate(
     import pandas as pd
 
     samples = pd.DataFrame(chosen[rows], columns=names)
-    domains = {n: Empirical(samples[n]) for n in names if np.ptp(samples[n]) > 0}
+    domains = {
+        n: Empirical(samples[n]) for n in names if float(np.ptp(samples[n].to_numpy(float))) > 0
+    }
     space = FeatureSpace({**problem.space.domains, **domains}, problem.space.where)
     return Calibration(
         samples, replace(problem, space=space, nominal=None), len(table),
