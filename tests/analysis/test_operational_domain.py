@@ -160,7 +160,7 @@ def test_the_next_points_fill_what_is_empty(domain):
 
 
 @pytest.mark.thorough
-def test_the_mass_is_that_of_the_prior():
+def test_the_mass_is_that_of_the_prior(tmp_path):
     space = vj.FeatureSpace({"x": vj.TruncatedNormal(0, 1, -3, 3), "y": vj.Box(0.0, 2.0)})
     odd = vj.odd_of(vj.FeatureSpace({"x": vj.Box(-1.0, 1.0), "y": vj.Box(0.0, 1.0)}), "part")
     assert odd.is_box
@@ -177,6 +177,11 @@ def test_the_mass_is_that_of_the_prior():
     assert found.table.loc["x", "volume"] == len(codes) / 4
     assert found.table.loc["x", "mass"] == pytest.approx(sum(share[c] for c in codes), abs=0.01)
     assert found.pairs.loc[("x", "y"), "cells"] == 16
+    page = run.report(tmp_path / "r.html", odd=odd, studies=False, traces=0).read_text()
+    assert "The operational design domain part" in page
+    assert "are outside the domain, and not counted below" in page
+    with pytest.raises(TypeError, match="odd= is for a report on a run; got Estimate"):
+        vj.estimate(run.problem, budget=64, progress=False).report(tmp_path / "e.html", odd=odd)
 
 
 def test_files_are_read_again(domain, tmp_path):

@@ -100,12 +100,11 @@ class OddCoverage(InNotebook):
                 f"{format_percent(row['volume'])} of the volume{prior}"
             )
         if len(self.pairs):
-            volume = format_percent(float(self.pairs["volume"].mean()))
-            worst = self.pairs["volume"].idxmin()
-            lines.append(
-                f"  pairs of attributes: {volume} of the volume on average, least of "
-                f"{' with '.join(worst)} ({format_percent(self.pairs.loc[worst, 'volume'])})"
-            )
+            volume, worst = self.pairs["volume"], self.pairs["volume"].idxmin()
+            text = f"{format_percent(float(volume.mean()))} of the volume on average"
+            if len(volume) > 1:
+                text += f", {format_percent(volume[worst])} of {' with '.join(worst)}"
+            lines.append(f"  pairs of attributes: {text}")
         return "\n".join(lines)
 
     __repr__ = __str__
