@@ -11,11 +11,11 @@ from scipy.optimize import linprog
 from verifai_jax.core.cube import Cube
 from verifai_jax.mtl.clauses import ABSENT
 from verifai_jax.search import Gradient, Observations, Portfolio
-from verifai_jax.search.gradient import HALVINGS, _minimax
+from verifai_jax.search.linear_steps import HALVINGS, minimax
 
 D, K = 5, 4
 FREE = np.ones(D, bool)
-solve = jax.jit(_minimax, static_argnums=())
+solve = jax.jit(minimax, static_argnums=())
 
 
 def exact(clauses, gradients, point, radius):

@@ -1,0 +1,133 @@
+"""Problems of choices, flags, numbers and plateaus, on which slopes say little or nothing.
+
+    python benchmarks/search_quality.py mixed
+
+`SHARES` has the share of samples that fail. Where the robustness leads nowhere, no search can do
+better than samples of the prior; where many coordinates are choices, descents move only the others.
+"""
+
+import jax.numpy as jnp
+
+import verifai_jax as vj
+
+
+def _steps(values):
+    return vj.Trace({"out": jnp.atleast_1d(values)}, dt=0.1)
+
+
+def _flags(count: int) -> dict[str, vj.Categorical]:
+    return {f"on{i}": vj.Categorical(0, 1) for i in range(count)}
+
+
+def levers(features, key):
+    """A mass that eleven three-way choices push, one after the other."""
+    x, v, track = features["x0"], features["v0"], []
+    for i in range(11):
+        push = features[f"push{i}"] - 1.0
+        v = 0.8 * v + 0.35 * features["gain"] * push - 0.12 * x
+        x = x + 0.5 * v
+        track.append(x)
+    return vj.Trace({"x": jnp.stack(track)}, dt=0.5)
+
+
+def guards(features, key):
+    """Flags that guard a number, as signals of their own."""
+    numbers = [features[name] for name in ("a", "b", "c")]
+    speed = numbers[0] + 0.6 * numbers[1] - 0.3 * numbers[2]
+    flags = {name: value[None] * 1.0 for name, value in features.items() if name.startswith("on")}
+    return vj.Trace({"speed": speed[None], **flags}, dt=0.1)
+
+
+def alarm(features, key):
+    """A number of two values: an alarm that sounds in a ball."""
+    u = jnp.stack([features[f"u{i}"] for i in range(4)])
+    near = jnp.linalg.norm(u - jnp.array([0.35, 0.6, 0.45, 0.7]) + 1e-9) < 0.2124
+    return _steps(jnp.where(near, 1.0, 0.0))
+
+
+def stairs(features, key):
+    """A bowl in steps: its derivative is zero almost everywhere."""
+    u = jnp.stack([features[f"u{i}"] for i in range(5)])
+    bowl = jnp.linalg.norm(u - jnp.array([0.3, 0.7, 0.55, 0.4, 0.25]) + 1e-9)
+    return _steps(-jnp.ceil(8 * (bowl - 0.2705)) / 8)
+
+
+def modes(features, key):
+    """Six modes, each a bowl of its own, of which one goes below zero."""
+    mode = features["mode"]
+    u = jnp.stack([features[f"u{i}"] for i in range(4)])
+    centre = jnp.array([0.2, 0.8, 0.5, 0.35]) + 0.09 * mode * jnp.array([1.0, -1.0, 0.5, 0.7])
+    bowl = jnp.linalg.norm(u - centre + 1e-9) + jnp.array([0.3, 0.2, 0.1, 0.0, 0.15, 0.25])[mode]
+    return _steps(0.188 - bowl)
+
+
+def votes(features, key):
+    """Twelve flags that count unequally, and two numbers."""
+    flags = jnp.stack([features[f"on{i}"] * 1.0 for i in range(12)])
+    weights = jnp.array([3, -2, 4, 1, -3, 2, 1, -1, 2, -4, 3, 1.0])
+    return _steps(flags @ weights + 2 * features["a"] - 3 * features["b"] - 14.72)
+
+
+def counts(features, key):
+    """Whole numbers with an order, and two numbers, as in a queue."""
+    load = features["cars"] * (1 + features["rate"]) - 2.2 * features["lanes"] * features["flow"]
+    late = jnp.where(features["shift"] == 2, 4.0, 0.0)
+    return _steps(load + late - 22.07)
+
+
+def misled(features, key):
+    """A slope that leads to a face of the cube, and failures that lie elsewhere."""
+    u = jnp.stack([features[f"u{i}"] for i in range(3)])
+    away = jnp.linalg.norm(u - jnp.array([0.5, 0.35, 0.6]) + 1e-9)
+    return _steps(jnp.where(away < 0.1337, 1.0, -1.0 + away))
+
+
+def _box(count: int) -> dict[str, vj.Box]:
+    return {f"u{i}": vj.Box(0, 1) for i in range(count)}
+
+
+def _guarded(flags: int, limit: float) -> vj.Problem:
+    space = {"a": vj.Box(0, 1), "b": vj.Box(0, 1), "c": vj.Box(0, 1), **_flags(flags)}
+    guard = " and ".join(f"on{i} > 0.5" for i in range(flags))
+    name = f"guards_{flags}"
+    return vj.Problem(name, space, guards, f"always (({guard}) -> speed < {limit})")
+
+
+PUSHES = {f"push{i}": vj.Categorical(0, 1, 2) for i in range(11)}
+NUMBERS = {"x0": vj.Box(-1, 1), "v0": vj.Box(-1, 1), "gain": vj.Box(0.5, 1.5)}
+PROBLEMS = {
+    problem.name: problem
+    for problem in (
+        vj.Problem("levers", NUMBERS | PUSHES, levers, "always x < 3.34"),
+        _guarded(2, 1.07),
+        _guarded(4, 1.02),
+        vj.Problem("alarm", _box(4), alarm, "always out < 0.5"),
+        vj.Problem("stairs", _box(5), stairs, "always out < -0.06"),
+        vj.Problem(
+            "modes", {"mode": vj.Categorical(*range(6)), **_box(4)}, modes, "always out < 0"
+        ),
+        vj.Problem("votes", {"a": vj.Box(0, 1), "b": vj.Box(0, 1), **_flags(12)}, votes,
+                   "always out < 0"),
+        vj.Problem(
+            "counts",
+            {"cars": vj.DiscreteBox(0, 12), "lanes": vj.DiscreteBox(1, 4),
+             "shift": vj.Categorical(0, 1, 2), "rate": vj.Box(0, 1), "flow": vj.Box(0.2, 1)},
+            counts, "always out < 0",
+        ),
+        vj.Problem("misled", _box(3), misled, "always out < 0"),
+    )
+}  # fmt: skip
+"""By name."""
+
+SHARES = {
+    "levers": 2.0e-3,
+    "guards_2": 3.1e-2,
+    "guards_4": 1.02e-2,
+    "alarm": 1.01e-2,
+    "stairs": 7.8e-3,
+    "modes": 1.17e-3,
+    "votes": 2.65e-3,
+    "counts": 1.0e-2,
+    "misled": 1.0e-2,
+}
+"""Of 400 000 samples."""
