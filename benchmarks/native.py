@@ -11,6 +11,7 @@ machine disturb least. The cart-pole is also written by hand in C (`cartpole.c`)
 import argparse
 import ctypes
 import importlib
+import itertools
 import statistics
 import subprocess
 import tempfile
@@ -47,7 +48,27 @@ def quadrotor():
     return names["problem"]
 
 
+WIDTH = 64
+
+
+def wide():
+    """Return a cart-pole whose policy has two hidden layers of `WIDTH` units."""
+    rng, sizes = np.random.default_rng(0), (4, WIDTH, WIDTH, 2)
+    layers = tuple(
+        (rng.normal(size=(a, b)).astype(np.float32) / a**0.5, np.full(b, 0.1, np.float32))
+        for a, b in itertools.pairwise(sizes)
+    )
+    policy = vj.rl.Policy(layers, None, None, None, vj.rl.Discrete(2))
+    return vj.Problem(
+        "wide",
+        space={name: vj.Box(low, high) for name, (low, high) in RANGES.items()},
+        system=cartpole.cartpole(controller=cartpole.neural(policy), duration=STEPS * PERIOD),
+        spec=f"always[0, 4] abs(theta) <= {THETA_LIMIT!r}",
+    )
+
+
 SYSTEMS = {
+    "wide": (wide, 4096),
     "cartpole": (cart_pole, 32768),
     "quadrotor": (quadrotor, 8192),
     "balance": ("specs.cartpole", 8192),
@@ -145,12 +166,39 @@ def by_hand(rounds, n=131_072):
         print(f"  {name:<32}{speed:>11,.0f}/s  {share:z.2f} of C", flush=True)
 
 
+def beside_blas(rounds, batch=4096):
+    """Compare the products of a policy in the loop with the same products alone, by NumPy's BLAS.
+
+    By processor time, of all that a simulation takes; run with OPENBLAS_NUM_THREADS=1, since idle
+    threads of BLAS take time too.
+    """
+    rng = np.random.default_rng(0)
+    native = NativeEngine(engine_for(wide(), batch), "native", batch)
+    u, hidden = rng.random((batch, 4), np.float32), rng.random((batch, WIDTH), np.float32)
+    weights, out = rng.random((WIDTH, WIDTH), np.float32), np.empty((batch, WIDTH), np.float32)
+
+    def alone():
+        for _ in range(STEPS):
+            np.matmul(hidden, weights, out=out)
+
+    sides = (lambda: native.evaluate(u, KEY, FIRST), alone)
+    products = (WIDTH * (WIDTH + 6), WIDTH * WIDTH)
+    for side in sides:
+        side()
+    rows = [
+        [timed(side)[1] / n for side, n in zip(sides, products, strict=True)] for _ in range(rounds)
+    ]
+    share = statistics.median(blas / ours for ours, blas in rows)
+    print(f"policy of 2 x {WIDTH} in the loop: {share:z.2f} of BLAS alone")
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("systems", nargs="*", choices=[*SYSTEMS, []], help="all when left out")
     parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args()
     by_hand(options.rounds)
+    beside_blas(options.rounds)
     for name in options.systems or SYSTEMS:
         print(name)
         problem = problem_of(name)

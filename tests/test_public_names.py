@@ -27,6 +27,7 @@ ROOMS = (
     "blocks",
     "clusters",
     "events",
+    "faults",
     "mtl",
     "perception",
     "policies",

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from verifai_jax import blocks as blocks
     from verifai_jax import clusters as clusters
     from verifai_jax import events as events
+    from verifai_jax import faults as faults
     from verifai_jax import mtl as mtl
     from verifai_jax import perception as perception
     from verifai_jax import policies as policies
@@ -39,10 +40,14 @@ if TYPE_CHECKING:
     from verifai_jax.counterexamples import replay_counterexamples as replay_counterexamples
     from verifai_jax.counterexamples import shrink as shrink
     from verifai_jax.estimation import Estimate as Estimate
+    from verifai_jax.estimation import SequenceEstimate as SequenceEstimate
     from verifai_jax.estimation import estimate as estimate
+    from verifai_jax.estimation import sequence as sequence
     from verifai_jax.failure_modes import Mode as Mode
     from verifai_jax.failure_modes import Modes as Modes
     from verifai_jax.failure_modes import modes as modes
+    from verifai_jax.failure_table import FailureTable as FailureTable
+    from verifai_jax.failure_table import fmea as fmea
     from verifai_jax.falsification import ErrorTable as ErrorTable
     from verifai_jax.falsification import Replay as Replay
     from verifai_jax.falsification import Run as Run

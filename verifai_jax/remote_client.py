@@ -135,6 +135,34 @@ class Waveform:
         return np.where(np.sign(slope) == np.sign(d0), slope, 0)
 
 
+class Reaction:
+    """A function of signals by its parameters: the form in which a `Reactive` feature arrives.
+
+    `push(gap=12.0, speed=3.0)`, or the signals in the order of `inputs`: asked at each step, it
+    answers with a number within its bounds.
+    """
+
+    def __init__(
+        self, parameters: Sequence[float], inputs: Any, hidden: int, bounds: Sequence[float]
+    ) -> None:
+        self.parameters, self.hidden = np.asarray(parameters, np.float64), hidden
+        self.inputs, self.bounds = {name: (low, high) for name, low, high in inputs}, bounds
+
+    def __call__(self, *values: float, **named: float) -> float:
+        """Return the reaction to signals, in the order of `inputs` or by their names."""
+        given = dict(zip(self.inputs, values, strict=False)) | named
+        if given.keys() != self.inputs.keys() or len(values) + len(named) != len(given):
+            raise ValueError(f"this reaction takes {', '.join(self.inputs)}, each once")
+        ends = self.inputs.items()
+        x = np.array([(2 * given[name] - low - high) / (high - low) for name, (low, high) in ends])
+        if self.hidden:
+            size = self.hidden * len(x)
+            first = self.parameters[:size].reshape(self.hidden, len(x))
+            x = np.tanh(first @ x + self.parameters[size:][: self.hidden])
+        last, (low, high) = self.parameters[-(len(x) + 1) :], self.bounds
+        return float(low + (high - low) * (1 + np.tanh(last[:-1] @ x + last[-1])) / 2)
+
+
 def serve(
     simulate: Callable[[dict[str, Any], int], Any],
     host: str = "127.0.0.1",
@@ -149,11 +177,11 @@ def serve(
 
     **Arguments:**
 
-    - `simulate(features, seed) -> result`: features are numbers, arrays, dictionaries of these and
-      `Waveform`s; `seed` is an integer in `[0, 2^32)`, the same on every replay. The result is a
-      dictionary of signals, `[time]` or `[time, k]`, and `dt` in seconds (or `times`, and `valid`,
-      how many samples count); or anything with `.signals` and these as attributes. What it raises
-      becomes a row with that message.
+    - `simulate(features, seed) -> result`: features are numbers, arrays, dictionaries of these,
+      `Waveform`s and `Reaction`s; `seed` is an integer in `[0, 2^32)`, the same on every replay.
+      The result is a dictionary of signals, `[time]` or `[time, k]`, and `dt` in seconds (or
+      `times`, and `valid`, how many samples count); or anything with `.signals` and these as
+      attributes. What it raises becomes a row with that message.
     - `token`: the server's; the environment variable `VERIFAI_JAX_TOKEN` when left out. It is
       proved, not sent.
     - `capacity`: how many points may wait here at most.
@@ -434,11 +462,13 @@ def described(error: BaseException) -> str:
 
 
 def features_of(value: object) -> Any:
-    """Return features from JSON: lists as arrays, objects of control points as `Waveform`s."""
+    """Return features from JSON: lists as arrays, objects as `Waveform`s and `Reaction`s."""
     if isinstance(value, dict):
         needed = {"knots", "hold", "duration"}
         if needed <= value.keys() <= needed | {"times", "width"}:
             return Waveform(**value)
+        if value.keys() == {"parameters", "inputs", "hidden", "bounds"}:
+            return Reaction(**value)
         return {name: features_of(inner) for name, inner in value.items()}
     return np.asarray(value) if isinstance(value, list) else value
 

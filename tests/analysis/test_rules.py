@@ -6,7 +6,7 @@ import pytest
 from scipy.stats import binomtest
 
 import verifai_jax as vj
-from verifai_jax.analysis._rules import _aside, rules
+from verifai_jax.analysis._rules import rows_set_aside, rules
 from verifai_jax.analysis.conditions import Between, OneOf, Region, short_number
 from verifai_jax.analysis.data.columns import Column
 
@@ -99,7 +99,7 @@ def test_the_numbers_are_those_of_the_rows_kept_aside(seed):
     table["violated"] = ((table.x > 0.7) & (table.colour != "red")) ^ (g.random(1500) < 0.1)
     found = rules(table, seed=seed)
     failing = table["violated"].to_numpy()
-    aside = table[_aside(failing, 0.4, seed)]
+    aside = table[rows_set_aside(failing, 0.4, seed)]
     assert len(aside) == found.measured
     assert aside["violated"].mean() == pytest.approx(failing.mean(), abs=0.01)
     for rule in (*found.rules, found):

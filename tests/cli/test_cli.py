@@ -557,6 +557,24 @@ class TestMonitor:
             "--define", "slow=speed < limit", "--const", "limit=3",
         )  # fmt: skip
 
+    @pytest.mark.thorough
+    def test_many_requirements_on_many_recordings(self, call, tmp_path):
+        (tmp_path / "all.csv").write_text("id,formula\ngap,always dist > 1\nnear,G dist >= 2\n")
+        (tmp_path / "logs").mkdir()
+        (tmp_path / "drive.csv").rename(tmp_path / "logs" / "drive.csv")
+        (tmp_path / "uneven.csv").rename(tmp_path / "logs" / "uneven.csv")
+        files = ("--report", "out/r.html", "--junit", "out/j.xml")
+        output = call("monitor", "all.csv", "logs", *files, "--fail-on", "violation", code=1)
+        assert "2 requirements on 2 recordings: 1 of 2 verdicts fail, and 2 could" in output
+        assert "dist >= 2 has margin -0.5 at 1 s" in output
+        assert (tmp_path / "out" / "j.xml").exists()
+        assert (tmp_path / "out" / "r.html").exists()
+        one = ("monitor", "always dist > 0", "logs")
+        assert "is not evenly sampled" in call(*one, "--fail-on", "incomplete", code=1)
+        call(*one, "--resample", "0.5", "--method", "hold", "--fail-on", "incomplete")
+        assert "no requirement had a verdict" in call("monitor", "other > 0", "logs", code=3)
+        assert "--plot and --compat go with one" in call(*one, "--plot", "a.png", code=2)
+
     def test_monitor_explains_what_decided(self, call, tmp_path):
         output = call(
             "monitor", "always[0, 1] dist >= 2", "drive.csv", "--explain", "--plot", "why.png"

@@ -13,7 +13,7 @@ from verifai_jax.cli.main import main
 from verifai_jax.core.targets import TargetError, definitions, load_target
 from verifai_jax.store.cache import Cache
 from verifai_jax.sweeps import Study
-from verifai_jax.sweeps import _sweep as driver
+from verifai_jax.sweeps import running as driver
 
 STUDY = """
 import verifai_jax as vj
@@ -113,7 +113,7 @@ def test_an_interruption_outside_of_the_work_prints_the_command_too(call, monkey
         Cache(folder).note("command", {})
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(driver, "sweep", interrupted)
+    monkeypatch.setattr("verifai_jax.sweeps._sweep.sweep", interrupted)
     output = call("specs/drift.py:safe", *SMALL, "--folder", "part", code=130)
     assert "  resume       verifai-jax sweep --resume part\n" in output
 

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 import verifai_jax as vj
 from verifai_jax.cli.main import main
-from verifai_jax.core.revisions import _lies_in, load_at_revision, split_revision
+from verifai_jax.core.revisions import lies_in, load_at_revision, split_revision
 from verifai_jax.core.targets import TargetError
 
 SPEC = """
@@ -132,4 +132,4 @@ def test_what_a_failed_import_left_behind_is_in_no_folder(project, monkeypatch):
     monkeypatch.syspath_prepend(str(project))
     part = importlib.import_module("half.part")
     monkeypatch.delitem(sys.modules, "half")
-    assert not _lies_in(part, project)
+    assert not lies_in(part, project)

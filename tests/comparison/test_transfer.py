@@ -68,6 +68,9 @@ def test_a_planted_difference_is_found(tmp_path):
     assert (tmp_path / "a.png").stat().st_size > 1000
     assert "<img" in found._repr_html_()
     assert found.rules()
+    page = found.report(tmp_path / "t.html").read_text()
+    assert "without drag and with drag differ: traces part in 64 of 64 pairs" in page
+    assert "pairs with different verdicts:" in page
 
 
 @pytest.mark.thorough
@@ -84,6 +87,67 @@ def test_another_integrator_at_another_clock():
     found = compared(plant(), plant(method="euler", dt=0.025, steps=120))
     assert found.differs
     assert found.table["proper"].all()
+
+
+PENDULUM = """
+<mujoco>
+  <option timestep="0.005" integrator="{integrator}"/>
+  <worldbody>
+    <body>
+      <joint name="hinge" axis="0 1 0" damping="0.1" armature="{armature}"/>
+      <geom type="capsule" fromto="0 0 0 0.3 0 -0.4" size="0.03"/>
+    </body>
+  </worldbody>
+  <actuator><general joint="hinge" biastype="affine" biasprm="0 0 -{drag}"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def pendulums():
+    pytest.importorskip("mujoco")
+
+    def problem(integrator="Euler", armature=0.0, drag=0.0):
+        system = vj.mujoco(
+            PENDULUM.format(integrator=integrator, armature=armature, drag=drag),
+            duration=0.5,
+            control_period=0.02,
+            bind={"start": "joint/hinge/qpos"},
+            controller=lambda time, state, features: -state.qpos[0],
+            signals={"angle": "joint/hinge/qpos"},
+            backend="native",
+        )
+        return vj.Problem("pendulum", {"start": vj.Box(-0.5, 0.5)}, system, "always angle < 9")
+
+    def compared(one, other):
+        a, b = problem(**one), problem(**other)
+        return vj.transfer(None, a, b, samples=8, simulations=0, batch=8, progress=False)
+
+    return compared
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"armature": 0.001}, "the models differ: dof_armature is [0.] in a and [0.001] in b"),
+        ({"integrator": "RK4"}, "option/integrator is mjINT_EULER in a and mjINT_RK4 in b"),
+        ({"integrator": "implicitfast", "drag": 0.1}, "mjINT_IMPLICITFAST in b"),
+    ],
+)
+def test_another_integrator_or_armature_of_mujoco(pendulums, change, said):
+    found = pendulums({"drag": change.get("drag", 0.0)}, change)
+    assert found.differs
+    assert said in str(found)
+
+
+@pytest.mark.thorough
+def test_integrators_of_mujoco_that_are_one_where_only_joints_are_damped(pendulums):
+    """MuJoCo's Euler treats the damping of joints implicitly."""
+    found = pendulums({}, {"integrator": "implicitfast"})
+    assert found.table["gap"].max() == 0.0
+    assert "no difference beyond rounding" in str(found)
+    assert "option/integrator is mjINT_EULER in a and mjINT_IMPLICITFAST in b" in str(found)
 
 
 def test_what_is_wrong_is_said():

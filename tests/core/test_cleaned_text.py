@@ -1,8 +1,10 @@
 """Texts of others, on a terminal and as names of folders."""
 
+import numpy as np
 import pytest
 
-from verifai_jax.core.text import folder_name, format_error, one_line, printable
+import verifai_jax as vj
+from verifai_jax.core.text import folder_name, format_error, format_features, one_line, printable
 
 
 def test_what_steers_a_terminal_is_written_out():
@@ -34,3 +36,21 @@ def test_an_error_is_one_line_that_is_not_too_long():
     assert format_error(ValueError("first\nsecond")) == "ValueError: first"
     assert format_error(KeyError()) == "KeyError"
     assert len(format_error(ValueError("x" * 100_000))) < 600
+
+
+@pytest.mark.parametrize("name", ["a\nb", "a\x1b[2Jb", "a\u2028b", "a\tb"])
+def test_names_of_a_problem_are_one_line(name):
+    def system(features, key):
+        return vj.Trace({"x": features["a"]}, dt=1.0)
+
+    told = "must be one line without control characters, as people read it in summaries; got "
+    with pytest.raises(ValueError, match="the name of a field " + told):
+        vj.FeatureSpace({name: vj.Box(0, 1)})
+    with pytest.raises(ValueError, match="the name of a formula " + told):
+        vj.Problem("p", {"a": vj.Box(0, 1)}, system, {name: "always x > 0"})
+    problem = vj.Problem(name, {"a": vj.Box(0, 1)}, system, "always x > 0", description=name)
+    assert problem.name in ("a_b", "a_[2Jb")
+    assert "\x1b" not in str(problem)
+    # What is data may be any text, and is written in one line.
+    vj.Trace({name: np.ones(1)}, dt=1.0)
+    assert len(format_features({"c": name}).splitlines()) == 1

@@ -80,8 +80,8 @@ def test_many_items_are_removed_in_runs():
 
 
 def test_sets_of_few_items_are_all_subsets():
-    from verifai_jax.counterexamples.remove_items import _sets
+    from verifai_jax.counterexamples.remove_items import item_sets
 
-    found = {tuple(each) for each in _sets(np.array([1, 4, 6]))}
+    found = {tuple(each) for each in item_sets(np.array([1, 4, 6]))}
     subsets = [c for n in (1, 2, 3) for c in itertools.combinations([1, 4, 6], n)]
     assert found == set(subsets)

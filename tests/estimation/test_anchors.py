@@ -9,12 +9,13 @@ from scipy.stats import norm
 
 from verifai_jax.estimation._estimate import one_thread
 from verifai_jax.estimation.anchors import anchors_of, join_explorations
+from verifai_jax.estimation.answers import Plan, chains_for
 from verifai_jax.estimation.components import Gaussian, Prior
 from verifai_jax.estimation.exploration import explore
 from verifai_jax.estimation.fitting import fit_across, fit_diagonal
 from verifai_jax.estimation.importance import fit_proposal
 from verifai_jax.estimation.initial_proposal import proposal_from
-from verifai_jax.estimation.methods import Plan, chains_for, estimate_automatically
+from verifai_jax.estimation.methods import estimate_automatically
 from verifai_jax.estimation.mixture import Mixture
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from closed_forms import Cells, with_gradient
 
-from verifai_jax.estimation.descents import Ends, _begin, _points_ahead, descend_from_many
-from verifai_jax.estimation.exploration import _spread_out
+from verifai_jax.estimation.descents import Ends, begin_descents, descend_from_many, points_ahead
+from verifai_jax.estimation.exploration import spread_out
 from verifai_jax.estimation.normal_space import LimitState
 
 
@@ -41,7 +41,7 @@ def test_planes_near_the_origin_are_told_apart_by_their_directions():
     far = Ends(points, feet * [[1.0], [1.0], [1.0], [1.5]])
     assert np.linalg.norm(far.planes[2] - far.planes[3]) == pytest.approx(1.5)
     assert gaps[2, 3] == 0.0
-    assert sorted(_spread_out(ends, 4)) in ([0, 1, 2], [0, 1, 3])
+    assert sorted(spread_out(ends, 4)) in ([0, 1, 2], [0, 1, 3])
 
 
 def test_a_start_is_where_its_slope_leads():
@@ -50,13 +50,13 @@ def test_a_start_is_where_its_slope_leads():
         lambda z: 2.0 - z @ normals, lambda z: np.broadcast_to(-normals, z.shape), 3, 1000
     )
     z = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, -2.0], [-3.0, -4.0, 0.5]])
-    ahead = _points_ahead(known, _begin(known, z))
+    ahead = points_ahead(known, begin_descents(known, z))
     assert ahead[:2] @ normals == pytest.approx(2.0)
     assert ahead[:2, 2] == pytest.approx(z[:2, 2])
     # No farther than one step, and nowhere without a slope.
     assert np.linalg.norm(ahead[2] - z[2]) == pytest.approx(3.0)
     flat = with_gradient(lambda z: np.ones(len(z)), np.zeros_like, 3, 1000)
-    assert np.array_equal(_points_ahead(flat, _begin(flat, z)), z)
+    assert np.array_equal(points_ahead(flat, begin_descents(flat, z)), z)
 
 
 def warped(cells, power):

@@ -8,12 +8,8 @@ from scipy.stats import norm
 
 import verifai_jax as vj
 from verifai_jax.estimation._estimate import one_thread
-from verifai_jax.estimation.methods import (
-    SHARE_OF_LEVEL,
-    Plan,
-    chains_for,
-    estimate_automatically,
-)
+from verifai_jax.estimation.answers import Plan, chains_for
+from verifai_jax.estimation.methods import SHARE_OF_LEVEL, estimate_automatically
 from verifai_jax.estimation.normal_space import LimitState
 
 DIM = 5

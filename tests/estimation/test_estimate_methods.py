@@ -7,17 +7,19 @@ import pytest
 from closed_forms import CASES, Cells, closed_form, half_space, normal
 
 from verifai_jax.estimation._estimate import one_thread
-from verifai_jax.estimation.descents import descend_from_many
-from verifai_jax.estimation.methods import (
-    SHARE_OF_LEVEL,
-    SHARE_OF_REPLICATE,
+from verifai_jax.estimation.answers import (
     Answer,
     Plan,
     chains_for,
     check_by_splitting,
-    estimate_automatically,
     estimate_by_monte_carlo,
     estimate_by_splitting,
+)
+from verifai_jax.estimation.descents import descend_from_many
+from verifai_jax.estimation.methods import (
+    SHARE_OF_LEVEL,
+    SHARE_OF_REPLICATE,
+    estimate_automatically,
 )
 from verifai_jax.estimation.monte_carlo import Counts
 from verifai_jax.estimation.splitting import SplittingRun

@@ -6,10 +6,11 @@ from closed_forms import closed_form, islands, normal, with_gradient
 from scipy.stats import norm
 
 from verifai_jax.estimation.anchors import WeightedFailures, anchors_of, join_explorations
+from verifai_jax.estimation.answers import Plan, chains_for
 from verifai_jax.estimation.components import Gaussian, Prior
 from verifai_jax.estimation.exploration import approach_origin, explore
 from verifai_jax.estimation.initial_proposal import compare_explorations
-from verifai_jax.estimation.methods import Plan, chains_for, estimate_automatically
+from verifai_jax.estimation.methods import estimate_automatically
 from verifai_jax.estimation.mixture import Mixture
 from verifai_jax.estimation.normal_space import farthest_first
 from verifai_jax.estimation.paths import connected, halve

@@ -13,8 +13,8 @@ import verifai_jax as vj
 from verifai_jax.core.targets import definitions
 from verifai_jax.mtl import parse
 from verifai_jax.problem.silent_mistakes import (
-    _programs,
     difference,
+    programs_read,
     silent_mistakes,
 )
 
@@ -217,6 +217,6 @@ def test_programs_inside_an_operation_may_take_constants_as_operands():
     table = jnp.arange(3.0)
     one, other = (jax.make_jaxpr(lambda x, k=k: k * x + table)(table).jaxpr for k in (2.0, 3.0))
     assert one.constvars
-    assert list(_programs({"jaxpr": one})) == [one]
+    assert list(programs_read({"jaxpr": one})) == [one]
     assert difference(one, one) == (False, None)
     assert difference(one, other)[0]

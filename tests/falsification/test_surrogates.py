@@ -9,7 +9,7 @@ import verifai_jax as vj
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.falsification import simulations
-from verifai_jax.falsification.surrogates import Surrogate, _padded, _spread
+from verifai_jax.falsification.surrogates import Surrogate, padded_rows, spread_factor
 from verifai_jax.falsification.trace_form import TraceForm
 from verifai_jax.mtl import parse, robustness
 from verifai_jax.search import TraceSurrogate, TuRBO
@@ -247,18 +247,18 @@ def test_short_traces_are_monitored_at_every_sample():
 
 def test_a_model_without_progress_is_believed_less():
     better = 0.8 ** np.arange(20)
-    assert {_spread(better, number, 2) for number in range(8)} == {1.0}
+    assert {spread_factor(better, number, 2) for number in range(8)} == {1.0}
     idle = np.append(better, np.ones(64))
-    spreads = [_spread(idle, number, 2) for number in range(8)]
+    spreads = [spread_factor(idle, number, 2) for number in range(8)]
     np.testing.assert_allclose(spreads, 2 * [4 ** (i / 3) for i in range(4)])
     # A little better is no progress, and the factor is bounded.
     little = np.append(better, better[-1] * 0.999 ** np.arange(1, 33))
-    assert _spread(little, 3, 2) == pytest.approx(2)
-    assert _spread(np.ones(1000), 3, 2) == pytest.approx(5)
+    assert spread_factor(little, 3, 2) == pytest.approx(2)
+    assert spread_factor(np.ones(1000), 3, 2) == pytest.approx(5)
     # In more dimensions progress takes longer.
-    assert _spread(idle, 3, 4) == pytest.approx(2)
+    assert spread_factor(idle, 3, 4) == pytest.approx(2)
     # Nobody has to leave a failure.
-    assert _spread(np.append(-1.0, np.ones(100)), 3, 2) == 1
+    assert spread_factor(np.append(-1.0, np.ones(100)), 3, 2) == 1
 
 
 def test_the_best_rows_from_which_points_are_drawn_are_no_neighbours():
@@ -272,7 +272,7 @@ def test_the_best_rows_from_which_points_are_drawn_are_no_neighbours():
 
 @pytest.mark.parametrize("capacity", [16, 512, 5000])
 def test_programs_are_compiled_for_few_numbers_of_rows_whatever_the_capacity(capacity):
-    sizes = [_padded(rows, capacity) for rows in range(1, capacity + 1)]
+    sizes = [padded_rows(rows, capacity) for rows in range(1, capacity + 1)]
     assert all(size >= rows for rows, size in enumerate(sizes, 1))
     assert max(sizes) == capacity
     assert len(set(sizes)) <= 5

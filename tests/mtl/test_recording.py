@@ -198,7 +198,7 @@ def test_bad_recordings(tmp_path, flight):
 
     with pytest.raises(FileNotFoundError, match="there is no recording"):
         read(tmp_path / "none.csv")
-    with pytest.raises(ValueError, match=r"a \.csv or a \.parquet file; got bad\.txt"):
+    with pytest.raises(ValueError, match=r"\.csv, \.parquet or \.npz file; got bad\.txt"):
         read(file("x\n1\n", "bad.txt"))
     with pytest.raises(ValueError, match="has no rows"):
         read(file("time,x\n"))
@@ -245,3 +245,42 @@ def test_a_comma_that_may_stand_between_thousands_is_refused(tmp_path):
     assert np.asarray(read(path)["x"]).tolist() == [1.5, 7.0]
     path.write_text('time,x\n0,"1,500"\n1,"7,25"\n')
     assert np.asarray(read(path)["x"]).tolist() == [1.5, 7.25]
+
+
+def test_comments_and_a_row_of_units_are_passed_over(tmp_path):
+    file = tmp_path / "flight.csv"
+    for text in (
+        "# made by a logger\n# at noon\ntime,x\n0,1\n0.5,2\n",
+        "time;x\ns;m\n0,0;1,0\n0,5;2,0\n",
+        '# units below\n"time","x"\n"[s]",\n0,1\n0.5,2\n',
+    ):
+        file.write_text(text)
+        trace = read(file)
+        np.testing.assert_array_equal(trace.times, [0, 0.5])
+        np.testing.assert_array_equal(trace["x"], [1, 2])
+    file.write_text("time,x\n0,a\n0.5,2\n")
+    with pytest.raises(ValueError, match="holds 'a' in row 1, where other rows hold numbers"):
+        read(file, columns=["x"])
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("ms", 10**3), ("us", 10**6), ("ns", 10**9)])
+def test_clocks_since_1970_are_recognised_and_said(tmp_path, unit, factor):
+    file = tmp_path / "flight.csv"
+    first = 1_700_000_000 * factor
+    file.write_text(f"time,x\n{first},1\n{first + factor // 10},2\n{first + factor // 5},3\n")
+    trace = read(file)
+    np.testing.assert_array_equal(trace.times, [0.0, 0.1, 0.2])
+    assert any(f"is read as {unit} since 1970" in note for note in trace.notes)
+    file.write_text("time,x\n1700000000.5,1\n1700000001.5,2\n")
+    assert not read(file).notes
+
+
+def test_arrays_of_numpy(tmp_path):
+    file = tmp_path / "flight.npz"
+    np.savez(file, time=np.arange(3) * 0.5, x=np.arange(3.0), p=np.ones((3, 2)))
+    trace = read(file)
+    assert trace["p"].shape == (3, 2)
+    assert robustness("(G (norm(p) > 1)) & (F (x > 1))", trace) > 0
+    np.savez(file, time=np.arange(2.0), x=np.ones((2, 2, 2)))
+    with pytest.raises(ValueError, match=r"array 'x' of .* must have shape .* got \[2, 2, 2\]"):
+        read(file)

@@ -12,7 +12,7 @@ from PIL import Image
 
 import verifai_jax as vj
 from verifai_jax.plotting import plot_features, plot_replay, write_run_pictures
-from verifai_jax.plotting.replay import _telling, decisive_instant
+from verifai_jax.plotting.replay import decisive_instant, telling_signals
 from verifai_jax.plotting.scatter import distinguishing_features
 from verifai_jax.plotting.style import (
     BOUND,
@@ -105,7 +105,7 @@ def test_what_moves_is_shown_before_what_stands_and_each_body_once():
     clock = np.arange(3.0)
     names = ["ego_x", "ego_speed", "notice", "turning_x", "turning_y", "visible"]
     curves = dict.fromkeys(names, clock) | {"ego_x": np.full(3, 8.75), "notice": np.ones(3)}
-    ordered = _telling(names, curves, ["gap", "ego_y"])
+    ordered = telling_signals(names, curves, ["gap", "ego_y"])
     assert ordered == ["turning_x", "visible", "ego_speed", "turning_y", "ego_x", "notice"]
 
 

@@ -8,7 +8,7 @@ import pytest
 from verifai_jax.rl import Continuous, Discrete, evaluate, train
 from verifai_jax.rl.advantage import Ends, advantages
 from verifai_jax.rl.algorithm import Algorithm
-from verifai_jax.rl.pqn import PQN, _exploration_chances, _next_held, q_lambda_targets
+from verifai_jax.rl.pqn import PQN, exploration_chances, next_held, q_lambda_targets
 
 NONE = jnp.zeros(3, bool)
 SMALL = PQN(hidden=(16,), environments=8, horizon=16, minibatches=4)
@@ -79,10 +79,10 @@ def test_targets_are_values_plus_advantages_of_the_greedy_policy():
 
 def test_exploration_takes_its_part_of_the_steps_and_holds_on():
     pqn = PQN(epsilon_start=0.3, epsilon_end=0.3, hold=5.0)
-    keep, start = _exploration_chances(pqn, done=3, updates=10)
+    keep, start = exploration_chances(pqn, done=3, updates=10)
 
     def step(held, drawn):
-        held = _next_held(held, *drawn, keep, start)
+        held = next_held(held, *drawn, keep, start)
         return held, held
 
     draws = np.random.default_rng(0)

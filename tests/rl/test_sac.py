@@ -9,7 +9,7 @@ from scipy import stats
 from verifai_jax.rl import BatchedTraining, Configuration, Continuous, Discrete, evaluate, train
 from verifai_jax.rl.algorithm import Algorithm
 from verifai_jax.rl.replay_buffer import StoredTransitions, add, empty_buffer, sample, unpack
-from verifai_jax.rl.sac import SAC, _act, _loss, squash_log_prob
+from verifai_jax.rl.sac import SAC, act, squash_log_prob, total_loss
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def test_noise_lasts_as_long_as_its_episode_and_has_the_policys_deviation():
         def step(state, key):
             noise_key, key = jax.random.split(key)
             noise = jax.random.normal(noise_key, (400, 1))
-            return _act(sac, Blind(time_limit=4), state, noise, key)[0], None
+            return act(sac, Blind(time_limit=4), state, noise, key)[0], None
 
         start = sac.init(Blind(time_limit=4), key, updates=1)
         state, _ = jax.lax.scan(step, start, jax.random.split(key, 5))
@@ -158,7 +158,7 @@ def test_each_loss_has_a_gradient_for_its_own_weights():
     def gradient(reward):
         state = sac.init(Aim(), jax.random.key(0), updates=10)
         changed = batch._replace(reward=reward)
-        return state, jax.grad(_loss)(state.weights, sac, state.slow, changed, noise)
+        return state, jax.grad(total_loss)(state.weights, sac, state.slow, changed, noise)
 
     (state, first), (_, other) = gradient(batch.reward), gradient(batch.reward + 1)
     same = jax.tree.map(lambda a, b: bool(np.allclose(a, b, atol=1e-6)), first, other)

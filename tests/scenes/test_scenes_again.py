@@ -7,7 +7,7 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax.scenes import ProgramError
-from verifai_jax.scenes.recipe import _compiled
+from verifai_jax.scenes.recipe import compiled_recipe
 
 scenic = pytest.importorskip("scenic")
 pytestmark = [pytest.mark.thorough, pytest.mark.filterwarnings("ignore")]
@@ -64,7 +64,7 @@ class TestThereAndBack:
 
     def test_a_scene_of_another_compilation_is_refused(self, program):
         scene = drawn(program)
-        _compiled.cache_clear()
+        compiled_recipe.cache_clear()
         other = vj.scenic(WIDE)
         with pytest.raises(ValueError, match=r"another compilation .*from_bytes\(other.to_bytes"):
             other.features_of(scene)

@@ -10,10 +10,10 @@ from verifai_jax.core.cube import Cube
 from verifai_jax.search import Observations
 from verifai_jax.search.annealing import (
     Annealing,
-    _best_to_median,
-    _exchange,
-    _matchings,
-    _reflect,
+    best_to_median,
+    exchange,
+    partners_of,
+    reflect,
 )
 from verifai_jax.testing import check_search
 
@@ -60,8 +60,8 @@ def test_each_chain_has_the_density_of_its_temperature():
 def test_exchanges_sort_cold_chains_and_lose_no_point():
     energy = jnp.array([5.0, 3.0, jnp.inf, 1.0, 4.0, 2.0, 0.0])
     coldness = jnp.array([6.0, 5.0, 4.0, 3.0, 2.0, 1.0, 0.0]) * 1e6
-    matchings = _matchings(7)
-    place = np.asarray(_exchange(energy, coldness, jnp.zeros(matchings.shape)))
+    matchings = partners_of(7)
+    place = np.asarray(exchange(energy, coldness, jnp.zeros(matchings.shape)))
     assert sorted(place.tolist()) == list(range(7))
     # Gains only are taken at this temperature: the best goes to the coldest chain in one go.
     assert energy[place[0]] == 0
@@ -78,19 +78,19 @@ def test_exchanges_follow_the_odds():
     energy, coldness = jnp.array([0.0, 1.0]), jnp.array([1.5, 0.5])
     chance = jnp.log(jax.random.uniform(jax.random.key(0), (20000, 2, 2)))
     chance = chance.at[:, 1].set(0.0)
-    place = jax.vmap(lambda chance: _exchange(energy, coldness, chance))(chance)
+    place = jax.vmap(lambda chance: exchange(energy, coldness, chance))(chance)
     assert abs(float(jnp.mean(place[:, 0] == 1)) - np.exp(-1)) < 0.02
 
 
 def test_reflection():
     u = jnp.array([[-0.25, 0.5, 1.25, 2.25, -1.5, 1.0]])
-    np.testing.assert_allclose(_reflect(u), [[0.25, 0.5, 0.75, 0.25, 0.5, 1.0]], atol=1e-6)
+    np.testing.assert_allclose(reflect(u), [[0.25, 0.5, 0.75, 0.25, 0.5, 1.0]], atol=1e-6)
 
 
 @pytest.mark.thorough
 def test_the_spread_is_that_of_the_first_points():
-    assert _best_to_median(jnp.array([3.0, jnp.inf, 1.0, 2.0, 100.0, jnp.nan])) == 1.0
-    assert _best_to_median(jnp.full(3, jnp.inf)) == 0.0
+    assert best_to_median(jnp.array([3.0, jnp.inf, 1.0, 2.0, 100.0, jnp.nan])) == 1.0
+    assert best_to_median(jnp.full(3, jnp.inf)) == 0.0
     _, states = run(Annealing(), Cube((0, 0)), 1, lambda u: 3 * u[:, 0] + 5, 30)
     spread = np.asarray(states.spread)
     # Eight chains take turns: it is known after eight rounds.

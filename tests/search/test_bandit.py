@@ -10,7 +10,7 @@ from checked_types import unchecked
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.search import Observations
-from verifai_jax.search.bandit import Bandit, _draw, _fill
+from verifai_jax.search.bandit import Bandit, draw_cells, fill_cells
 
 
 def told(u, rho, valid=None):
@@ -46,7 +46,7 @@ def test_shares_are_those_of_draws_one_by_one():
         count = (1 + rng.integers(0, 60, (6, 5))).astype(np.float32)
         exists = np.array([[True] * 5] * 5 + [[True, False, True, True, False]])
         bonus = np.array([[0.01], [0.1], [0.5], [1], [3], [1]], np.float32)
-        shares = _fill(mean, count, exists, np.full((6, 1), budget, np.float32), bonus)
+        shares = fill_cells(mean, count, exists, np.full((6, 1), budget, np.float32), bonus)
         for got, *given in zip(shares, mean, count, exists, bonus[:, 0], strict=True):
             expected = one_by_one(*given[:3], budget, given[3])
             np.testing.assert_allclose(got, expected, atol=1.5 / budget)
@@ -67,7 +67,7 @@ def test_densities_are_drawn_from_evenly():
     density = jnp.array([[0.1, 0.0, 0.6, 0.3], [0.0, 1.0, 0.0, 0.0]])
     edges = np.array([[0, 0.25, 0.5, 0.75, 1], [0, 0.5, 0.7, 0.7, 1]], np.float32)
     even = jnp.stack([(jnp.arange(1000) + 0.5) / 1000] * 2, axis=1)
-    u = np.asarray(_draw(density, edges, even))
+    u = np.asarray(draw_cells(density, edges, even))
     np.testing.assert_array_equal(np.histogram(u[:, 0], edges[0])[0], [100, 0, 600, 300])
     np.testing.assert_allclose(np.sort(u[:, 1]), np.linspace(0.5, 0.7, 1000), atol=2e-3)
 

@@ -11,7 +11,7 @@ from checked_types import unchecked
 from verifai_jax.core.cube import Cube
 from verifai_jax.search import Observations, named
 from verifai_jax.search.halton import halton_points
-from verifai_jax.search.turbo import SIDES, TuRBO, _box
+from verifai_jax.search.turbo import SIDES, TuRBO, trust_box
 
 KEY = jax.random.key(0)
 SMALL = TuRBO(capacity=128, candidates=256)
@@ -110,7 +110,7 @@ def test_sides_follow_the_length_scales():
     state = TINY.init(KEY, cube, 4)
     lengths = jnp.log(jnp.array([0.5, 2.0, 1.0, 1.0]))
     state = state._replace(hyper=state.hyper._replace(lengths=lengths), side=jnp.float32(0.1))
-    low, high = _box(state, cube, jnp.full(4, 0.5))
+    low, high = trust_box(state, cube, jnp.full(4, 0.5))
     # 0.1 times 0.5 and 2; one cell to either side; any of the unordered ones.
     np.testing.assert_allclose(high - low, [0.05, 0.2, 0.6, 1.0], rtol=1e-5)
 

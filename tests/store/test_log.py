@@ -20,7 +20,7 @@ import pytest
 from hypothesis import strategies
 
 from verifai_jax.store.files import DamagedError, checksum
-from verifai_jax.store.log import _HEADER, MARK, Log, write_log
+from verifai_jax.store.log import HEADER, MARK, Log, write_log
 
 
 @hypothesis.settings(max_examples=50, deadline=None)
@@ -114,9 +114,9 @@ def test_a_forged_log_is_damaged_in_words(tmp_path):
         ),
     ):  # fmt: skip
         head, body = json.dumps(form).encode(), b"12345678"
-        begin = _HEADER.pack(MARK, len(head), len(body), 0)[:-4]
+        begin = HEADER.pack(MARK, len(head), len(body), 0)[:-4]
         own = checksum(head + body, checksum(begin))
-        path.write_bytes(_HEADER.pack(MARK, len(head), len(body), own) + head + body)
+        path.write_bytes(HEADER.pack(MARK, len(head), len(body), own) + head + body)
         assert not Log(path).damaged
         assert Log(path).get("a") is None
         assert dict(Log(path).entries()).keys() <= {"b"}

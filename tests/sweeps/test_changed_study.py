@@ -8,7 +8,7 @@ from drifting import drifting, quick_certificates
 from verifai_jax.core.sources import Source
 from verifai_jax.rl import policy_sources
 from verifai_jax.store.cache import CacheError
-from verifai_jax.sweeps import _sweep as driver
+from verifai_jax.sweeps import running as driver
 from verifai_jax.sweeps._sweep import sweep
 from verifai_jax.sweeps.result import load_sweep
 from verifai_jax.sweeps.study import Study

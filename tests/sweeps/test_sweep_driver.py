@@ -14,7 +14,7 @@ from verifai_jax.core.errors import MissingExtra, UnknownNameError
 from verifai_jax.rl import evaluate, train
 from verifai_jax.rl._evaluate import mean_returns
 from verifai_jax.store.cache import Cache, CacheError
-from verifai_jax.sweeps import _sweep as driver
+from verifai_jax.sweeps import running as driver
 from verifai_jax.sweeps import training_runs
 from verifai_jax.sweeps._sweep import sweep
 from verifai_jax.sweeps.halving import Halving
@@ -385,7 +385,7 @@ def test_out_of_time_is_what_there_is():
 
 
 def test_what_was_trained_in_time_is_certified(monkeypatch):
-    monkeypatch.setattr(driver, "_FOR_TRAINING", 1e-9)
+    monkeypatch.setattr(driver, "FOR_TRAINING", 1e-9)
     found = sweep(drifting(), configurations=4, samples=8, max_seconds=1000.0)
     assert not found.record.complete
     assert len(found.table) in range(1, 4 * 3)

@@ -211,7 +211,7 @@ def rules(
     doubt = _doubt(source)
     if _too_few(failing):
         return Rules((), 0.0, None, unsupported=0, measured=0, doubt=doubt, samples=samples)
-    aside = _aside(failing, held_out, seed)
+    aside = rows_set_aside(failing, held_out, seed)
     values, codes = samples.values(), samples.codes()
     made = ~aside
     regions = _select_regions(
@@ -290,7 +290,9 @@ def check_both(samples: Samples, purpose: str) -> None:
         )
 
 
-def _aside(failing: Bool[np.ndarray, " n"], share: float, seed: int) -> Bool[np.ndarray, " n"]:
+def rows_set_aside(
+    failing: Bool[np.ndarray, " n"], share: float, seed: int
+) -> Bool[np.ndarray, " n"]:
     """Draw rows to keep aside: the same share of failing and of safe ones."""
     aside = np.zeros(len(failing), bool)
     generator = np.random.default_rng(seed)

@@ -28,7 +28,7 @@ from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.precision import reproducible_settings
 from verifai_jax.core.progress import ProgressBar
-from verifai_jax.core.sources import sources_of
+from verifai_jax.core.source_collection import sources_of
 from verifai_jax.falsification.validation import check_search
 from verifai_jax.features import FeatureSpace
 from verifai_jax.search import Search, named

@@ -27,7 +27,7 @@ from verifai_jax.certification.simulators import (
 )
 from verifai_jax.core.executors import Executor, Shipment, ship
 from verifai_jax.core.precision import truncate_silently
-from verifai_jax.core.sources import sources_of
+from verifai_jax.core.source_collection import sources_of
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.verdicts import Verdicts

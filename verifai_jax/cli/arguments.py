@@ -366,11 +366,29 @@ def resuming(command: str, folder: Path, target: str | None, options: Mapping[st
     return shlex.join(words)
 
 
+@contextlib.contextmanager
 def given_or_next(
-    folder: Path | None, parent: str, name: str
-) -> contextlib.AbstractContextManager[Path]:
-    """Return the folder that was given, or else the next one, as `next_folder` makes it."""
-    return next_folder(parent, name) if folder is None else contextlib.nullcontext(folder)
+    folder: Path | None,
+    parent: str,
+    name: str,
+    goes_on: Callable[[Path], str] | None = None,
+    record: str | Path = "run.json",
+) -> Iterator[Path]:
+    """Return the folder that was given, or else the next one, as `next_folder` makes it.
+
+    **Arguments:**
+
+    - `goes_on`: writes the command that goes on with the folder, which is said for those who kill
+      this one.
+    - `record`: file that the folder has from when on that is possible.
+    """
+    from verifai_jax.core.progress import goes_on_with
+
+    with contextlib.ExitStack() as held:
+        path = held.enter_context(next_folder(parent, name)) if folder is None else folder
+        if goes_on is not None:
+            held.enter_context(goes_on_with(goes_on(path), (path / record).is_file))
+        yield path
 
 
 @contextlib.contextmanager

@@ -7,6 +7,7 @@ import click
 
 from verifai_jax.cli.arguments import CLUSTER, MAX_SECONDS, REPORT, SEED, TARGET, on_cluster
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
+from verifai_jax.cli.going_on import kept_until_done
 from verifai_jax.cli.json_output import as_plain, command, give_result
 
 
@@ -47,10 +48,11 @@ def compare(
     from verifai_jax.core.text import printable
     from verifai_jax.problem import Problem
 
-    with on_cluster(cluster) as executor:
+    with kept_until_done() as kept, on_cluster(cluster) as executor:
         named = {name: name for name in candidates}
         result = run_compare(target, named, executor=executor, **options)
-    click.echo(printable(str(result)))
+        click.echo(printable(str(result)))
+        kept.stopped(result.stopped)
     if report is not None:
         with load_at_revision(target, Problem) as baseline:
             path = result.report(report, problem=baseline)

@@ -8,6 +8,7 @@ import click
 from verifai_jax.cli import arguments
 from verifai_jax.cli.exit_codes import BROKEN, INTERRUPTED, CommandError
 from verifai_jax.cli.gates import RATE, Gate, check_gate, fail_on
+from verifai_jax.cli.going_on import kept_until_done
 from verifai_jax.cli.json_output import command, show_result
 
 if TYPE_CHECKING:
@@ -52,9 +53,10 @@ def estimate(
     if p0 is None and fail_on is not None:
         p0 = fail_on.bound
     problem = arguments.load_problem(target, only)
-    with arguments.on_cluster(cluster) as executor:
+    with kept_until_done() as kept, arguments.on_cluster(cluster) as executor:
         found = run(problem, p0=p0, executor=executor, **options)
-    show_result(found, plot)
+        show_result(found, plot)
+        kept.stopped(found.stopped)
     if report is not None:
         path = found.report(report, problem=problem)
         click.echo(f"  report       {path}")

@@ -2,6 +2,7 @@
 
 import shlex
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
@@ -125,12 +126,18 @@ def falsify(
         problem = arguments.load_problem(target, only)
         _simulate_shard(problem, shard, chosen, budget or 10_000, folder, target=target, **asked)
         return
+    ends = {"--max-seconds": given["max_seconds"], "--stop-after": given["stop_after"]}
+    ends |= {"--within": within, "--decide": decide, "--cluster": cluster}
+    goes_on = partial(arguments.resuming, "falsify", target=target, options=ends)
     if resume is not None:
         problem = arguments.load_problem(target, only)
         asked = {
             name: given[name] for name in ("max_seconds", "stop_after", "progress", "keep_going")
         }
-        with arguments.on_cluster(cluster) as executor:
+        with (
+            arguments.given_or_next(resume, "runs", "", goes_on),
+            arguments.on_cluster(cluster) as executor,
+        ):
             run = falsification.resume(
                 resume,
                 problem,
@@ -149,7 +156,7 @@ def falsify(
         problem = arguments.load_problem(target, only)
         earlier = None if warm_start is None else arguments.read_run(warm_start)
         with (
-            arguments.given_or_next(folder, "runs", problem.name) as path,
+            arguments.given_or_next(folder, "runs", problem.name, goes_on) as path,
             arguments.on_cluster(cluster) as executor,
         ):
             run = falsification.falsify(
@@ -164,8 +171,6 @@ def falsify(
                 executor=executor,
                 **given,
             )
-    ends = {"--max-seconds": given["max_seconds"], "--stop-after": given["stop_after"]}
-    ends |= {"--within": within, "--decide": decide, "--cluster": cluster}
     print_run(run, pictures, ends)
     check_run(run, fail_on)
 

@@ -1,5 +1,6 @@
 """`verifai-jax fuzz specs/handover.py:handover --stop-after 1`: follow what was covered."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,9 +45,10 @@ def fuzz(
 
     chosen = {name: _cells(name, text) for name, text in arguments.split_pairs("--cells", cells)}
     problem = arguments.load_problem(target)
-    with arguments.given_or_next(folder, "runs", problem.name) as path:
-        run = run_fuzz(problem, cells=chosen or None, folder=path, target=target, **options)
     ends = {"--max-seconds": options["max_seconds"], "--stop-after": options["stop_after"]}
+    goes_on = partial(arguments.resuming, "falsify", target=target, options=ends)
+    with arguments.given_or_next(folder, "runs", problem.name, goes_on) as path:
+        run = run_fuzz(problem, cells=chosen or None, folder=path, target=target, **options)
     print_run(run, pictures, ends)
     parts = [
         {"of": part.where, "kind": part.what, "covered": part.covered, "total": part.total}

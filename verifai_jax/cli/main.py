@@ -33,7 +33,9 @@ from verifai_jax.cli.exit_codes import (
 )
 from verifai_jax.cli.explain import explain
 from verifai_jax.cli.falsify import falsify
+from verifai_jax.cli.fmea import fmea
 from verifai_jax.cli.fuzz import fuzz
+from verifai_jax.cli.going_on import WORDS
 from verifai_jax.cli.list import list_targets
 from verifai_jax.cli.merge import merge
 from verifai_jax.cli.modes import modes
@@ -59,6 +61,7 @@ COMMANDS = (
     confirm,
     estimate,
     modes,
+    fmea,
     explain,
     repair,
     shrink,
@@ -111,9 +114,14 @@ def _closed_pipe() -> click.exceptions.Exit:
 class _Group(click.Group):
     """Command group that tells an error in one line, with the exit code of its kind."""
 
-    def make_context(self, *args: Any, **options: Any) -> click.Context:
+    def make_context(
+        self, info_name: str | None, args: list[str], *rest: Any, **options: Any
+    ) -> click.Context:
+        words = list(args)
         try:
-            return super().make_context(*args, **options)
+            context = super().make_context(info_name, args, *rest, **options)
+            context.meta[WORDS] = words
+            return context
         except BrokenPipeError:  # Of what --help and --version print.
             raise _closed_pipe() from None
 

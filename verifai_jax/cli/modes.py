@@ -6,6 +6,7 @@ from typing import Any
 import click
 
 from verifai_jax.cli import arguments
+from verifai_jax.cli.going_on import kept_until_done
 from verifai_jax.cli.json_output import command, show_result
 
 
@@ -31,4 +32,8 @@ def modes(target: str, only: str | None, plot: Path | None, **options: Any) -> N
     """List the modes of failure of TARGET (FILE.py:NAME), each with its probability."""
     from verifai_jax.failure_modes import modes as run
 
-    show_result(run(arguments.load_problem(target, only), **options), plot)
+    problem = arguments.load_problem(target, only)
+    with kept_until_done() as kept:
+        found = run(problem, **options)
+        show_result(found, plot)
+        kept.stopped(found.stopped)

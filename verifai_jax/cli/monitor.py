@@ -1,4 +1,7 @@
-"""`verifai-jax monitor "always[0, 4] abs(x) <= 2.4" trace.csv`: a formula on a recording."""
+"""`verifai-jax monitor "always[0, 4] abs(x) <= 2.4" trace.csv`: a formula on a recording.
+
+`verifai-jax monitor requirements.toml logs/`: many requirements on many recordings.
+"""
 
 import math
 import sys
@@ -11,6 +14,7 @@ from verifai_jax.cli.arguments import PLOT, split_pairs
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result
+from verifai_jax.cli.monitor_fleet import fleet_options, is_fleet, monitor_fleet
 from verifai_jax.cli.monitor_stream import monitor_stream
 from verifai_jax.core.errors import UnknownNameError, missing_name, nearest_names
 from verifai_jax.core.text import printable
@@ -22,7 +26,7 @@ if TYPE_CHECKING:
 
 @command()
 @click.argument("formula")
-@click.argument("recording", type=click.Path(path_type=Path))
+@click.argument("recording", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--dt", type=float, help="Sampling period in seconds, instead of a column of times.")
 @click.option("--time", default="time", show_default=True, help="Column of sample times.")
 @click.option("--resample", "period", type=float, help="Period in seconds to resample to.")
@@ -39,10 +43,11 @@ if TYPE_CHECKING:
 @click.option("--define", "definitions", multiple=True, metavar="NAME=FORMULA")
 @click.option("--explain", is_flag=True, help="Say which predicate decides, and when.")
 @PLOT
-@fail_on(violation="if the formula fails")
+@fleet_options
+@fail_on(violation="if a formula fails", incomplete="if one fails or has no verdict on a recording")
 def monitor(
     formula: str,
-    recording: Path,
+    recording: tuple[Path, ...],
     dt: float | None,
     time: str,
     period: float | None,
@@ -53,9 +58,15 @@ def monitor(
     definitions: tuple[str, ...],
     explain: bool,
     plot: Path | None,
+    report: Path | None,
+    junit: Path | None,
+    jobs: int,
     fail_on: Gate | None,
 ) -> None:
     """Compute the robustness of FORMULA on a recorded trace, RECORDING.csv or .parquet.
+
+    FORMULA may also be a file of requirements (.toml or .csv), and RECORDING a folder, or several:
+    every requirement is judged on every recording.
 
     With - as RECORDING, lines of CSV are read from the standard input as they come, until the
     verdict is certain whatever follows: tail -f log.csv | verifai-jax monitor FORMULA -
@@ -68,8 +79,18 @@ def monitor(
     if (explain or plot is not None) and compat is not None:
         raise click.UsageError("--explain and --plot do not go with --compat")
     numbers = {name: _number(name, value) for name, value in split_pairs("--const", constants)}
-    parsed = mtl.parse(formula, numbers, dict(split_pairs("--define", definitions)))
-    if str(recording) == "-":
+    named = dict(split_pairs("--define", definitions))
+    if is_fleet(formula, recording, report, junit):
+        if plot is not None or compat is not None:
+            raise click.UsageError("--plot and --compat go with one formula on one recording")
+        options = {"time": time, "dt": dt, "resample_to": period, "method": method, "end": end}
+        found = monitor_fleet(formula, recording, numbers, named, report, junit, jobs, options)
+        failing, missing = bool(found.failing), bool(found.without_verdict)
+        check_gate(fail_on, {"violation": failing, "incomplete": failing or missing})
+        return
+    (file,) = recording
+    parsed = mtl.parse(formula, numbers, named)
+    if str(file) == "-":
         if explain or plot is not None or compat is not None or period is not None or end != "hold":
             raise click.UsageError(
                 "a stream goes with --dt, --time, --const, --define and --fail-on; other options "
@@ -77,10 +98,10 @@ def monitor(
             )
         holds = monitor_stream(parsed, sys.stdin, time, dt)
         give_result(formula=str(parsed), holds=holds)
-        check_gate(fail_on, {"violation": not holds})
+        check_gate(fail_on, {"violation": not holds, "incomplete": not holds})
         return
-    trace = _read(recording, time, dt, period, method)
-    _check_signals(parsed, trace, recording)
+    trace = _read(file, time, dt, period, method)
+    _check_signals(parsed, trace, file)
     with jax.enable_x64(True):
         try:
             rho = float(mtl.robustness(parsed, trace, end=end, compat=compat))
@@ -108,7 +129,7 @@ def monitor(
                 mtl.draw(why, plot)
                 click.echo(f"picture {plot}")
     give_result(formula=str(parsed), holds=holds, robustness=rho)
-    check_gate(fail_on, {"violation": not holds})
+    check_gate(fail_on, {"violation": not holds, "incomplete": not holds})
 
 
 def _read(

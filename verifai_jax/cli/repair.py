@@ -7,6 +7,7 @@ import click
 
 from verifai_jax.cli import arguments
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
+from verifai_jax.cli.going_on import kept_until_done
 from verifai_jax.cli.json_output import command, draw, give_result, show_result
 
 
@@ -48,22 +49,24 @@ def repair(
     from verifai_jax.synthesis import repair as run_repair
 
     problem = arguments.load_problem(target)
-    result = run_repair(
-        problem if folder is None else arguments.read_run(folder, problem),
-        parameters,
-        budget,
-        nominal=arguments.plain_values("--nominal", nominal) or None,
-        **keywords,
-    )
-    show_result(
-        result, None, "before", "parameters", "robustness", "repaired", "change",
-        "held_out_before", "held_out_after", "simulations", "stopped", "seed", "sources",
-        "changed",
-    )  # fmt: skip
-    if estimate is not None:
-        estimates = result.estimate(budget=estimate, seed=result.seed)
-        click.echo(printable(str(estimates)))
-        give_result(estimate_before=estimates.before, estimate_after=estimates.after)
+    with kept_until_done() as kept:
+        result = run_repair(
+            problem if folder is None else arguments.read_run(folder, problem),
+            parameters,
+            budget,
+            nominal=arguments.plain_values("--nominal", nominal) or None,
+            **keywords,
+        )
+        show_result(
+            result, None, "before", "parameters", "robustness", "repaired", "change",
+            "held_out_before", "held_out_after", "simulations", "stopped", "seed", "sources",
+            "changed",
+        )  # fmt: skip
+        if estimate is not None:
+            estimates = result.estimate(budget=estimate, seed=result.seed)
+            click.echo(printable(str(estimates)))
+            give_result(estimate_before=estimates.before, estimate_after=estimates.after)
+        kept.stopped(result.stopped)
     if plot is not None:
         draw(result, plot)
     check_gate(fail_on, {"unsafe": not result.repaired})

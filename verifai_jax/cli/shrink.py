@@ -7,6 +7,7 @@ import click
 
 from verifai_jax.cli import arguments
 from verifai_jax.cli.exit_codes import check_again
+from verifai_jax.cli.going_on import kept_until_done
 from verifai_jax.cli.json_output import command, give_result, show_result
 
 
@@ -45,10 +46,12 @@ def shrink(
     from verifai_jax import counterexamples
 
     run = arguments.load_judged_run(folder, target)
-    small = counterexamples.shrink(run, row, **options)
-    give_result(robustness=small.rho)
-    show_result(
-        small, (into or folder) / f"shrunk-{small.row}.png" if pictures else None, "row",
-        "features", "changed", "count", "distance", "simulations", "model_changed", "finding",
-    )  # fmt: skip
+    with kept_until_done() as kept:
+        small = counterexamples.shrink(run, row, **options)
+        give_result(robustness=small.rho)
+        show_result(
+            small, (into or folder) / f"shrunk-{small.row}.png" if pictures else None, "row",
+            "features", "changed", "count", "distance", "simulations", "model_changed", "finding",
+        )  # fmt: skip
+        kept.stopped(small.stopped)
     check_again(small.finding, even_if_changed)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -116,9 +117,13 @@ def sweep(
         "nominal": list(nominal),
     }
     keywords = _keywords(given, options)
+    goes_on = partial(
+        _resuming, target=target, cache=cache, max_seconds=max_seconds, cluster=cluster
+    )
+    kept = cache_file(Path() if cache is None else cache.absolute())
     try:
         with (
-            arguments.given_or_next(folder, "sweeps", study.name) as path,
+            arguments.given_or_next(folder, "sweeps", study.name, goes_on, kept) as path,
             arguments.on_cluster(cluster) as executor,
         ):
             folder = path

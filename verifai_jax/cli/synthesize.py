@@ -7,6 +7,7 @@ import click
 
 from verifai_jax.cli.arguments import PARAMETER_CHOICE, TARGET, load_problem
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
+from verifai_jax.cli.going_on import kept_until_done
 from verifai_jax.cli.json_output import command, show_result
 
 
@@ -35,11 +36,14 @@ def synthesize(
     """Find parameters for which TARGET (specs/FILE.py:NAME) holds, whatever its other features."""
     from verifai_jax.synthesis import synthesize as run_synthesize
 
-    result = run_synthesize(load_problem(target), parameters, budget, **keywords)
-    show_result(
-        result, None, "parameters", "robustness", "holds", "margin", "converged", "simulations",
-        "without_verdict", "held_out", "stopped", "seed", "sources",
-    )  # fmt: skip
+    problem = load_problem(target)
+    with kept_until_done() as kept:
+        result = run_synthesize(problem, parameters, budget, **keywords)
+        show_result(
+            result, None, "parameters", "robustness", "holds", "margin", "converged",
+            "simulations", "without_verdict", "held_out", "stopped", "seed", "sources",
+        )  # fmt: skip
+        kept.stopped(result.stopped)
     if table is not None:
         from verifai_jax.core.atomic_files import replacing
 

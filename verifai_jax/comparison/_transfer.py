@@ -42,6 +42,10 @@ GROWTH = 3.0
 """Times that growth which a gap must exceed: moves in other directions may grow more."""
 STILL, TINY = 1e-3, 1e-9
 """Least unit of a signal, as a part of its greatest value and by itself."""
+MAX_CONSTANTS = 8
+"""Constants of the models that are named at most."""
+USUAL = 0.9
+"""Quantile of the traces' greatest values that counts as the end of a signal's range."""
 
 
 @suggests_options
@@ -178,10 +182,26 @@ def _common(a: Problem, b: Problem) -> tuple[tuple[Problem, Problem], list[str]]
         if others:
             notes.append(f"{', '.join(others)} of {letter} is held at its nominal value")
         held.append(problem.only(*both) if others else problem)
+    notes += _other_constants(a, b)
     order = [[n for n, d in p.space.root.fields if d.size] for p in held]
     if order[0] != order[1]:
         raise ProblemError(f"the common features are in another order: {order[0]} and {order[1]}")
     return (held[0], held[1]), notes
+
+
+def _other_constants(a: Problem, b: Problem) -> list[str]:
+    """Say in which constants the models of two systems differ, where they can be compared."""
+    one, other = (problem.system.constants for problem in (a, b))
+    said = []
+    for name in one:
+        x, y = one[name], other.get(name)
+        if y is None or np.array_equal(x, y):
+            continue
+        if isinstance(x, str) or np.size(x) == 1 == np.size(y):
+            said.append(f"{name} is {x} in a and {y} in b")
+        elif np.shape(x) == np.shape(y):
+            said.append(f"{name} differs by up to {np.max(np.abs(np.subtract(x, y))):z.3g}")
+    return ["the models differ: " + "; ".join(said[:MAX_CONSTANTS])] if said else []
 
 
 class _Pairs:
@@ -332,7 +352,7 @@ def _columns(trace: Trace | None) -> dict[str, Float[np.ndarray, " time"]]:
 
 
 def _scales(sides: Sequence[Verdicts]) -> dict[str, float]:
-    """Return the range of each common signal, over all traces of both engines.
+    """Return the range of each common signal, over most traces of both engines.
 
     **Raises:** `ProblemError` without a common signal.
     """
@@ -348,11 +368,15 @@ def _scales(sides: Sequence[Verdicts]) -> dict[str, float]:
         )
     scales = {}
     for name in names:
-        values = np.concatenate([each[name] for one in known for each in one])
-        values = values[np.isfinite(values)]
-        size = float(np.max(np.abs(values), initial=0.0))
+        traces = [v[np.isfinite(v)] for one in known for each in one if len(v := each[name])]
+        low, high, size = np.array(
+            [(np.min(v), np.max(v), np.max(np.abs(v))) for v in traces if len(v)] or [(0, 0, 0)]
+        ).T
+        # Some traces that diverge must not hide what the others do.
+        whole = np.quantile(high, USUAL) - np.quantile(low, 1 - USUAL)
+        whole = whole or np.max(high) - np.min(low)
         # What hardly moves is in units of its size, lest its rounding look like a motion.
-        scales[name] = max(float(np.ptp(values)) if len(values) else 0.0, STILL * size, TINY)
+        scales[name] = float(max(whole, STILL * np.quantile(size, USUAL), TINY))
     return scales
 
 

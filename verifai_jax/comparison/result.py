@@ -225,6 +225,18 @@ class Transfer(InNotebook):
         rows = rows.assign(violated=rows.index.isin(self.flips.index), rho=-rows["gap"])
         return _rules(rows, self.space, options)
 
+    def report(self, path: str | Path, **options: Any) -> Path:
+        """Write the evidence report as HTML, and its claims as JSON.
+
+        **Arguments:**
+
+        - `path`: of the HTML file.
+        - `options`: of `reports.write_report`: `units`, `reasons`.
+
+        **Returns:** the path.
+        """
+        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
+
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the pair that parts most, and the gaps of all by the feature that matters most.
 

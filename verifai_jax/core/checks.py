@@ -11,19 +11,24 @@ from typing import SupportsIndex, TypeGuard
 
 import numpy as np
 
+from verifai_jax.core.text import is_control
+
 
 def is_number(value: object) -> TypeGuard[float]:
     """Return whether this is a real number of Python or NumPy, and no truth value."""
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
-def check_name(what: str, name: object, *, error: type[ValueError] = ValueError) -> str:
+def check_name(
+    what: str, name: object, *, lines: bool = False, error: type[ValueError] = ValueError
+) -> str:
     """Check a name that tables and files can hold.
 
     **Arguments:**
 
     - `what`: what it names, for the message: `the name of a signal`.
     - `name`: name to check.
+    - `lines`: whether it may have line breaks and other control characters.
     - `error`: type of the error to raise.
 
     **Returns:** the name.
@@ -39,6 +44,11 @@ def check_name(what: str, name: object, *, error: type[ValueError] = ValueError)
             f"{what} must be a text that UTF-8 can hold; {name!r} has the lone surrogate "
             f"{cause.object[cause.start]!r}"
         ) from None
+    if not lines and any(is_control(character) for character in name):
+        raise error(
+            f"{what} must be one line without control characters, as people read it in summaries; "
+            f"got {name!r}"
+        )
     return name
 
 

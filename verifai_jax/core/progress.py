@@ -19,7 +19,7 @@ import io
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import IO, TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
@@ -35,6 +35,8 @@ R = TypeVar("R")
 
 EVERY = 60.0
 """Seconds between two lines where nothing is drawn."""
+MOMENT = 2.0
+"""Seconds after which work is worth going on with: what takes less is as soon done anew."""
 
 _ongoing: ContextVar["ProgressBar | None"] = ContextVar("ongoing", default=None)
 """The bar of the verb that was called; the others within it show themselves there."""
@@ -349,3 +351,26 @@ def has_viewer() -> bool:
         return True
     # In a notebook rich draws through ipywidgets, and without it warns instead.
     return "ipykernel" in sys.modules and importlib.util.find_spec("ipywidgets") is not None
+
+
+@contextlib.contextmanager
+def goes_on_with(command: str, kept: Callable[[], bool]) -> Iterator[None]:
+    """Say after a moment by which command one goes on with what is killed: then nobody can.
+
+    **Arguments:**
+
+    - `kept`: whether there is anything to go on with by now.
+    """
+    over = threading.Event()
+
+    def say() -> None:
+        while not over.wait(MOMENT):
+            if kept():
+                write_line(f"note: if this is killed, go on with: {command}")
+                return
+
+    threading.Thread(target=say, daemon=True).start()
+    try:
+        yield
+    finally:
+        over.set()

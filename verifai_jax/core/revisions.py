@@ -113,7 +113,7 @@ def _git(*words: str, cwd: Path | None = None, env: dict[str, str] | None = None
 def _imported_from(root: Path, tree: Path, inner: Path) -> Iterator[None]:
     """Import modules of the project from another tree of its files, standing in `inner` of it."""
     before, paths = Path.cwd(), list(sys.path)
-    kept = {name: module for name, module in sys.modules.items() if _lies_in(module, root)}
+    kept = {name: module for name, module in sys.modules.items() if lies_in(module, root)}
     for name in kept:
         del sys.modules[name]
     sys.path[:] = [_moved(path, root, tree) for path in paths]
@@ -125,13 +125,14 @@ def _imported_from(root: Path, tree: Path, inner: Path) -> Iterator[None]:
     finally:
         os.chdir(before)
         sys.path[:] = paths
-        for name in [name for name, module in sys.modules.items() if _lies_in(module, tree)]:
+        for name in [name for name, module in sys.modules.items() if lies_in(module, tree)]:
             del sys.modules[name]
         sys.modules.update(kept)
         importlib.invalidate_caches()
 
 
-def _lies_in(module: object, folder: Path) -> bool:
+def lies_in(module: object, folder: Path) -> bool:
+    """Return whether a module was imported from a folder; never one of this package."""
     name = getattr(module, "__name__", None) or ""
     if name.partition(".")[0] in (_OWN, "__main__"):
         return False

@@ -115,7 +115,7 @@ def _is_real(value: object) -> bool:
 
 
 def _format_value(value: object) -> str:
-    return f"{value:z.4g}" if isinstance(value, float | np.floating) else str(value)
+    return f"{value:z.4g}" if isinstance(value, float | np.floating) else one_line(str(value))
 
 
 def format_error(error: BaseException) -> str:
@@ -174,6 +174,11 @@ def storable(text: object, maximum: int = 2000) -> str:
             raise
         written = f"({type(text).__name__} whose text cannot be written)"
     return shorten(written, maximum).encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+def is_control(character: str) -> bool:
+    """Return whether a character breaks a line, or controls a terminal."""
+    return unicodedata.category(character) in ("Cc", "Zl", "Zp")
 
 
 def _steers(character: str) -> bool:

@@ -107,7 +107,7 @@ class Trace(InNotebook):
         if not self.signals:
             raise ValueError("a trace needs at least one signal; got none")
         for name in self.signals:
-            check_name("the name of a signal", name)
+            check_name("the name of a signal", name, lines=True)
         signals = {name: with_gaps(name, signal) for name, signal in self.signals.items()}
         object.__setattr__(self, "signals", signals)
         lengths = {}

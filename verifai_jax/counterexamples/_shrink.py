@@ -121,10 +121,11 @@ def shrink(
     candidates = Candidates(problem, at, int(budget), run.precision)
     search = _Search(candidates, by, np.random.default_rng(seed), start)
     points = np.concatenate([start, select_others(run, at, number, OTHERS)]) if others else start
-    notes = []
+    notes, stopped = [], None
     try:
         search.search(points)
     except KeyboardInterrupt:
+        stopped = "interrupted"
         notes.append("interrupted: the least so far")
     verified = _verified(problem, search, key, number, run.precision)
     u = start[0] if verified is None else verified[0]
@@ -152,6 +153,7 @@ def shrink(
         start_broken=_broken(original),
         model_changed=original.changed,
         finding=original.finding,
+        stopped=stopped,
     )
 
 

@@ -191,5 +191,10 @@ def _named(i: Influence, *, begins: bool = False) -> str:
 
 
 def _usual(i: Influence) -> str:
+    if len(i.nominal) == len(i.coordinates) and all("." in one for one in i.coordinates):
+        # Of a structure, whose numbers say nothing without their names.
+        names = [one.rpartition(".")[2] for one in i.coordinates]
+        pairs = zip(names, map(format_number, i.nominal), strict=True)
+        return ", ".join(f"{name} {value}" for name, value in pairs)
     values = list(dict.fromkeys(i.nominal))
     return ", ".join(map(format_number, values[:4])) + ", ..." * (len(values) > 4)

@@ -36,7 +36,7 @@ def remove_items(candidates: Candidates, u: Float[np.ndarray, " d"]) -> Float[np
         points = nominal.restored(u)
         present = _present(candidates, u)
         drops = np.zeros((0, nominal.space.items), bool)
-        for removed in _sets(present):
+        for removed in item_sets(present):
             row = np.zeros((1, nominal.space.items), bool)
             row[0, removed] = True
             drops = np.concatenate([drops, row])
@@ -71,7 +71,7 @@ def _without(
     return nominal.settle(np.asarray(nominal.space.without_items(points, padded)))[:count]
 
 
-def _sets(present: Int[np.ndarray, " k"]) -> list[list[int]]:
+def item_sets(present: Int[np.ndarray, " k"]) -> list[list[int]]:
     """Return sets of items to take away, all of them together among them."""
     removed = present.tolist()
     count = len(removed)

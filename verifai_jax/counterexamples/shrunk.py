@@ -37,7 +37,7 @@ class Shrunk(Drawn, InNotebook):
     `broken` and `start_broken`: names of the formulas that it breaks, and that the row broke;
     `simulations` spent; `by`: what was made least first; `history`: a `Step` for each improvement;
     `notes` for people; `duration` of the simulation in seconds; `model_changed` and `finding`: what
-    the replay of the row says, as in `Replay`.
+    the replay of the row says, as in `Replay`; `stopped`: `"interrupted"` after Ctrl-C.
     """
 
     _picture = "counterexamples", "plot_shrunk"
@@ -64,6 +64,7 @@ class Shrunk(Drawn, InNotebook):
     start_broken: tuple[str, ...] = ()
     model_changed: str = ""
     finding: str = ""
+    stopped: str | None = None
 
     @property
     def count(self) -> int:

@@ -11,8 +11,10 @@ from verifai_jax.core.lazy import attach
 
 if TYPE_CHECKING:
     from verifai_jax.estimation._estimate import estimate as estimate
+    from verifai_jax.estimation._sequence import sequence as sequence
     from verifai_jax.estimation.result import METHODS as METHODS
     from verifai_jax.estimation.result import Estimate as Estimate
+    from verifai_jax.estimation.sequence_result import SequenceEstimate as SequenceEstimate
     from verifai_jax.statistics.binomial import simulations_until as simulations_until
     from verifai_jax.statistics.binomial import upper_bound as upper_bound
 

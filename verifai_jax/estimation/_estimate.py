@@ -18,18 +18,20 @@ from verifai_jax.core.checks import check_fraction, check_options
 from verifai_jax.core.errors import suggests_options, unknown_name
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import SimulationProgress, shows_progress
-from verifai_jax.estimation.double_precision import DoublePrecisionEvaluator
-from verifai_jax.estimation.methods import (
-    SHARE_OF_LEVEL,
-    SHARE_OF_REPLICATE,
+from verifai_jax.estimation.answers import (
     Answer,
     Plan,
     bound_from_pilot,
     chains_for,
-    estimate_automatically,
-    estimate_by_importance_sampling,
     estimate_by_monte_carlo,
     estimate_by_splitting,
+)
+from verifai_jax.estimation.double_precision import DoublePrecisionEvaluator
+from verifai_jax.estimation.methods import (
+    SHARE_OF_LEVEL,
+    SHARE_OF_REPLICATE,
+    estimate_automatically,
+    estimate_by_importance_sampling,
 )
 from verifai_jax.estimation.monte_carlo import AT_ONCE
 from verifai_jax.estimation.moved_priors import notice_own_chance
@@ -214,6 +216,7 @@ def _result(
         precision=precision,
         backend=backend,
         seconds=seconds,
+        stopped=limit_state.ended,
         drawn=answer.drawn,
     )
 

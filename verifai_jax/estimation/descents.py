@@ -75,7 +75,7 @@ class Ends:
 
 
 @dataclass
-class _Descents:
+class Descents:
     """Descents side by side: their points, scores, and slopes where there are gradients."""
 
     z: Float[np.ndarray, "n d"]
@@ -92,11 +92,11 @@ class _Descents:
         foot = (inner / np.where(known, square, 1.0))[:, None] * self.gradient
         return np.where(known[:, None], foot, self.z)
 
-    def of(self, rows: Int[np.ndarray, " m"]) -> "_Descents":
+    def of(self, rows: Int[np.ndarray, " m"]) -> "Descents":
         """Return some of them."""
-        return _Descents(self.z[rows], self.score[rows], self.rho[rows], self.gradient[rows])
+        return Descents(self.z[rows], self.score[rows], self.rho[rows], self.gradient[rows])
 
-    def replace(self, rows: Int[np.ndarray, " m"], others: "_Descents") -> None:
+    def replace(self, rows: Int[np.ndarray, " m"], others: "Descents") -> None:
         """Put others in the place of some of them."""
         self.z[rows], self.score[rows] = others.z, others.score
         self.rho[rows], self.gradient[rows] = others.rho, others.gradient
@@ -112,16 +112,16 @@ def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulat
     begin = limit_state.simulations
     share = DRAWN if limit_state.gradient is None else DRAWN_WITH_SLOPES
     drawn = min(max(MIN_AT_ONCE, round(share * simulations)), MAX_DRAWN)
-    starts = _begin(limit_state, draw_starts(limit_state, rng, drawn))
+    starts = begin_descents(limit_state, draw_starts(limit_state, rng, drawn))
     hits = np.flatnonzero(starts.score == -np.inf)[: max(8, round(HITS * simulations))]
     others = np.flatnonzero(starts.score > -np.inf)
-    worse = _worse_neighbours(_points_ahead(limit_state, starts), starts.score)
+    worse = _worse_neighbours(points_ahead(limit_state, starts), starts.score)
     others = others[np.argsort(-worse[others], kind="stable")]
     # Far out, where they lie, several regions overlap.
     failing = starts.of(hits)
     failing.z = come_in(limit_state, failing.z)
     if limit_state.gradient is not None:
-        failing = _begin(limit_state, failing.z)
+        failing = begin_descents(limit_state, failing.z)
     points, feet = [failing.z], [failing.feet]
     count, before, begun = MIN_AT_ONCE, limit_state.simulations, 0
     while limit_state.simulations - begin < simulations:
@@ -129,7 +129,7 @@ def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulat
         if len(now):
             descents = starts.of(now)
         else:
-            descents = _begin(limit_state, draw_starts(limit_state, rng, count))
+            descents = begin_descents(limit_state, draw_starts(limit_state, rng, count))
         if not len(descents.z):
             break
         _descend(limit_state, rng, descents, np.concatenate(feet))
@@ -146,11 +146,11 @@ def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulat
     return Ends(np.concatenate(points), np.concatenate(feet))
 
 
-def _begin(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> _Descents:
+def begin_descents(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Descents:
     """Simulate points that the constraint accepts, with their slopes where there are gradients."""
     if limit_state.gradient is not None:
-        return _Descents(z, *limit_state.linearize(z))
-    return _Descents(z, limit_state(z).score, np.full(len(z), np.nan), np.zeros_like(z))
+        return Descents(z, *limit_state.linearize(z))
+    return Descents(z, limit_state(z).score, np.full(len(z), np.nan), np.zeros_like(z))
 
 
 def draw_starts(
@@ -178,7 +178,7 @@ def _planes(feet: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n coordinates"
     return np.concatenate([feet, FAR * feet / np.maximum(norms, 1e-9)], axis=1)
 
 
-def _points_ahead(limit_state: LimitState, descents: _Descents) -> Float[np.ndarray, "n d"]:
+def points_ahead(limit_state: LimitState, descents: Descents) -> Float[np.ndarray, "n d"]:
     """Return where the slope at each point says that the limit state is; the point without one.
 
     It is looked for no farther than one step leads.
@@ -191,7 +191,7 @@ def _points_ahead(limit_state: LimitState, descents: _Descents) -> Float[np.ndar
 
 
 def _downhill(
-    limit_state: LimitState, descents: _Descents
+    limit_state: LimitState, descents: Descents
 ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"], Int[np.ndarray, " m"]]:
     """Return directions in natural coordinates, slopes along them, and the rows that have one."""
     slopes = natural_slopes(descents.z, descents.gradient, limit_state.uniform)
@@ -213,7 +213,7 @@ def _worse_neighbours(
 def _descend(
     limit_state: LimitState,
     rng: np.random.Generator,
-    descents: _Descents,
+    descents: Descents,
     known: Float[np.ndarray, "m d"],
 ) -> None:
     """Lower the robustness of each point until it fails or its steps are used up.
@@ -246,7 +246,7 @@ def _descend(
 
 
 def _descend_by_gradient(
-    limit_state: LimitState, descents: _Descents, known: Float[np.ndarray, "m d"]
+    limit_state: LimitState, descents: Descents, known: Float[np.ndarray, "m d"]
 ) -> Bool[np.ndarray, " n"]:
     """Take Newton's steps to the limit state, halved where they do not lower the robustness.
 
@@ -271,7 +271,7 @@ def _descend_by_gradient(
         here = descents.z[rows]
         moved = move_naturally(here, length[:, None] * direction, limit_state.uniform)
         fits = limit_state.accepts(moved)
-        new = _begin(limit_state, np.where(fits[:, None], moved, here))
+        new = begin_descents(limit_state, np.where(fits[:, None], moved, here))
         better = fits & (new.score < score)
         descents.replace(rows[better], new.of(np.flatnonzero(better)))
         misses[rows[~better]] += 1

@@ -21,6 +21,7 @@ from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.evaluation.unfinished import Part, present
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
@@ -232,7 +233,9 @@ class HeldKeys:
     def __init__(
         self, problem: Problem, batch: int, precision: str, seed: int, *, gradient: bool = False
     ) -> None:
-        self.batch, self.precision = batch, precision
+        self.batch, self.precision, self.problem = batch, precision, problem
+        self._mode = ("held keys", precision, gradient, seed)
+        self._kept: Part | None = None
         self._keys = jax.jit(jax.vmap(partial(simulation_key, run_keys(seed)[1])))
         self._engine: Engine | HostEngine
         if problem.black_box:
@@ -257,6 +260,15 @@ class HeldKeys:
         )
 
     def _block(self, points: Any, numbers: Any, temperature: float = 1.0) -> Verdicts:
+        simulate = partial(self._simulated, points, numbers, temperature)
+        work = present()
+        if work is None:
+            return simulate()
+        if self._kept is None or self._kept.of is not work:
+            self._kept = work.part(self.problem, *self._mode)
+        return self._kept.recall_or(points, numbers, temperature, simulate)
+
+    def _simulated(self, points: Any, numbers: Any, temperature: float) -> Verdicts:
         count, size = len(points), self.batch
         numbers = np.pad(numbers, (0, size - count), mode="edge").astype(np.int32)
         keys = self._keys(numbers)

@@ -151,7 +151,7 @@ def _choose_ends(
     **Returns:** rows of ends, and the region of each.
     """
     maximum = max(chains, round(COMPARED * simulations))
-    rows = _spread_out(ends, min(maximum, MAX_COMPARED))
+    rows = spread_out(ends, min(maximum, MAX_COMPARED))
     gaps = _gaps(ends, rows, rows)
     gaps[np.triu_indices(len(rows))] = np.inf
     group = _joined(limit_state, ends.points[rows], np.argsort(gaps, axis=1)[:, :LINKS])
@@ -232,7 +232,7 @@ def _joined(
     return np.unique(group, return_inverse=True)[1]
 
 
-def _spread_out(ends: Ends, maximum: int) -> Int[np.ndarray, " k"]:
+def spread_out(ends: Ends, maximum: int) -> Int[np.ndarray, " k"]:
     """Return ends far from one another, the least distant first; no two that are one."""
     everything = np.arange(len(ends.points))
     nearest = int(np.linalg.norm(ends.points, axis=1).argmin())

@@ -10,25 +10,32 @@ checks it, and repeats itself where the proposal is no good. Where no failure is
 left goes to the prior, and only its bound is claimed.
 """
 
-from dataclasses import dataclass, field
-from typing import Any
-
 import numpy as np
-from jaxtyping import Bool, Float
 
 from verifai_jax.core.text import format_percent
-from verifai_jax.estimation import importance, monte_carlo
+from verifai_jax.estimation import importance
 from verifai_jax.estimation.anchors import anchors_of, join_explorations
+from verifai_jax.estimation.answers import (
+    CHAIN,
+    UNDERSTATED,
+    Answer,
+    Plan,
+    bound_answer,
+    bound_from_pilot,
+    estimate_by_monte_carlo,
+    importance_answer,
+    monte_carlo_answer,
+    splitting_answer,
+    splitting_cost,
+)
 from verifai_jax.estimation.components import Prior
 from verifai_jax.estimation.exploration import Exploration, explore
-from verifai_jax.estimation.importance import DEFENSIVE, STEADY, FittedProposal
+from verifai_jax.estimation.importance import DEFENSIVE, FittedProposal
 from verifai_jax.estimation.initial_proposal import (
-    Agreement,
     compare_explorations,
     mix,
     proposal_from,
 )
-from verifai_jax.estimation.intervals import log_interval
 from verifai_jax.estimation.mixture import Mixture, fit_mixture
 from verifai_jax.estimation.monte_carlo import Counts
 from verifai_jax.estimation.moved_priors import SURE, moved_priors, share_failing_again, share_out
@@ -48,8 +55,6 @@ MIN_OF_MOVED = 15
 """The same of the moved prior, whose weights have no such tail as those of fitted proposals."""
 MIN_COUNTED = 10
 """Failures of the first samples from which on their rate says what counting promises."""
-WORST_TAIL = 0.7
-"""Tail index beyond which weighted samples are not relied on (Vehtari et al., 2024)."""
 SHARE_OF_LEVEL = 0.06
 """Share of the budget for each level of the splitting that makes the proposal."""
 SHARE_OF_REPLICATE = 0.02
@@ -67,89 +72,8 @@ SHARE_OF_PATHS = 0.03
 """Share of the budget for paths between the failures of different searches."""
 RESERVED = 0.3
 """Share of the budget that splitting leaves over where searches have found failures."""
-NOTED_UNSEEN = 0.02
-"""Share of the probability from which a disagreement is noted."""
 EXPLORED = 0.1
 """Share of the simulations left for more failures before the proposal is fitted."""
-CHAIN = 10
-"""States of a chain: each level is about a tenth as probable as the previous one."""
-UNDERSTATED = 1.6
-"""Factor on the relative error of a run: chains start from those of the previous level."""
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Requirements of an answer.
-
-    - `confidence`: of the interval and the bound.
-    - `chains`: splitting chains of a level.
-    - `clamped`: True at coordinates whose domain ends in an outermost value.
-    """
-
-    confidence: float
-    chains: int
-    clamped: Bool[np.ndarray, " d"]
-
-
-@dataclass
-class Answer:
-    """An answer of a method; fields are those of `Estimate`.
-
-    - `prior`: counts of the independent samples of the prior that the bound rests on.
-    - `probability`: the estimate; None if none is claimed.
-    - `low`, `high`: ends of the interval.
-    - `method`: the method that gave the estimate.
-    - `effective`, `relative_error`: precision of the estimate.
-    - `diagnostics`: further numbers of the method.
-    - `notes`: sentences on anything surprising.
-    - `drawn`: data of the pictures.
-    - `samples`: the weighted samples that the estimate rests on; None if there are none.
-    - `nearest`: least distant failures `[m, d]` that the searches found.
-    """
-
-    prior: Counts
-    probability: float | None = None
-    low: float = 0.0
-    high: float = 1.0
-    method: str | None = None
-    effective: float = float("nan")
-    relative_error: float = float("nan")
-    diagnostics: dict[str, Any] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    drawn: dict[str, Any] = field(default_factory=dict)
-    samples: importance.ImportanceSamples | None = None
-    nearest: Float[np.ndarray, "m d"] | None = None
-
-
-def chains_for(budget: int, share: float) -> int:
-    """Return the chains of a level that takes this share of the budget, in multiples of 32."""
-    return 32 * max(1, round(budget * share / CHAIN / 32))
-
-
-def estimate_by_monte_carlo(
-    limit_state: LimitState, rng: np.random.Generator, plan: Plan
-) -> Answer:
-    """Estimate by Monte Carlo with all simulations that are left."""
-    return _monte_carlo_answer(monte_carlo.sample_prior(limit_state, rng, limit_state.left), plan)
-
-
-def _monte_carlo_answer(counts: Counts, plan: Plan) -> Answer:
-    answer = Answer(counts)
-    if counts.failures:
-        answer.probability = counts.failures / counts.simulations
-        answer.low, answer.high = counts.interval(plan.confidence)
-        answer.method = "monte_carlo"
-        answer.effective = float(counts.failures)
-        answer.relative_error = float(
-            np.sqrt((1 - answer.probability) / max(counts.failures, 1)),
-        )
-    else:
-        answer.high = counts.upper_bound(plan.confidence)
-        answer.notes.append(
-            f"none of {counts.simulations:,} samples of the prior fails, so there is a bound and "
-            "no estimate"
-        )
-    return answer
 
 
 def estimate_automatically(limit_state: LimitState, rng: np.random.Generator, plan: Plan) -> Answer:
@@ -164,7 +88,7 @@ def estimate_automatically(limit_state: LimitState, rng: np.random.Generator, pl
         answer = estimate_by_monte_carlo(limit_state, rng, plan)
         if answer.prior.simulations:
             return answer
-        return _monte_carlo_answer(counts, plan)
+        return monte_carlo_answer(counts, plan)
     return estimate_by_importance_sampling(limit_state, rng, plan, first)
 
 
@@ -177,7 +101,7 @@ def estimate_by_importance_sampling(
         return bound_from_pilot(limit_state, plan)
     counts = _counts(first)
     if limit_state.left <= 0:
-        return _monte_carlo_answer(counts, plan)
+        return monte_carlo_answer(counts, plan)
     run, again = SplittingRun(stopped="ended"), 1.0
     try:
         explorations = _explore(limit_state, rng)
@@ -188,7 +112,7 @@ def estimate_by_importance_sampling(
         if again >= SURE:
             run = run_splitting(limit_state, rng, len(first[0]), plan.chains, first, reserve)
             if run.stopped is not None and not explorations:
-                return _bound_only(limit_state, rng, plan, run, counts)
+                return bound_answer(limit_state, rng, plan, run, counts)
             if run.stopped is None:
                 again = min(again, share_failing_again(limit_state, rng, run.points))
         by_chance = again < SURE
@@ -228,7 +152,7 @@ def estimate_by_importance_sampling(
     except Ended:
         return _without_samples(limit_state, rng, plan, run, counts)
     answer = _with_chance(
-        _importance_answer(samples, run, agreement, counts, plan), again, limit_state.own_chance
+        importance_answer(samples, run, agreement, counts, plan), again, limit_state.own_chance
     )
     answer.samples = samples
     if explorations:
@@ -263,12 +187,12 @@ def _without_proposal(
         f"{fitted.tail:z.2f}; counting {counted:z.0f})"
     )
     if run.stopped is None and not limit_state.draws and _promised_by(run, limit_state) > counted:
-        answer = _splitting_answer(limit_state, rng, plan, [run], counts)
+        answer = splitting_answer(limit_state, rng, plan, [run], counts)
         answer.notes.append(f"{why}, so the estimate is that of multilevel splitting")
         return answer
     prior = Mixture((Prior(limit_state.dim),), np.ones(1))
     samples = importance.sample_proposal(limit_state, rng, prior, limit_state.left, plan.clamped)
-    answer = _bound_only(limit_state, rng, plan, run, counts + samples.counts)
+    answer = bound_answer(limit_state, rng, plan, run, counts + samples.counts)
     answer.samples = samples
     if answer.probability is not None:
         answer.notes.append(f"{why}, so failures are counted in samples of the prior")
@@ -277,13 +201,8 @@ def _without_proposal(
 
 def _promised_by(run: SplittingRun, limit_state: LimitState) -> float:
     """Return the failures that splitting is worth, with as many more runs as what is left."""
-    more = limit_state.left / _cost(run, run.first[0])
+    more = limit_state.left / splitting_cost(run, run.first[0])
     return (1 + more) / max(UNDERSTATED * run.cv, 1e-6) ** 2
-
-
-def _cost(run: SplittingRun, size: int) -> float:
-    """Return the simulations of a splitting run with levels of this size."""
-    return size + (len(run.fractions) - 1) * (size - size // CHAIN)
 
 
 def _with_chance(answer: Answer, again: float, own_chance: str) -> Answer:
@@ -307,8 +226,8 @@ def _without_samples(
 ) -> Answer:
     """Answer by splitting where it is complete, else by a bound."""
     if run.stopped is None:
-        return _splitting_answer(limit_state, rng, plan, [run], counts)
-    return _bound_only(limit_state, rng, plan, run, counts)
+        return splitting_answer(limit_state, rng, plan, [run], counts)
+    return bound_answer(limit_state, rng, plan, run, counts)
 
 
 def _explore(limit_state: LimitState, rng: np.random.Generator) -> list[Exploration]:
@@ -340,184 +259,6 @@ def _proposals(
     points, chain_ids = explore_failures(limit_state, rng, run, plan.chains, steps)
     fitted = fit_mixture(points, np.ones(len(points)), chain_ids, rng, DEFENSIVE)
     return points, chain_ids, [fitted, *proposals]
-
-
-def _importance_answer(
-    samples: importance.ImportanceSamples,
-    run: SplittingRun,
-    agreement: Agreement,
-    counts: Counts,
-    plan: Plan,
-) -> Answer:
-    mean = samples.mean
-    low, high = samples.interval(plan.confidence)
-    failing, drawn = samples.defensive_counts
-    high = min(1.0, high / (1 - agreement.unseen))
-    answer = Answer(counts, min(mean.mean, 1.0), low, high, "importance", mean.effective, mean.cv)
-    answer.diagnostics = {
-        "tail_index": mean.tail,
-        "largest_share": mean.largest,
-        "failing_share": float(samples.failing.mean()),
-        "components": len(samples.proposal.shares),
-        "defensive_share": float(samples.proposal.shares[0]),
-        "failures_by_prior": failing,
-        "samples_by_prior": drawn,
-        "splitting": run.estimate,
-        "unresolved": samples.unresolved,
-        "acceptance": samples.acceptance[0],
-        "levels": list(run.levels),
-        "fractions": list(run.fractions),
-        "reached": [float(share) for share in agreement.reached],
-        "unseen": agreement.unseen,
-    }
-    answer.drawn = {"weights": np.sort(samples.x[samples.failing])[::-1] / samples.x.sum()}
-    if run.stopped is None:
-        check_by_splitting(answer, run, float(agreement.reached[0]), (low, high), plan)
-    elif run.levels:
-        answer.notes.append(
-            "splitting reached no failure; the estimate rests on the failures that independent "
-            "searches found"
-        )
-    if agreement.unseen > NOTED_UNSEEN:
-        answer.notes.append(
-            f"independent searches do not agree: {format_percent(agreement.alone)} of the "
-            "probability lies where no more than one of them found failures, so there may be "
-            f"more that none found; the interval allows for {format_percent(agreement.unseen)}. "
-            "A larger budget searches more, and falsify(problem, diverse=...) lists more failures"
-        )
-    if mean.tail > WORST_TAIL:
-        answer.notes.append(
-            f"the weights have a heavy tail (index {mean.tail:z.2f}): "
-            "the interval may be too narrow"
-        )
-    if samples.unresolved > 0.01:
-        answer.notes.append(
-            f"failures lie where single precision or a distribution's outermost value hides up to "
-            f"{format_percent(samples.unresolved)} of them; the interval is wider by that"
-        )
-    return answer
-
-
-def check_by_splitting(
-    answer: Answer,
-    run: SplittingRun,
-    reached: float,
-    interval: tuple[float, float],
-    plan: Plan,
-) -> None:
-    """Compare an answer with splitting, as far as splitting reached the same failures."""
-    assert answer.probability is not None
-    if reached < 1 - NOTED_UNSEEN:
-        answer.notes.append(
-            f"splitting alone reached {format_percent(reached)} of the probability; independent "
-            "searches found the rest"
-        )
-    # What splitting is known to have reached may be less than what it has, which steady weights
-    # leave open: then anything up to the whole agrees.
-    steady = answer.diagnostics["tail_index"] < STEADY
-    known = answer.probability * max(reached, 1e-6)
-    nearest = np.clip(run.estimate, known, answer.probability if steady else known)
-    apart = np.log(nearest / run.estimate)
-    if abs(apart) <= 3.5 * np.hypot(UNDERSTATED * run.cv, answer.relative_error):
-        return
-    if apart > 0 and steady:
-        # Weighted samples are as likely to be too high as too low; chains that few of them lead to
-        # a region, or none, are too low. So steady weights need no wider interval below.
-        return
-    other = log_interval(run.estimate, UNDERSTATED * run.cv, plan.confidence, 10)
-    answer.low, answer.high = min(interval[0], other[0]), max(interval[1], other[1])
-    answer.notes.append(
-        f"splitting gave {run.estimate:z.2g}, which does not agree; the interval is made to "
-        "hold both. More simulations would tell"
-    )
-
-
-def estimate_by_splitting(limit_state: LimitState, rng: np.random.Generator, plan: Plan) -> Answer:
-    """Estimate by independent splitting runs, as many as the budget allows."""
-    run = run_splitting(limit_state, rng, CHAIN * plan.chains, plan.chains)
-    counts = Counts(*run.first)
-    if run.stopped is not None:
-        return _bound_only(limit_state, rng, plan, run, counts)
-    return _splitting_answer(limit_state, rng, plan, [run], counts)
-
-
-def _splitting_answer(
-    limit_state: LimitState,
-    rng: np.random.Generator,
-    plan: Plan,
-    runs: list[SplittingRun],
-    counts: Counts,
-) -> Answer:
-    """Answer by the mean of these runs and of as many more as the budget allows."""
-    size = runs[0].first[0]
-    cost = _cost(runs[0], size)
-    # Half as large, where that gives two instead of one.
-    while limit_state.left < 2.2 * cost and size >= 20 * CHAIN and len(runs) == 1:
-        size, cost = size // 2 // CHAIN * CHAIN, cost / 2
-    while limit_state.left > 1.1 * cost:
-        run = run_splitting(limit_state, rng, size, size // CHAIN)
-        counts = counts + Counts(*run.first)
-        if run.stopped is not None:
-            if run.stopped == "stuck":
-                continue
-            break
-        runs.append(run)
-    worth = np.array([run.first[0] for run in runs], float)
-    worth /= worth.sum()
-    values = np.array([run.estimate for run in runs])
-    mean = float(worth @ values)
-    inner = UNDERSTATED * np.array([run.cv for run in runs])
-    by_chains = float(np.sqrt(np.sum((worth * inner) ** 2)))
-    count = len(runs)
-    cv, freedom = by_chains, 8.0
-    if count > 1:
-        variance = float(np.sum(worth**2 * (values - mean) ** 2)) * count / (count - 1)
-        cv, freedom = max(cv, float(np.sqrt(variance)) / mean), count + 3.0
-    low, high = log_interval(mean, cv, plan.confidence, freedom)
-    answer = Answer(counts, mean, low, min(high, 1.0), "splitting", float("nan"), cv)
-    answer.diagnostics = {
-        "runs": count,
-        "estimates": [float(value) for value in values],
-        "levels": list(runs[0].levels),
-        "fractions": list(runs[0].fractions),
-        "accepted": list(runs[0].accepted),
-    }
-    if count == 1:
-        answer.notes.append("one splitting run only: its interval rests on its own chains")
-    return answer
-
-
-def _bound_only(
-    limit_state: LimitState, rng: np.random.Generator, plan: Plan, run: SplittingRun, counts: Counts
-) -> Answer:
-    """Answer by a bound alone: the simulations that are left sample the prior."""
-    reached = float(np.prod(run.fractions)) if run.fractions else 1.0
-    level = run.levels[-1] if run.levels else np.inf
-    why = {
-        "stuck": "the search found no failure: the robustness gets no lower than "
-        f"{limit_state.lowest:z.4g}, or has no slope to follow",
-        "budget": f"the budget ended at robustness {level:z.4g}, which is reached with probability "
-        f"{reached:z.1e}; failing is rarer, or impossible",
-    }.get(run.stopped or "", f"ended ({run.stopped}) at robustness {level:z.4g}")
-    counts = counts + monte_carlo.sample_prior(limit_state, rng, limit_state.left)
-    answer = _monte_carlo_answer(counts, plan)
-    answer.diagnostics = {"levels": list(run.levels), "fractions": list(run.fractions)}
-    if not np.isfinite(limit_state.lowest):
-        pass  # No simulation had a verdict, of which there is a note.
-    elif limit_state.failures == 0:
-        answer.notes.insert(0, why)
-    elif answer.probability is None:
-        answer.notes.insert(
-            0, f"{why}; {limit_state.failures:,} failures were met on the way, so it can fail"
-        )
-    return answer
-
-
-def bound_from_pilot(limit_state: LimitState, plan: Plan) -> Answer:
-    """Answer by the pilot samples of the prior that were finished before an early end."""
-    answer = _monte_carlo_answer(Counts(*limit_state.pilot), plan)
-    answer.notes.insert(0, f"ended early ({limit_state.ended})")
-    return answer
 
 
 def _first_level(

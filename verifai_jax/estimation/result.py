@@ -53,6 +53,7 @@ class Estimate(Drawn, InNotebook):
     - `p0`: the wanted upper limit of the probability, if one was given.
     - `seed`, `version`, `precision`, `backend`: needed to repeat the estimate.
     - `seconds`: wall-clock time.
+    - `stopped`: what ended it early: `"max_seconds"` or `"interrupted"`; None if nothing did.
     - `sources`: what the model was made of, as a run records it; empty if that is not recorded.
     - `drawn`: data of the pictures.
     """
@@ -84,6 +85,7 @@ class Estimate(Drawn, InNotebook):
     precision: str = "float32"
     backend: str | None = None
     seconds: float = 0.0
+    stopped: str | None = None
     sources: Mapping[str, Any] = field(default_factory=dict)
     drawn: dict[str, Any] = field(default_factory=dict, repr=False)
 

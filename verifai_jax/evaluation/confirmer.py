@@ -198,7 +198,9 @@ class Confirmer:
             found.why[rest] = notes[-1]
         return replace(found, notes=tuple(notes), checks=self.check_names)
 
-    def check_round(self, columns: Mapping[str, np.ndarray], first: int) -> Confirmations:
+    def check_round(
+        self, columns: Mapping[str, np.ndarray], first: int
+    ) -> tuple[Int[np.ndarray, " violating"], Confirmations]:
         """Check the violating ones of a run's new rows, as many as `limit` says.
 
         **Arguments:**
@@ -206,17 +208,12 @@ class Confirmer:
         - `columns`: of all new rows, as the table will have them.
         - `first`: number of the first one in the run.
 
-        **Returns:** of all these rows; the verdict of those that violate nothing is empty.
+        **Returns:** which of the new rows violate the property, and what came of these.
         """
         violating = np.flatnonzero(columns["violated"])
-        count = len(columns["rho"])
-        found = Confirmations.blank(
-            self.problem.name, first + np.arange(count), columns["rho"], verdict=""
-        )
-        if len(violating):
-            taken = {name: column[violating] for name, column in columns.items()}
-            found.put(violating, self(taken, first + violating, self.limit(first + count)))
-        return found
+        taken = {name: column[violating] for name, column in columns.items()}
+        limit = self.limit(first + len(columns["rho"])) if len(violating) else None
+        return violating, self(taken, first + violating, limit)
 
     @property
     def compile_seconds(self) -> float:

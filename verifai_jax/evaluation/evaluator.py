@@ -8,6 +8,8 @@ evaluator takes the engine that suits the problem, compiled or on the host, or s
 workers of an executor. Each simulation has a random key of its own, by its number.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -19,6 +21,7 @@ from verifai_jax.core.progress import count_done
 from verifai_jax.evaluation.engine import Engine, Wanted, engine_for
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.raising import ALIKE, Raising
+from verifai_jax.evaluation.unfinished import Part, present
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 
@@ -53,7 +56,8 @@ class Evaluator:
       left out.
     - `guidance`: what is computed for a search in addition to the robustness.
     - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
-    - `keep_traces`: whether verdicts come with traces; in this process.
+    - `keep_traces`: whether verdicts come with traces, in this process; or names of signals that
+      they are to have in addition to those of the formulas.
     - `given`: whether rows of features that somebody gave (`given_rows`) may be among the points.
     - `engine`: `"native"`, or `"auto"` where it decides by `budget`, the simulations of the run,
       whether rows are simulated by native code; see `evaluation.native_engine`.
@@ -73,7 +77,7 @@ class Evaluator:
         executor: "Executor | None" = None,
         target: str | None = None,
         guidance: Guidance = NOTHING,
-        keep_traces: bool = False,
+        keep_traces: bool | tuple[str, ...] = False,
         given: bool = False,
         ends_raising: bool = False,
         engine: Wanted = "xla",
@@ -100,15 +104,16 @@ class Evaluator:
             from verifai_jax.evaluation import host_engine
 
             self.engine = self._host = host_engine.HostEngine(
-                problem, precision, journal, guidance=guidance, keep_traces=keep_traces,
-                given=self.given,
+                problem, precision, journal, guidance=guidance, given=self.given,
+                keep_traces=keep_traces is not False,
             )  # fmt: skip
         else:
-            guidance = guidance._replace(trace=keep_traces)
+            others = keep_traces if isinstance(keep_traces, tuple) else ()
+            guidance = guidance._replace(trace=keep_traces is not False, signals=others)
             self.engine = compiled = engine_for(
                 problem, batch, gradient, precision, clauses, guidance, self.given
             )
-            if engine != "xla" and precision == "float32" and not keep_traces:
+            if engine != "xla" and precision == "float32" and keep_traces is False:
                 from verifai_jax.evaluation import native_engine
 
                 self.engine = self._native = native_engine.NativeEngine(compiled, engine, budget)
@@ -119,6 +124,8 @@ class Evaluator:
         self._padded_to = power_of_two(batch) if ends_raising else 1
         self.key: Key[Array, ""] = run_keys(seed)[1]
         self.simulations = 0
+        self._mode = (precision, gradient, clauses, given, seed)
+        self._kept: Part | None = None
 
     @property
     def compile_seconds(self) -> float:
@@ -176,7 +183,12 @@ class Evaluator:
         count, parts = len(u), []
         if self._sender is not None and count:
             self.simulations = start + count
-            verdicts = self._sender.evaluate(u, self.key, start, temperature)
+            verdicts = self._recall_or(
+                u,
+                start,
+                temperature,
+                partial(self._sender.evaluate, u, self.key, start, temperature),
+            )
             count_done(count)
             self._check_raising(verdicts)
             return verdicts
@@ -190,15 +202,16 @@ class Evaluator:
             points = u if block.stop - block.start >= count else u[block]
             if points.dtype != self._dtype:
                 points = np.asarray(points, self._dtype)
+            first_row = start + begin
             if self._host is not None:
-                verdicts = self._host.evaluate(
-                    points, self.key, start + begin, some,
+                simulate = partial(
+                    self._host.evaluate, points, self.key, first_row, some,
                     padded_to=max(padded_to, self._padded_to), keep_traces=keep_traces,
                     journals=journals,
                 )  # fmt: skip
             else:
-                verdicts = self.engine.evaluate(points, self.key, start + begin, some)
-            parts.append(verdicts)
+                simulate = partial(self.engine.evaluate, points, self.key, first_row, some)
+            parts.append(self._recall_or(points, first_row, some, simulate))
             count_done(len(points))
             self._check_raising(parts[-1])
             begin = block.stop
@@ -206,6 +219,29 @@ class Evaluator:
         if not parts:
             return Verdicts.nothing(len(self.problem.formulas), self.problem.space.dim)
         return Verdicts.concatenate(parts)
+
+    def _recall_or(
+        self,
+        points: Float[Any, "n d"],
+        first: int,
+        temperature: Float[np.ndarray, " n"] | float,
+        simulate: Callable[[], Verdicts],
+    ) -> Verdicts:
+        """Return the verdicts of work that goes on where an earlier process was killed."""
+        work = present()
+        if work is None:
+            return simulate()
+        if self._kept is None or self._kept.of is not work:
+            self._kept = work.part(self.problem, *self._mode)
+        if self._host is not None and not self._host.system.can_simulate_batch:
+            # One by one, which is worth more the longer a simulation takes.
+            self._host.journal = self._kept.journal
+            verdicts = simulate()
+            self._kept.settle()
+            return verdicts
+        return self._kept.recall_or(
+            np.asarray(points), np.arange(first, first + len(points)), temperature, simulate
+        )
 
     def submit(self, u: Float[Any, "n d"], first: int) -> "Pending":
         """Send points to the workers of the executor; `result` of what it returns waits for them.

@@ -26,11 +26,13 @@ class Guidance(NamedTuple):
     - `guide`: the value of the guide's term.
     - `outcome`: what happened, of the form that `core.outcomes` says.
     - `trace`: the monitored signals, of a system that JAX traces.
+    - `signals`: others that the trace is to have.
     """
 
     guide: bool = False
     outcome: bool = False
     trace: bool = False
+    signals: tuple[str, ...] = ()
 
     @property
     def size(self) -> int:
@@ -46,7 +48,8 @@ class Guidance(NamedTuple):
             wanted["guidance"] = self.values(problem, trace, features)
         if self.trace:
             trace = trace.hold()
-            signals = {name: as_array(trace.signals[name]) for name in problem.monitored}
+            names = dict.fromkeys((*problem.monitored, *self.signals))
+            signals = {name: as_array(trace.signals[name]) for name in names}
             wanted["traces"] = Trace(signals, trace.dt)
         return wanted
 

@@ -25,8 +25,8 @@ JOURNAL = "inflight.rows"
 class Journal:
     """The finished rows of the batch in flight, in `folder`; see the module's docstring."""
 
-    def __init__(self, folder: Path) -> None:
-        self.path = folder / JOURNAL
+    def __init__(self, folder: Path, name: str = JOURNAL) -> None:
+        self.path = folder / name
         self._known = _read(Log(self.path))
         self._log = Log(self.path)  # It is not read: what is put is not looked up.
         self._last = max(self._known, default=-1)

@@ -31,16 +31,10 @@ from verifai_jax.counterexamples.description import describe_predicate
 from verifai_jax.counterexamples.fixed_key import hold_key
 from verifai_jax.counterexamples.selection import problem_of
 from verifai_jax.estimation._estimate import one_thread
+from verifai_jax.estimation.answers import Answer, Plan, bound_from_pilot, chains_for
 from verifai_jax.estimation.double_precision import DoublePrecisionEvaluator
 from verifai_jax.estimation.importance import ImportanceSamples
-from verifai_jax.estimation.methods import (
-    SHARE_OF_LEVEL,
-    Answer,
-    Plan,
-    bound_from_pilot,
-    chains_for,
-    estimate_by_importance_sampling,
-)
+from verifai_jax.estimation.methods import SHARE_OF_LEVEL, estimate_by_importance_sampling
 from verifai_jax.estimation.moved_priors import notice_lost_failures, notice_own_chance
 from verifai_jax.estimation.normal_space import Ended, LimitState, Spent, to_unit_cube
 from verifai_jax.evaluation.backends import resolved
@@ -155,8 +149,7 @@ def modes(
         held = _under_keys(simulated, limit_state)
         divided = _divide(limit_state, held, rng, answer, _failures_of(source), problem.black_box)
     bound = answer.prior.upper_bound(confidence)
-    listed, rest, run, unexplained = (), 0.0, None, (0.0, 1.0)
-    notes = list(answer.notes)
+    listed, rest, run, unexplained, notes = (), 0.0, None, (0.0, 1.0), list(answer.notes)
     if limit_state.own_chance:
         notes.insert(
             0,
@@ -195,6 +188,7 @@ def modes(
         seconds=time.perf_counter() - started,
         sources=sources.settled(begun).to_json(),
         changed=changed,
+        stopped=limit_state.ended,
     )
 
 

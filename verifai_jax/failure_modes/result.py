@@ -152,6 +152,7 @@ class Modes(Drawn, InNotebook):
     - `notes`: sentences on anything surprising.
     - `run`: simulations of the likeliest failures, as `falsify` keeps them.
     - `seconds`: wall-clock time.
+    - `stopped`: what ended it early: `"max_seconds"` or `"interrupted"`; None if nothing did.
     - `sources`: what the model was made of, as a run records it.
     - `changed`: says that the model of the run from which they began is another one by now.
     """
@@ -175,6 +176,7 @@ class Modes(Drawn, InNotebook):
     seconds: float = math.nan
     sources: Mapping[str, Any] = field(default_factory=dict)
     changed: str = ""
+    stopped: str | None = None
 
     def __len__(self) -> int:
         return len(self.modes)

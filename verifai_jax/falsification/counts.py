@@ -74,6 +74,16 @@ class Tally:
         self.without_verdict += int(np.sum(~verdicts.proper))
         self.lowest = float(np.fmin(self.lowest, np.fmin.reduce(verdicts.lowest)))
 
+    def numbers(self, simulations: int) -> dict[str, float]:
+        """Return plain numbers of a run with so many simulations, for callbacks."""
+        return {
+            "simulations": simulations,
+            "violating": self.violating,
+            "counterexamples": self.claimed,
+            "without_verdict": self.without_verdict,
+            "least_robustness": self.lowest,
+        }
+
 
 def claimed_rows(columns: Columns) -> Bool[np.ndarray, " n"]:
     """Tell rows that violate the property and are claimed to."""

@@ -171,7 +171,9 @@ class Rounds:
             return Batch(given, "first", maximum < self.batch and len(self.first) > done + maximum)
         if self.suggestions is not None:
             with self._searching():
-                given = self._suggested(self.suggestions, done)
+                given = self.suggestions.next_points(
+                    self.table, self.evaluate.key, self._keep_on_disk
+                )
             left = maximum if limit is None else max(limit - done, 0)
             if len(given[:left]):
                 return Batch(given[:left], "suggested", limit is not None and len(given) > left)
@@ -247,14 +249,21 @@ class Rounds:
         """
         with self.watch.on(CONFIRM):
             compiled = confirmer.compile_seconds
-            found = confirmer.check_round(columns, len(self.table))
+            rows, found = confirmer.check_round(columns, len(self.table))
             self.watch.move(confirmer.compile_seconds - compiled, COMPILE)
-        columns["verdict"] = found.verdict
+        count = len(columns["violated"])
+        columns["verdict"] = np.full(count, "", object)
+        columns["verdict"][rows] = found.verdict
         if self.problem.black_box:
-            columns["rho_again"] = found.rho.get("again", np.full(len(found), np.nan))
+            columns["rho_again"] = np.full(count, np.nan)
+            columns["rho_again"][rows] = found.rho.get("again", np.nan)
         self.checks = confirmer.check_names or self.checks
         refused, greatest = found.refuse()
-        return columns["violated"] & ~refused, np.where(refused, greatest, objective)
+        if not refused.any():
+            return columns["violated"], objective
+        claimed, objective = columns["violated"].copy(), objective.copy()
+        claimed[rows[refused]], objective[rows[refused]] = False, greatest[refused]
+        return claimed, objective
 
     @contextmanager
     def _searching(self) -> Iterator[None]:
@@ -284,26 +293,9 @@ class Rounds:
             self.suggestions.restore(checkpoint)
             self.suggestions.check_source()
 
-    def _suggested(self, suggestions: "Suggestions", rows: int) -> Float[np.ndarray, "n d"]:
-        """Return the suggested points that come next, after a question where it is time for one."""
-        waiting = suggestions.waiting(rows)
-        if len(waiting) or not suggestions.due(rows):
-            return waiting
-        from verifai_jax.falsification.suggestion_prompt import describe_run
-
-        question = describe_run(
-            self.problem,
-            self.table.all,
-            suggestions.search,
-            self.evaluate.key,
-            self.precision,
-            suggestions.last_refused,
-        )
-        suggestions.ask(question, rows)
-        # On disk before anything is simulated: nobody is asked twice for it.
+    def _keep_on_disk(self) -> None:
         self._keep()
         self.save()
-        return suggestions.waiting(rows)
 
     def measure(self, maximum: int, timed: bool) -> float:
         """Simulate the first rows, and return the least seconds that one took.
@@ -396,17 +388,6 @@ class Rounds:
         raised = () if self._confirmer is None else self._confirmer.raised
         suggested = () if self.suggestions is None else self.suggestions.notes
         return (*self._simulations.notes, *raised, *suggested)
-
-    @property
-    def numbers(self) -> dict[str, float]:
-        """Plain numbers of the run so far, for callbacks."""
-        return {
-            "simulations": len(self.table),
-            "violating": self.tally.violating,
-            "counterexamples": self.tally.claimed,
-            "without_verdict": self.tally.without_verdict,
-            "least_robustness": self.tally.lowest,
-        }
 
     @property
     def exhausted(self) -> bool:

@@ -1,10 +1,4 @@
-"""The result of a falsification: its table, its statistics, and how to see a row again.
-
-run.summary()                      what failed, how often, the worst case
-run.table.counterexamples          a DataFrame
-run.replay(run.best)               the trace of a row
-run.save("runs/mine"); vj.load("runs/mine", problem)
-"""
+"""The result of a falsification: its table, its statistics, and how to see a row again."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -193,7 +193,7 @@ class Running:
             while stopped is None:
                 rounds.advance(min(rounds.batch, budget - len(rounds.table)), budget)
                 bar.update(len(rounds.table), rounds.tally.claimed, rounds.tally.lowest)
-                notify(callbacks, len(rounds.table), rounds.numbers)
+                notify(callbacks, len(rounds.table), rounds.tally.numbers(len(rounds.table)))
                 stopped = self.ends.reached(rounds)
                 if stopped is None and self._is_hopeless:
                     stopped = RAISES

@@ -84,7 +84,7 @@ def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
     elif not is_quick(problem) or _samples(problem, cast(Engine, engine).padded) > MAX_SAMPLES:
         return ()
     space = problem.space
-    nominal = problem.nominal or {}
+    nominal = space.completed(problem.nominal or {})
     varied = {name: nominal[name] for name, domain in space.root.fields if domain.size}
     # One program for it, where each step on its own would compile another.
     flatten = compile_soon(

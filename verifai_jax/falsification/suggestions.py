@@ -9,14 +9,15 @@ What was suggested is in the checkpoint, written before the first of it is simul
 goes on does not ask again for suggestions that it has already received.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.forks import returning_once
 from verifai_jax.core.text import format_error, one_line
+from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.features.given import given_features, given_rows
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Suggested
@@ -81,6 +82,28 @@ class Suggestions:
         begin, count = self.asked[-1]
         done = max(rows - int(begin), 0)
         return self.points[len(self.points) - int(count) :][done:]
+
+    def next_points(
+        self, table: ErrorTable, key: Key[Array, ""], keep: Callable[[], None]
+    ) -> Float[np.ndarray, "n row"]:
+        """Return the suggested rows that come next, after a question where it is time for one.
+
+        - `table`: the rows of the run so far.
+        - `key`: of the run's simulations.
+        - `keep`: writes a checkpoint, so that nobody is asked twice for the same suggestions.
+        """
+        rows = len(table)
+        waiting = self.waiting(rows)
+        if len(waiting) or not self.due(rows):
+            return waiting
+        from verifai_jax.falsification.suggestion_prompt import describe_run
+
+        question = describe_run(
+            self.problem, table.all, self.search, key, self.precision, self.last_refused
+        )
+        self.ask(question, rows)
+        keep()
+        return self.waiting(rows)
 
     def ask(self, question: dict[str, Any], rows: int) -> None:
         """Ask, and keep the suggestions that can be simulated.

@@ -199,7 +199,7 @@ class Surrogate:
         scale = np.repeat(np.where(scale > 0, scale, 1.0), len(form.positions)).astype(np.float32)
         mean, components = models.principal_components(self.traces / scale)
         coefficients = ((self.traces / scale - mean) @ components.T).astype(np.float32)
-        size = _padded(len(self.rho), self.options.capacity)
+        size = padded_rows(len(self.rho), self.options.capacity)
         missing = size - len(self.rho)
         coefficients = np.pad(coefficients, ((0, missing), (0, 0)))
         u = np.pad(self.u, ((0, missing), (0, 0)), constant_values=0.5)
@@ -209,9 +209,10 @@ class Surrogate:
             self.fitted = len(self.rho)
         parents = np.resize(self._parents(), (PARENTS, self.cube.dim))
         key = jax.random.fold_in(self.key, np.uint32(self.round))
+        spread = np.float32(spread_factor(self.rho, self.round, self.cube.dim))
         ends, value = self._programs.descend(
             form, count, self.hyper, u, mask, coefficients, mean * scale, components * scale,
-            parents, key, np.bool_(guess), np.float32(_spread(self.rho, self.round, self.cube.dim)),
+            parents, key, np.bool_(guess), spread,
         )  # fmt: skip
         return self._distinct(np.asarray(ends), np.asarray(value))
 
@@ -329,7 +330,7 @@ DESCENTS: Slot[TraceOptions, Descents] = Slot("descents on a model of the traces
 """The programs of a problem for its surrogates, by their options."""
 
 
-def _spread(rho: Float[np.ndarray, " n"], number: int, dim: int) -> float:
+def spread_factor(rho: Float[np.ndarray, " n"], number: int, dim: int) -> float:
     """Return the factor on the model's standard deviations: it grows while no row is progress.
 
     A model that is too sure of itself proposes the neighbours of one hollow again and again; drawn
@@ -377,7 +378,7 @@ def _embed(u: Float[Any, "n d"], cube: Cube) -> Float[Array, "n x"]:
     return jnp.concatenate(columns, axis=1)
 
 
-def _padded(rows: int, capacity: int) -> int:
+def padded_rows(rows: int, capacity: int) -> int:
     """Return the number of rows of the program for so many; each is compiled once."""
     size = MIN_ROWS
     while size < rows:

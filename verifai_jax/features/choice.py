@@ -72,7 +72,7 @@ class Categorical(Domain):
         known: set[object] = set()
         for choice in self.choices:
             if str(choice):
-                check_name("a choice", str(choice))  # As the table shows it.
+                check_name("a choice", str(choice), lines=True)  # As the table shows it.
             keys: set[object] = {str(choice)}  # All that the table shows of most objects.
             if isinstance(choice, int | float):
                 limit = 2**31 - 1 if isinstance(choice, int) else MAX_REAL

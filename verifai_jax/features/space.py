@@ -9,34 +9,31 @@ FeatureSpace({...}, where=lambda f: f["x"] < f["y"])                 # a constra
 space.only("x0", nominal={"alg": "ppo"})                             # a view
 """
 
-import math
 from collections.abc import Callable, Mapping
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Key
 
-from verifai_jax.core.cube import Cube
 from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.core.notebook import ForUsers, rows_html
-from verifai_jax.core.precision import in_precision
 from verifai_jax.features.acceptance import acceptance_rate
 from verifai_jax.features.compound import Struct
 from verifai_jax.features.custom import Distribution
-from verifai_jax.features.domain import Domain, Numbers, Row, as_real
+from verifai_jax.features.domain import Domain, Numbers, Row
 from verifai_jax.features.fixed import Fixed
 from verifai_jax.features.plain import from_plain, to_plain
+from verifai_jax.features.point_maps import PointMaps
 from verifai_jax.features.points import features_of_rows, nudged
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-class FeatureSpace(ForUsers):
+class FeatureSpace(PointMaps, ForUsers):
     """Named domains over `dim` unit coordinates; uniform coordinates are the prior on features.
 
     A simulation has three forms: a *point* of the unit cube, its *features* by name as a system
@@ -75,182 +72,14 @@ class FeatureSpace(ForUsers):
         domains: Mapping[str, Domain],
         where: Callable[[Any], Bool[Array, ""]] | None = None,
     ) -> None:
-        self.root = Struct(domains)
+        super().__init__(Struct(domains), where)
         if where is not None and not callable(where):
             raise TypeError(f"where must be a function of the features; got {where!r}")
-        self.where = where
         known: set[str] = set()
         for column in self.columns:
             if column in known:
                 raise ValueError(f"two features give the table column {column!r}; rename one")
             known.add(column)
-
-    def __getstate__(self) -> dict[str, Any]:
-        # What follows from the domains is computed where it is wanted, and so are programs.
-        kind = type(self)
-        return {
-            name: value
-            for name, value in vars(self).items()
-            if not isinstance(getattr(kind, name, None), cached_property)
-        }
-
-    @property
-    def domains(self) -> dict[str, Domain]:
-        """Domains by name, in the order written."""
-        return dict(self.root.fields)
-
-    @cached_property
-    def levels(self) -> tuple[int, ...]:
-        """Number of cells of each coordinate; 0 if it is continuous."""
-        return self.root.levels
-
-    @cached_property
-    def weights(self) -> tuple[tuple[float, ...] | None, ...]:
-        """Probabilities of the cells of each coordinate; None for equal ones."""
-        return self.root.weights
-
-    @cached_property
-    def ordered(self) -> tuple[bool, ...]:
-        """Order of each coordinate: True if its values have one."""
-        return self.root.ordered
-
-    @cached_property
-    def lengths(self) -> tuple[int, ...]:
-        """Indices of the coordinates that are lengths of arrays, on which others depend."""
-        return self.root.lengths
-
-    @cached_property
-    def signals(self) -> tuple[tuple[int, ...], ...]:
-        """The coordinates of each function of time, in the order of its control points."""
-        return self.root.signals
-
-    @cached_property
-    def coordinates(self) -> tuple[str, ...]:
-        """Names of the coordinates, such as `x0`, `cars.length`, `cars[0].x`."""
-        return self.root.coordinates("")
-
-    def labels(self, duration: float | None = None) -> dict[str, str]:
-        """Return the names of the coordinates for people: `{"wind[3]": "wind at 1.5 s", ...}`.
-
-        **Arguments:**
-
-        - `duration`: of a simulation in seconds, for signals that have none of their own; without
-          it their control points keep their numbers.
-        """
-        return dict(zip(self.coordinates, self.root.labels("", duration), strict=True))
-
-    @property
-    def dim(self) -> int:
-        """Number of unit coordinates."""
-        return len(self.levels)
-
-    @property
-    def point_form(self) -> jax.ShapeDtypeStruct:
-        """Shape and type of a point of the unit cube, for abstract evaluation."""
-        return jax.ShapeDtypeStruct((self.dim,), jnp.result_type(float))
-
-    @property
-    def feature_form(self) -> dict[str, Any]:
-        """Shapes and types of the features of a point, for abstract evaluation."""
-        return jax.eval_shape(self.unflatten, self.point_form)
-
-    def feature_form_in(self, precision: str) -> dict[str, Any]:
-        """Return the form of the features in `"float32"` or `"float64"`, whatever JAX is set to."""
-        with in_precision(precision):
-            return jax.eval_shape(self.unflatten, jax.ShapeDtypeStruct((self.dim,), precision))
-
-    @cached_property
-    def columns(self) -> tuple[str, ...]:
-        """Names of the feature columns of a table, such as `x0`, `cars[0].x`, `point[1]`."""
-        return self.root.columns("")
-
-    def unflatten(self, u: Numbers) -> dict[str, Any]:
-        """Convert a point `[dim]` of the unit cube to features; real ones have the dtype of `u`.
-
-        Pure JAX; `jax.vmap` it for batches.
-
-        **Arguments:**
-
-        - `u`: the point, `[dim]` with entries in `[0, 1]`.
-
-        **Returns:** the features by name, as a system sees them.
-
-        **Raises:** `ValueError` for a point of another shape.
-        """
-        u = as_real(u)
-        if u.shape != (self.dim,):
-            raise ValueError(
-                f"u must have shape [{self.dim}], one coordinate for each of "
-                f"{', '.join(self.columns[:8])}{', ...' * (self.dim > 8)}; got {list(u.shape)}"
-            )
-        return self.root.from_unit(u)
-
-    def flatten(self, features: Mapping[str, Any]) -> Float[Array, " dim"]:
-        """Convert features to the point `[dim]` of the unit cube; discrete ones to cell centres.
-
-        Pure JAX on the values that `unflatten` gives; takes plain Python values too. Nothing is
-        checked.
-
-        **Arguments:**
-
-        - `features`: by name; constant, fixed ones and events may be left out.
-
-        **Returns:** the point, `[dim]`.
-        """
-        return self.root.to_unit(self.root.coerce(self.completed(features)))
-
-    @cached_property
-    def features_at(self) -> Callable[[Numbers], dict[str, Any]]:
-        """Points `[n, dim]` to features `[n, ...]`: `unflatten`, compiled once for each `n`."""
-        return jax.jit(jax.vmap(self.unflatten))
-
-    @cached_property
-    def point_of(self) -> Callable[[Mapping[str, Any]], Float[Array, " dim"]]:
-        """Features of one simulation to a point `[dim]`: `flatten`, compiled."""
-        return jax.jit(self.flatten)
-
-    @cached_property
-    def points_at(self) -> Callable[[Mapping[str, Any]], Float[Array, "n dim"]]:
-        """Features `[n, ...]` to points `[n, dim]`: `flatten`, compiled once for each `n`."""
-        return jax.jit(jax.vmap(self.flatten))
-
-    @cached_property
-    def width(self) -> int:
-        """Number of real numbers among the features of one simulation."""
-        leaves = jax.tree.leaves(self.feature_form)
-        return sum(math.prod(leaf.shape) for leaf in leaves if _is_real(leaf))
-
-    def unflatten_given(
-        self, u: Float[Array, " dim"], values: Float[Array, " width"]
-    ) -> dict[str, Any]:
-        """Return features with given real numbers, others as `unflatten` gives them. Pure JAX.
-
-        **Arguments:**
-
-        - `u`: the point of the unit cube nearest to the features.
-        - `values`: their real numbers, one after another; where one is NaN, that of the point.
-        """
-        leaves, form = jax.tree.flatten(self.unflatten(u))
-        start = 0
-        for i, leaf in enumerate(leaves):
-            if _is_real(leaf):
-                given = values[start : start + leaf.size].reshape(leaf.shape).astype(leaf.dtype)
-                leaves[i] = jnp.where(jnp.isnan(given), leaf, given)
-                start += leaf.size
-        return jax.tree.unflatten(form, leaves)
-
-    @cached_property
-    def cube(self) -> Cube:
-        """The unit cube of this space, as searches see it."""
-        return Cube(
-            levels=self.levels,
-            weights=self.weights,
-            ordered=self.ordered,
-            names=self.coordinates,
-            lengths=self.lengths,
-            signals=self.signals,
-            sequences=self.root.sequences,
-        )
 
     def points(self, rows: "pd.DataFrame") -> Float[np.ndarray, "n dim"]:
         """Convert a table to the points `[n, dim]` of the unit cube that its rows came from.
@@ -341,45 +170,6 @@ class FeatureSpace(ForUsers):
         """End of a message on features that the constraint refuses."""
         assert self.where is not None
         return f"breaks the constraint of this space, {_source(self.where)}"
-
-    def accepts(self, features: Mapping[str, Any]) -> Bool[Array, ""]:
-        """Return whether the constraint holds; True without one. Pure JAX."""
-        return jnp.asarray(True if self.where is None else self.where(features))
-
-    @cached_property
-    def accepts_points(self) -> Callable[[Numbers], Bool[Array, " n"]]:
-        """The constraint as a compiled function of points `[n, dim]` of the unit cube."""
-        return jax.jit(jax.vmap(lambda u: self.accepts(self.unflatten(u))))
-
-    @property
-    def items(self) -> int:
-        """Number of items at most that `without_items` can take away, such as events."""
-        return self.root.items
-
-    @cached_property
-    def without_items(self) -> Callable[[Numbers, Numbers], Float[Array, "n dim"]]:
-        """Take those items away from points `[n, dim]` that `[n, items]` selects; compiled."""
-        return jax.jit(jax.vmap(self.root.without))
-
-    @cached_property
-    def settle(self) -> Callable[[Numbers], Float[Array, "n dim"]]:
-        """Move coordinates of points `[n, dim]` that mean nothing to one value; compiled."""
-        return jax.jit(jax.vmap(self.root.settled))
-
-    @cached_property
-    def used(self) -> Callable[[Numbers], Bool[Array, "n dim"]]:
-        """Say which coordinates of points `[n, dim]` mean something; compiled."""
-        return jax.jit(jax.vmap(self.root.used))
-
-    @cached_property
-    def coverage_ids_at(self) -> Callable[[Numbers], Int[Array, "n ids"]]:
-        """Return what points `[n, dim]` cover, such as transitions of an automaton; compiled."""
-        return jax.jit(jax.vmap(lambda u: self.root.coverage_ids(self.unflatten(u))))
-
-    @property
-    def constraint(self) -> Callable[[Numbers], Bool[Array, " n"]] | None:
-        """The compiled constraint `[n, dim] -> [n]`; None for a space without one."""
-        return None if self.where is None else self.accepts_points
 
     def check_where(self, seed: int | Key[Array, ""] = 0) -> float:
         """Measure the share of the prior that the constraint accepts; 1 without one.
@@ -486,13 +276,14 @@ class FeatureSpace(ForUsers):
             for name, domain in self.root.fields
             if name not in features and domain.held_at is None
         ]
-        missing = [name for name in others if name not in (nominal or {})]
+        nominal = self.completed(nominal or {})
+        missing = [name for name in others if name not in nominal]
         if missing:
             raise ValueError(
                 f"features that do not vary need a nominal value; {', '.join(missing)} "
                 f"{'has' if len(missing) == 1 else 'have'} none"
             )
-        return self.fixed(**{name: (nominal or {})[name] for name in others})
+        return self.fixed(**{name: nominal[name] for name in others})
 
     def refined(self, factor: int) -> "tuple[FeatureSpace, Callable[[dict], dict]]":
         """Return the space with finer signals, and a map of features to it.
@@ -583,15 +374,6 @@ class FeatureSpace(ForUsers):
             self.root.check(self.completed(features), "")
         return self.flatten(features)
 
-    def completed(self, features: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return features with the constant, fixed ones and events that were left out."""
-        if not isinstance(features, Mapping):
-            return features
-        held = ((name, domain.held_at) for name, domain in self.root.fields)
-        known = {name: value for name, value in held if value is not None}
-        known |= {n: d.nominal for n, d in self.root.fields if d.nominal is not None}
-        return {**known, **features}
-
     def __getitem__(self, name: str) -> Domain:
         return self.root[name]
 
@@ -624,10 +406,6 @@ class FeatureSpace(ForUsers):
         if self.where is not None:
             rows.append(("where", _source(self.where), ""))
         return rows
-
-
-def _is_real(leaf: jax.Array | jax.ShapeDtypeStruct) -> bool:
-    return bool(jnp.issubdtype(leaf.dtype, jnp.floating))
 
 
 def _varied(domain: Domain) -> Domain:

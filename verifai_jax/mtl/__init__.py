@@ -10,6 +10,9 @@ from verifai_jax.mtl.evaluate import End, IntervalError
 from verifai_jax.mtl.expression import Expression, signal
 from verifai_jax.mtl.formula import FALSE, TRUE, Formula
 from verifai_jax.mtl.grammar import FormulaSyntaxError
+from verifai_jax.mtl.judgement import Judgement
+from verifai_jax.mtl.judging import judge
+from verifai_jax.mtl.mining import Mined, mine
 from verifai_jax.mtl.normalization import anneal, normalize
 from verifai_jax.mtl.operators import (
     always,
@@ -23,6 +26,7 @@ from verifai_jax.mtl.operators import (
 )
 from verifai_jax.mtl.plot import draw
 from verifai_jax.mtl.recording import TimeColumnError, read
+from verifai_jax.mtl.requirements import Requirement, read_requirements
 from verifai_jax.mtl.resampling import resample
 from verifai_jax.mtl.rewriting import nnf, simplify
 from verifai_jax.mtl.semantics import Semantics, boolean, hard, smooth
@@ -30,11 +34,12 @@ from verifai_jax.mtl.setting import HorizonError, SamplingError
 
 __all__ = [
     "FALSE", "TRUE", "End", "Explanation", "Expression", "Formula", "FormulaSyntaxError",
-    "HorizonError", "IntervalError", "Online", "SamplingError", "Semantics", "SmoothingError",
-    "TimeColumnError", "always", "anneal", "boolean", "draw", "eventually", "explain", "hard",
-    "historically", "latex", "next_", "nnf", "normalize", "once", "online", "parse", "prev",
-    "read", "resample", "robustness", "robustness_signal", "satisfied", "signal", "simplify",
-    "since", "smooth", "smoothing_error", "until",
+    "HorizonError", "IntervalError", "Judgement", "Mined", "Online", "Requirement",
+    "SamplingError", "Semantics", "SmoothingError", "TimeColumnError", "always", "anneal",
+    "boolean", "draw", "eventually", "explain", "hard", "historically", "judge", "latex", "mine",
+    "next_", "nnf", "normalize", "once", "online", "parse", "prev", "read", "read_requirements",
+    "resample", "robustness", "robustness_signal", "satisfied", "signal", "simplify", "since",
+    "smooth", "smoothing_error", "until",
 ]  # fmt: skip
 
 

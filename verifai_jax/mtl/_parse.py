@@ -1,50 +1,27 @@
 """The parser of formulas: `parse("always[0, 4] (abs(x) <= 2.4 & F[0,500ms] safe)")`.
 
 One LALR grammar covers Boolean and arithmetic expressions, because two would collide on
-parentheses; what may stand where is checked afterwards, on the tree, where the position is known.
-It reads more than it accepts: chains and mixtures on which tools disagree are read and refused
-with the parentheses that would settle them.
+parentheses; what may stand where is checked afterwards, on the tree, by `FormulaBuilder`. It reads
+more than it accepts, so that an error can say what is meant.
 """
 
-import itertools
-import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
-from decimal import Decimal, DecimalException
-from typing import Any
 
-from verifai_jax.core.errors import unknown_name
-from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl.expression import Arithmetic, Expression, Number, Signal
-from verifai_jax.mtl.formula import Formula, Interval
-from verifai_jax.mtl.grammar import FormulaSyntaxError, Tree, explain_error, parser
-from verifai_jax.mtl.words import ANGLES, FUNCTIONS, NAME, NUMBERS, OPERATORS
+from verifai_jax.mtl.expression_builder import MAX_DEPTH
+from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.formula_builder import FormulaBuilder
+from verifai_jax.mtl.grammar import FormulaSyntaxError, explain_error, parser
+from verifai_jax.mtl.words import NAME
 
-_UNITS = {
-    "s": Decimal(1),
-    "ms": Decimal("1e-3"),
-    "us": Decimal("1e-6"),
-    "ns": Decimal("1e-9"),
-    "min": Decimal(60),
-    "h": Decimal(3600),
-    "d": Decimal(86400),
-}
 MAX_TOKENS = 10_000
 """Words and symbols that a formula's text may have. Far more than a person writes: a file that
 is given by mistake is refused before it is parsed."""
 
-MAX_DEPTH = 100
-"""Operators, or parentheses, that may stand within each other: far from where Python gives up."""
-
 MAX_OFFERED = 300
 """Characters of a text that an error offers at most; a longer one would be cut when it is shown."""
 
-MAX_TEMPORAL_DEPTH = 40
-"""Temporal operators that may stand within each other: each is a loop of its own to compile."""
-
 _TOKEN = re.compile(r'"[^"\n]*"|[\w.]+|\S')
-_CONNECTIVES = ("iff", "impl", "or_", "and_", "bin", "negation", "temporal")
 
 
 def parse(
@@ -80,10 +57,7 @@ def parse(
 
 
 def _read(
-    text: str,
-    constants: Mapping[str, float],
-    known: Mapping[str, Formula],
-    offers: bool = True,
+    text: str, constants: Mapping[str, float], known: Mapping[str, Formula], offers: bool = True
 ) -> Formula:
     """Read a formula; `offers` is whether an error may offer texts, each of which is read, too."""
     if not isinstance(text, str):
@@ -95,7 +69,17 @@ def _read(
         tree = parser().parse(text)
     except lark.UnexpectedInput as error:
         raise explain_error(error, text) from None
-    return _Builder(text, constants, known, offers).formula(tree)
+
+    def reads(offered: str) -> bool:
+        if not offers or len(offered) > MAX_OFFERED:
+            return False
+        try:
+            _read(offered, constants, known, offers=False)
+        except (FormulaSyntaxError, RecursionError):
+            return False
+        return True
+
+    return FormulaBuilder(text, constants, known, reads).formula(tree)
 
 
 def _check_size(text: str) -> None:
@@ -112,444 +96,3 @@ def _check_size(text: str) -> None:
             raise FormulaSyntaxError(
                 f"{reason}: name its parts by definitions", text, token.start()
             )
-
-
-@dataclass
-class _Part:
-    """The meaning of a part of the text, and where it stands there."""
-
-    value: Formula | Expression
-    start: int
-    end: int
-    #: In parentheses, so that nothing to the right could be thought to belong to it.
-    closed: bool = False
-    rule: str = ""
-    #: Minus signs in front of each other.
-    signs: int = 0
-
-
-class _Builder:
-    """Turns the tree of one text into a formula, refusing what is ambiguous or ill-typed."""
-
-    def __init__(
-        self,
-        text: str,
-        constants: Mapping[str, float],
-        known: Mapping[str, Formula],
-        offers: bool = True,
-    ) -> None:
-        self.text = text
-        self.constants = constants
-        self.known = known
-        self.offers = offers
-        self.parts: dict[int, _Part] = {}
-
-    def formula(self, tree: Tree) -> Formula:
-        return self._formula(self._build(tree))
-
-    def _fail(self, reason: str, start: int, end: int) -> FormulaSyntaxError:
-        return FormulaSyntaxError(reason, self.text, start, end - start)
-
-    def _source(self, part: _Part) -> str:
-        return self.text[part.start : part.end]
-
-    def _offered(self, before: str, *texts: str, within: str = "{}") -> str:
-        """Return the part of a message that offers texts: only those that can be read.
-
-        **Arguments:**
-
-        - `before`: what stands before the offers; nothing is said where none can be read.
-        - `within`: a formula that has the text in it, for one that is none on its own.
-        """
-        texts = tuple(" ".join(map(str.strip, text.splitlines())) for text in texts)
-        offers = [each for each in texts if self._reads(within.format(each))]
-        return f"{before}{' or '.join(offers)}" if offers else ""
-
-    def _reads(self, text: str) -> bool:
-        """Return whether a text that is to be offered is a formula; nothing is offered in turn."""
-        if not self.offers or len(text) > MAX_OFFERED:
-            return False
-        try:
-            _read(text, self.constants, self.known, offers=False)
-        except (FormulaSyntaxError, RecursionError):
-            return False
-        return True
-
-    def _formula(self, part: _Part) -> Formula:
-        if isinstance(part.value, Expression):
-            try:
-                return ast.Atom(part.value)
-            except ValueError as error:
-                raise self._fail(str(error), part.start, part.end) from None
-        return part.value
-
-    def _expression(self, part: _Part) -> Expression:
-        if isinstance(part.value, Formula):
-            source = self._source(part)
-            power = "; a power is written x**2" if "^" in source else ""
-            raise self._fail(
-                f"a number or a signal is needed here, not the formula {source!r}{power}",
-                part.start,
-                part.end,
-            )
-        return part.value
-
-    def _build(self, tree: Tree) -> _Part:
-        """Return the meaning of a tree, building what is below it first and without recursion."""
-        stack: list[tuple[Tree, bool]] = [(tree, False)]
-        while stack:
-            node, ready = stack.pop()
-            if id(node) in self.parts:
-                continue
-            if ready:
-                self.parts[id(node)] = self._built(node)
-                continue
-            if node.data == "iff":
-                self._refuse_powers(node)
-            stack.append((node, True))
-            below = [c for c in node.children if isinstance(c, Tree) and c.data != "interval"]
-            stack.extend((child, False) for child in reversed(below))
-        return self.parts[id(tree)]
-
-    def _built(self, tree: Tree) -> _Part:
-        try:
-            part = getattr(self, f"_{tree.data}".rstrip("_"))(tree)
-        except FormulaSyntaxError:
-            raise
-        except ValueError as error:
-            raise self._fail(str(error), *self._span(tree)) from None
-        if isinstance(part.value, Formula):
-            limits = {
-                "operators": (part.value.depth, MAX_DEPTH),
-                "temporal operators": (part.value.temporal_depth, MAX_TEMPORAL_DEPTH),
-            }
-            for kind, (depth, limit) in limits.items():
-                if depth > limit:
-                    reason = f"{kind} stand at most {limit} deep within each other"
-                    raise self._fail(reason, part.start, part.start + 1)
-        return part
-
-    def _span(self, tree: Tree) -> tuple[int, int]:
-        return tree.meta.start_pos, tree.meta.end_pos
-
-    def _operands(self, tree: Tree) -> tuple[list[_Part], list[Any]]:
-        return [self._build(c) for c in tree.children[::2]], tree.children[1::2]
-
-    # Boolean connectives
-
-    def _iff(self, tree: Tree) -> _Part:
-        parts, words = self._operands(tree)
-        if len(words) > 1:
-            raise self._chained(parts, words)
-        left, right = map(self._formula, parts)
-        value = left.iff(right) if words[0].type == "IFF" else left ^ right
-        return _Part(value, *self._span(tree), rule="iff")
-
-    def _impl(self, tree: Tree) -> _Part:
-        parts, words = self._operands(tree)
-        self._refuse_open(parts, words, tree.children[::2])
-        if len(words) > 1:
-            raise self._chained(parts, words)
-        left, right = map(self._formula, parts)
-        return _Part(left >> right, *self._span(tree), rule="impl")
-
-    def _or(self, tree: Tree) -> _Part:
-        return self._joined(tree, ast.Or)
-
-    def _and(self, tree: Tree) -> _Part:
-        return self._joined(tree, ast.And)
-
-    def _joined(self, tree: Tree, kind: type[ast.And] | type[ast.Or]) -> _Part:
-        parts, words = self._operands(tree)
-        self._refuse_open(parts, words, tree.children[::2])
-        for part in parts:
-            if part.rule == "bin":
-                word = next(c for c in words if c)
-                offer = self._offered(", as in ", f"({self._source(part)})")
-                raise self._fail(
-                    f"until and its like next to {str(word)!r} is ambiguous: put it in "
-                    f"parentheses{offer}",
-                    part.start,
-                    part.end,
-                )
-        value = kind(tuple(map(self._formula, parts)))
-        return _Part(value, *self._span(tree), rule="join")
-
-    def _refuse_powers(self, tree: Tree) -> None:
-        """Refuse `x^2 < 1`, where `^` stands next to arithmetic: it means exclusive or.
-
-        Between two comparisons it can mean nothing else, as these do not chain.
-        """
-        for k, word in enumerate(tree.children[1::2]):
-            left = self._touching(tree.children[2 * k], -1)
-            right = self._touching(tree.children[2 * k + 2], 0)
-            kinds = [None if side is None else str(side.data) for side in (left, right)]
-            if str(word) != "^" or kinds in ([None, None], ["cmp", "cmp"]):
-                continue
-            base = _text(self.text, _edge(tree.children[2 * k], -1))
-            exponent = _text(self.text, _edge(tree.children[2 * k + 2], 0))
-            power = self._offered("", f"{base}**{exponent}", within='"s" < {}') or "x**2"
-            raise self._fail(
-                f"'^' is exclusive or, and here it stands next to arithmetic: a power is written "
-                f"{power}, and exclusive or (one formula) xor (the other)",
-                word.start_pos,
-                word.start_pos + 1,
-            )
-
-    def _touching(self, tree: Tree, side: int) -> Tree | None:
-        """Return the arithmetic of an operand of `^` where it touches it; None if there is none."""
-        while tree.data in _CONNECTIVES and (side or tree.data not in ("negation", "temporal")):
-            tree = tree.children[side]
-        match tree.data:
-            case "quoted" | "true" | "false" | "negation" | "temporal":
-                return None
-            case "parens":
-                return tree if self._is_arithmetic(tree) else None
-            case "name":
-                return tree if str(tree.children[0]) in {**NUMBERS, **self.constants} else None
-        return tree
-
-    def _is_arithmetic(self, tree: Tree) -> bool:
-        """Return whether a tree is an expression, by its rule alone."""
-        while tree.data == "parens":
-            tree = tree.children[0]
-        if tree.data == "name":
-            name = str(tree.children[0])
-            return name in self.constants or name not in self.known
-        return tree.data not in (*_CONNECTIVES, "cmp", "true", "false")
-
-    def _bin(self, tree: Tree) -> _Part:
-        parts = [self._build(c) for c in tree.children[::3]]
-        words, intervals = tree.children[1::3], tree.children[2::3]
-        self._refuse_open(parts, words, tree.children[::3])
-        if len(words) > 1:
-            raise self._chained(parts, words)
-        left, right = map(self._formula, parts)
-        interval = self._interval(intervals[0])
-        value = ast.build(words[0].type.lower(), (left, right), interval)
-        return _Part(value, *self._span(tree), rule="bin")
-
-    def _chained(self, parts: list[_Part], words: list[Any]) -> FormulaSyntaxError:
-        sources = [self._source(part) for part in parts]
-        between = [self.text[p.end : q.start].strip() for p, q in itertools.pairwise(parts)]
-        right, left = sources[-1], sources[0]
-        for k in range(len(between)):
-            left = f"{left if k == 0 else f'({left})'} {between[k]} {sources[k + 1]}"
-            at = len(between) - 1 - k
-            right = f"{sources[at]} {between[at]} {right if k == 0 else f'({right})'}"
-        word = str(words[1])
-        # A power is no formula, so it is read within one.
-        within = '"s" < {}' if str(words[0]) == "**" else "{}"
-        offer = self._offered("write ", right, left, within=within)
-        return self._fail(
-            f"a chain of {str(words[0])!r} is ambiguous: {offer or 'say by parentheses how'}",
-            words[1].start_pos,
-            words[1].start_pos + len(word),
-        )
-
-    def _refuse_open(self, parts: list[_Part], words: list[Any], trees: list[Tree]) -> None:
-        """Refuse `always a & b`: tools disagree on how far the word reaches."""
-        is_open = [part.rule == "word" and not part.closed for part in parts]
-        if not any(is_open[: len(words)]):
-            return
-        far = near = self._source(parts[-1])
-        for k in reversed(range(len(words))):
-            between = self.text[parts[k].end : parts[k + 1].start]
-            source = self._source(parts[k])
-            if is_open[k]:
-                operator, operand = self._operator(trees[k], parts[k])
-                far = f"{operator} ({operand}{between}{far})"
-                near = f"({source}){between}{near}"
-            else:
-                far, near = f"{source}{between}{far}", f"{source}{between}{near}"
-        first = is_open.index(True)
-        operator, _ = self._operator(trees[first], parts[first])
-        part = parts[first]
-        offer = self._offered("write ", far, near)
-        raise self._fail(
-            f"how far {operator!r} reaches is ambiguous: {offer or 'say so by parentheses'}",
-            part.start,
-            part.end,
-        )
-
-    def _operator(self, tree: Tree, part: _Part) -> tuple[str, str]:
-        """Return the operators in front of a part, with their intervals, and what they stand for.
-
-        The grammar's own tree says where one ends: a text has blanks anywhere, or none.
-        """
-        start = part.start
-        while tree.data in ("temporal", "negation"):
-            tree = tree.children[-1]
-            start = tree.meta.start_pos
-        return self.text[part.start : start].strip(), self.text[start : part.end]
-
-    # Operators of one operand
-
-    def _negation(self, tree: Tree) -> _Part:
-        part = self._build(tree.children[1])
-        start, end = self._span(tree)
-        return _Part(ast.Not(self._formula(part)), start, end, part.closed, part.rule)
-
-    def _temporal(self, tree: Tree) -> _Part:
-        word, interval, operand = tree.children
-        part = self._build(operand)
-        value = self._formula(part)
-        name = word.type.lower()
-        if interval is not None and not OPERATORS[name].timed:
-            raise self._fail(f"{str(word)!r} takes no interval", *self._span(interval))
-        value = ast.build(name, (value,), self._interval(interval))
-        symbol = not str(word).rstrip("_").islower()
-        rule = part.rule if symbol else "word"
-        return _Part(value, *self._span(tree), closed=part.closed, rule=rule)
-
-    def _interval(self, tree: Tree | None) -> Interval:
-        if tree is None:
-            return ast.EVERYTHING
-        low, high = (self._bound(child) for child in tree.children)
-        span = self._span(tree)
-        if low < 0:
-            raise self._fail("an interval starts at 0 or later", *span)
-        if high < low:
-            ends = (_text(self.text, child) for child in reversed(tree.children))
-            offer = self._offered(": write ", f"[{', '.join(ends)}]", within='F{} "s"')
-            raise self._fail(f"an interval ends no earlier than it starts{offer}", *span)
-        if low == float("inf"):
-            raise self._fail("an interval starts at a finite time", *span)
-        return Interval(low, high)
-
-    def _bound(self, tree: Tree) -> float:
-        if len(tree.children) == 1:
-            name = str(tree.children[0])
-            if name in ("inf", "infinity"):
-                return float("inf")
-            if name in self.constants:
-                value = float(self.constants[name])
-                if math.isnan(value):
-                    raise self._fail(
-                        f"the end of an interval is a number; {name} is NaN", *self._span(tree)
-                    )
-                return value
-            raise self._fail(
-                str(unknown_name("constant", name, ["inf", *self.constants])), *self._span(tree)
-            )
-        minus, number, unit = tree.children
-        try:
-            value = float(Decimal(str(number)) * _UNITS[str(unit or "s")])
-        except (DecimalException, ValueError):
-            value = math.inf
-        if math.isinf(value):
-            raise self._fail("a time must be a finite number of seconds, or inf", *self._span(tree))
-        return -value if minus else value
-
-    # Comparisons and arithmetic
-
-    def _cmp(self, tree: Tree) -> _Part:
-        parts, words = self._operands(tree)
-        if len(words) > 1:
-            sides = zip(itertools.pairwise(map(self._source, parts)), words, strict=True)
-            offer = self._offered(": write ", " & ".join(f"({a} {w} {b})" for (a, b), w in sides))
-            raise self._fail(
-                f"comparisons do not chain{offer or ': join them by &'}",
-                words[1].start_pos,
-                words[1].start_pos + len(words[1]),
-            )
-        left, right = map(self._expression, parts)
-        try:
-            value = ast.Predicate(str(words[0]), left, right)
-        except ValueError as error:
-            raise self._fail(str(error), *self._span(tree)) from None
-        return _Part(value, *self._span(tree))
-
-    def _sum(self, tree: Tree) -> _Part:
-        parts, words = self._operands(tree)
-        value = self._expression(parts[0])
-        for word, part in zip(words, parts[1:], strict=True):
-            value = Arithmetic(str(word), (value, self._expression(part)))
-        return _Part(value, *self._span(tree))
-
-    _product = _sum
-
-    def _power(self, tree: Tree) -> _Part:
-        parts, words = self._operands(tree)
-        if len(words) > 1:
-            raise self._chained(parts, words)
-        base, exponent = map(self._expression, parts)
-        return _Part(base**exponent, *self._span(tree))
-
-    def _minus(self, tree: Tree) -> _Part:
-        part = self._build(tree.children[1])
-        if part.signs >= MAX_DEPTH:
-            reason = f"at most {MAX_DEPTH} minus signs stand in front of each other"
-            raise self._fail(reason, part.start, part.start + 1)
-        value = -self._expression(part)
-        return _Part(value, *self._span(tree), signs=part.signs + 1)
-
-    def _number(self, tree: Tree) -> _Part:
-        number, unit = tree.children
-        return _Part(Number(float(number) * ANGLES[str(unit or "rad")]), *self._span(tree))
-
-    def _name(self, tree: Tree) -> _Part:
-        name = str(tree.children[0])
-        if name in self.constants:
-            return _Part(Number(float(self.constants[name])), *self._span(tree))
-        if name in self.known:
-            return _Part(self.known[name], *self._span(tree))
-        if name in NUMBERS:
-            return _Part(Number(NUMBERS[name]), *self._span(tree))
-        if name in FUNCTIONS:
-            raise self._fail(
-                f"{name} is a function: write {name}({', '.join('xy'[: FUNCTIONS[name]])}), or "
-                "quote it if it is a signal",
-                *self._span(tree),
-            )
-        return _Part(Signal(name), *self._span(tree))
-
-    def _quoted(self, tree: Tree) -> _Part:
-        return _Part(Signal(str(tree.children[0])[1:-1]), *self._span(tree))
-
-    def _true(self, tree: Tree) -> _Part:
-        return _Part(ast.TRUE, *self._span(tree), closed=True)
-
-    def _false(self, tree: Tree) -> _Part:
-        return _Part(ast.FALSE, *self._span(tree), closed=True)
-
-    def _component(self, tree: Tree) -> _Part:
-        vector, index = tree.children
-        part = self._build(vector)
-        try:
-            value = self._expression(part)[int(str(index))]
-        except ValueError:
-            raise self._fail(
-                "a component is a signal and a whole number, as in p[0]", *self._span(tree)
-            ) from None
-        return _Part(value, *self._span(tree))
-
-    def _call(self, tree: Tree) -> _Part:
-        name, *arguments = tree.children
-        span = self._span(tree)
-        if str(name) not in FUNCTIONS:
-            error = unknown_name("function", str(name), FUNCTIONS)
-            raise self._fail(str(error), name.start_pos, name.start_pos + len(name))
-        parts = tuple(self._expression(self._build(c)) for c in arguments)
-        try:
-            return _Part(Arithmetic(str(name), parts), *span)
-        except ValueError as error:
-            raise self._fail(str(error), *span) from None
-
-    def _parens(self, tree: Tree) -> _Part:
-        part = self._build(tree.children[0])
-        return _Part(part.value, *self._span(tree), closed=True, signs=part.signs)
-
-
-def _edge(tree: Tree, side: int) -> Tree:
-    """Return the first (0) or last (-1) operand in a tree that is none of an open operator."""
-    while tree.data in (*_CONNECTIVES, "cmp", "sum", "product", "power"):
-        if not isinstance(tree.children[side], Tree):
-            break
-        tree = tree.children[side]
-    return tree
-
-
-def _text(text: str, tree: Tree) -> str:
-    """Return the part of `text` that a node of the tree was read from."""
-    return text[tree.meta.start_pos : tree.meta.end_pos]

@@ -94,11 +94,12 @@ def satisfied(
     # In NumPy, where nothing compiles.
     numbers = np.asarray(verdict)
     if np.any(np.isnan(numbers)):
-        raise ValueError(f"no verdict: {_first_nan(as_formula(formula), trace)}")
+        raise ValueError(f"no verdict: {first_nan(as_formula(formula), trace)}")
     return jax.device_put(numbers > 0)
 
 
-def _first_nan(formula: Formula, trace: Trace) -> str:
+def first_nan(formula: Formula, trace: Trace) -> str:
+    """Say where a signal of a formula has no number, or that the value of the formula is none."""
     trace = trace.trim().finely()
     clock = np.asarray(trace.clock())
     for name in formula.signals():

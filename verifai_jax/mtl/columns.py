@@ -146,7 +146,21 @@ def seconds_of(source: str, name: str, column: Any) -> np.ndarray:
             f"column {name!r} of {source} holds lists of {values.shape[1]} numbers, where each row "
             "must have one sample time"
         )
-    return values
+    unit = epoch_unit(values)
+    if unit == "s":
+        return values
+    first = values[0].item()
+    return np.array([(stamp - first) / FRACTIONS[unit] for stamp in values.tolist()])
+
+
+def epoch_unit(values: np.ndarray) -> str:
+    """Return the unit of numbers that are sample times: `s`, or that of a calendar's clock.
+
+    As seconds they would lie more than three thousand years after 1970.
+    """
+    known = values[np.isfinite(values)]
+    size = float(np.min(known)) if known.size and known.ndim == 1 else 0.0
+    return "s" if size < 1e11 else "ms" if size < 1e14 else "us" if size < 1e17 else "ns"
 
 
 def moment_of(text: str) -> datetime.datetime:

@@ -6,6 +6,7 @@ read("flight.parquet", dt=0.02)                           # rows 0.02 s apart
 read("flight.csv", resample_to=0.1, method="linear")
 """
 
+import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,16 +15,21 @@ import numpy as np
 
 from verifai_jax.core.errors import missing_name
 from verifai_jax.core.trace import Trace
-from verifai_jax.mtl.columns import LeftOut, is_numeric, numbers_of, seconds_of
+from verifai_jax.mtl.columns import LeftOut, epoch_unit, is_numeric, numbers_of, seconds_of
 from verifai_jax.mtl.resampling import Method, check_increasing, resample
 
 if TYPE_CHECKING:
     import pandas as pd
 
+NUMBER = re.compile(r'^\s*"?[-+]?[.,]?\d')
+"""The beginning of a number, or of a date."""
 DECIMAL_COMMAS = r"^\s*[-+]?\d*(,\d*)?([eE][-+]?\d+)?\s*$"
 """Numbers with a decimal comma, `1,5`, and those without decimals."""
 THOUSANDS = r"^\s*[-+]?(\d{1,3}|[1-9]\d{0,2},\d{3})\s*$"
 """Numbers in which a comma, where there is one, may stand between thousands, `1,500`."""
+
+ENDINGS = (".csv", ".parquet", ".npz")
+"""Endings of files that are recordings."""
 
 
 class TimeColumnError(ValueError):
@@ -49,19 +55,21 @@ def read(
     resample_to: float | None = None,
     method: Method | None = None,
 ) -> Trace:
-    """Read a trace from a CSV or Parquet file or a data frame, a column a signal, a row a sample.
+    """Read a trace from a file of CSV, Parquet or NumPy, or a data frame: a column is a signal.
 
     Columns `p[0]`, `p[1]`, ... make one vector signal `p`, and so does a column of lists of one
     length. Columns that hold no numbers are left out, with a note, unless named in `columns`. An
     empty cell is a gap (NaN). In a CSV file commas, semicolons or tabs separate the columns,
-    whichever the first line has; numbers may have a decimal comma, if all of them do.
+    whichever the first line has; numbers may have a decimal comma, if all of them do. Lines of
+    comments (`#`) before the names, and a row of units below them, are passed over.
 
     **Arguments:**
 
-    - `source`: the path of a `.csv` (first line: names) or `.parquet` file, or a
-      `pandas.DataFrame`, whose index is read as a column if it has a name.
+    - `source`: the path of a `.csv` (first line: names), `.parquet` or `.npz` file (an array of it
+      is a column), or a `pandas.DataFrame`, whose index is read as a column if it has a name.
     - `time`: the column of sample times in seconds, or of dates (ISO 8601 where they are text) or
-      durations, which become seconds since the first.
+      durations, which become seconds since the first; so do numbers that can only be milli-, micro-
+      or nanoseconds since 1970, with a note.
     - `dt`: the sampling period, instead of a column of times.
     - `columns`: the signals to read; all when left out.
     - `resample_to`, `method`: a period to resample to, and how (`"hold"` or `"linear"`).
@@ -87,6 +95,8 @@ def read(
         trace = Trace(signals, dt=dt, notes=notes)
     else:
         stamps = seconds_of(name, time, times)
+        if is_numeric(times) and (unit := epoch_unit(numbers_of(name, time, times))) != "s":
+            notes[f"column {time!r} is read as {unit} since 1970, in seconds from the first"] = 1
         check_increasing(stamps)
         trace = Trace(signals, times=stamps, notes=notes)
     if resample_to is not None and method is not None:
@@ -138,9 +148,9 @@ def _file_columns(path: Path) -> dict[str, Any]:
     import pyarrow
     from pyarrow import parquet
 
-    readers = {".csv": _read_csv, ".parquet": parquet.read_table}
+    readers = {".csv": _read_csv, ".parquet": parquet.read_table, ".npz": _read_arrays}
     if path.suffix.lower() not in readers:
-        raise ValueError(f"a recording is a .csv or a .parquet file; got {path.name}")
+        raise ValueError(f"a recording is a .csv, .parquet or .npz file; got {path.name}")
     try:
         table = readers[path.suffix.lower()](path)
         names = table.column_names
@@ -165,10 +175,15 @@ def _read_csv(path: Path) -> Any:
     from pyarrow import csv
 
     with open(path, encoding="utf-8", errors="replace") as file:
-        first = file.readline()
+        comments, first = 0, file.readline()
+        while first.startswith("#"):
+            comments, first = comments + 1, file.readline()
+        second, third = file.readline(), file.readline()
     separator = max((",", ";", "\t"), key=first.count)
+    units = _are_units(*(line.rstrip("\n").split(separator) for line in (second, third)))
     parsed = csv.ParseOptions(delimiter=separator)
-    table = csv.read_csv(path, parse_options=parsed)
+    skipped = csv.ReadOptions(skip_rows=comments, skip_rows_after_names=int(units))
+    table = csv.read_csv(path, parse_options=parsed, read_options=skipped)
     named = list(zip(table.column_names, table.columns, strict=True))
     commas = [name for name, column in named if _all_match(column, DECIMAL_COMMAS)]
     if not commas:
@@ -182,7 +197,10 @@ def _read_csv(path: Path) -> Any:
             "or one between thousands: write it without, or put semicolons between the columns"
         )
     again = csv.read_csv(
-        path, parse_options=parsed, convert_options=csv.ConvertOptions(decimal_point=",")
+        path,
+        parse_options=parsed,
+        read_options=skipped,
+        convert_options=csv.ConvertOptions(decimal_point=","),
     )
     for (name, before), after in zip(named, again.columns, strict=True):
         if is_numeric(before) and not is_numeric(after):
@@ -191,6 +209,37 @@ def _read_csv(path: Path) -> Any:
                 f"{name!r}: write all numbers in one way"
             )
     return again
+
+
+def _are_units(second: list[str], third: list[str]) -> bool:
+    """Return whether the row below the names has texts alone, and the next one numbers."""
+    named = [cell.strip().strip('"') for cell in second]
+    words = {"nan", "null", "na", "true", "false"}
+    values = any(NUMBER.match(cell) or cell.lower() in words for cell in named)
+    if values or len(named) != len(third):
+        return False
+    return any(cell and NUMBER.match(below) for cell, below in zip(named, third, strict=True))
+
+
+def _read_arrays(path: Path) -> Any:
+    """Read the arrays of an `.npz` file as an Arrow table; nothing in it is unpickled."""
+    import pyarrow
+
+    columns = {}
+    with np.load(path, allow_pickle=False) as arrays:
+        for name in arrays.files:
+            array = arrays[name]
+            if array.ndim not in (1, 2):
+                raise ValueError(
+                    f"array {name!r} of {path} must have shape [time] or [time, k]; "
+                    f"got {list(array.shape)}"
+                )
+            flat = pyarrow.array(array.reshape(-1))
+            wide = array.ndim == 2
+            columns[name] = (
+                pyarrow.FixedSizeListArray.from_arrays(flat, array.shape[1]) if wide else flat
+            )
+    return pyarrow.table(columns)
 
 
 def _all_match(column: Any, number: str) -> bool:

@@ -109,12 +109,12 @@ def prepare(
             raise _missing_signal(name, trace)
     dt, stride = period(trace), trace.stride
     if end == "strict":
-        _check_horizon(formula, trace, dt)
+        check_horizon(formula, trace, dt)
     if trace.valid is not None and end == "hold":
         trace = trace.hold()
     trace = trace.finely()
     valid = None if trace.valid is None or end == "hold" else jnp.asarray(trace.valid)
-    signals = _numbers({name: trace.signals[name] for name in formula.signals()})
+    signals = numbers_of_signals({name: trace.signals[name] for name in formula.signals()})
     setting = Setting(
         formula, trace.length, dt, semantics.kind, semantics.error, semantics.bound, end, compat,
         stride,
@@ -133,7 +133,7 @@ def _missing_signal(name: str, trace: Trace) -> Exception:
     return type(error)(f"{error}; {said[0]}") if said else error
 
 
-def _numbers(signals: dict[str, Samples]) -> dict[str, Array]:
+def numbers_of_signals(signals: dict[str, Samples]) -> dict[str, Array]:
     """Return the signals as arrays of one floating type; true counts as +1 and false as -1."""
     arrays = {name: as_array(value) for name, value in signals.items()}
     floats = [a.dtype for a in arrays.values() if jnp.issubdtype(a.dtype, jnp.floating)]
@@ -237,7 +237,8 @@ def _at(trace: Trace, k: int) -> str:
     return f"{format_time(float(np.asarray(trace.clock())[k]))} s"
 
 
-def _check_horizon(formula: Formula, trace: Trace, dt: float) -> None:
+def check_horizon(formula: Formula, trace: Trace, dt: float) -> None:
+    """Raise `HorizonError` for a formula that looks beyond the end of a trace."""
     horizon = formula.horizon(dt)
     length = trace.length
     if trace.valid is not None and not isinstance(trace.valid, Tracer):

@@ -1,11 +1,12 @@
 """Steps that move the elements of arrays, and are no code."""
 
+import math
 from collections.abc import Callable
 from typing import TypeAlias
 
 import numpy as np
 
-from verifai_jax.native_code.translation import Translator, rule
+from verifai_jax.native_code.translation import SINGLE, Translator, rule
 from verifai_jax.native_code.values import (
     DTYPES,
     Elements,
@@ -29,7 +30,12 @@ def moved(*names: str) -> Callable[[Move], Move]:
 
     def register(function: Move) -> Move:
         def apply(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
-            return [function(step.params, elements(inputs[0]))]
+            value = inputs[0]
+            if _is_large(inputs):
+                at = function(step.params, np.arange(value.size).reshape(value.shape))
+                if at.size > SINGLE and np.all(np.diff(at.ravel()) == 1):
+                    return [value.part(int(at.flat[0]), at.shape)]
+            return [function(step.params, elements(value))]
 
         rule(*names)(apply)
         return function
@@ -76,7 +82,15 @@ def _slice(params: Params, array: Elements) -> Elements:
 
 @rule("concatenate")
 def _concatenate(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
-    return [np.concatenate([elements(v) for v in inputs], step.params["dimension"])]
+    axis, form = step.params["dimension"], step.outvars[0].aval
+    if _is_large(inputs) and math.prod(form.shape[:axis]) == 1:
+        return [t.joined_in_memory(inputs, form)]
+    return [np.concatenate([elements(v) for v in inputs], axis)]
+
+
+def _is_large(values: list[Value]) -> bool:
+    """Return whether arrays that differ between simulations lie in memory."""
+    return any(isinstance(v, Memory) and v.values is None and v.size > SINGLE for v in values)
 
 
 @rule("stack")
@@ -95,8 +109,14 @@ def _split(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
 
 @rule("pad")
 def _pad(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
-    array, filler = elements(inputs[0]), elements(inputs[1]).item()
-    out = filled(step.outvars[0].aval.shape, filler)
+    filler, form = elements(inputs[1]).item(), step.outvars[0].aval
+    (low, high, inside), *others = step.params["padding_config"] or [(0, 0, 0)]
+    if _is_large(inputs) and min(low, high) >= inside == 0 and not any(map(any, others)):
+        each = math.prod(form.shape[1:])
+        ends = (filled((count * each,), filler) for count in (low, high))
+        return [t.joined_in_memory([next(ends), inputs[0], next(ends)], form)]
+    array = elements(inputs[0])
+    out = filled(form.shape, filler)
     cells = []
     for size, total, (low, _, inside) in zip(
         array.shape, out.shape, step.params["padding_config"], strict=True

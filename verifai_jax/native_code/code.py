@@ -5,8 +5,10 @@ registers; what a later piece needs lies in memory. What is the same for all sim
 once, in front of the piece.
 """
 
+import math
 import re
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -16,8 +18,12 @@ MAX_LINES = 30_000
 """The maximum number of lines of a program; a compiler takes seconds for that many."""
 STACK = 4096
 """Numbers of a simulation in arrays on the stack at most; others are in the thread's memory."""
-_DIVISION = re.compile(r"F (v\d+) = (\S+) / (v\d+);")
+MANY_DIVISIONS = 0.03
+"""Share of divisions in a piece from which on they are made of products: the unit that divides
+would make the others wait."""
+_DIVISION = re.compile(r"F (v\d+) = (\S+) / (v\d+|\(?-?[\d.e+-]+f\)?);")
 _NAME = re.compile(r"\bv\d+\b")
+_MADE = re.compile(r"\b([uvimw])\d+\b")
 
 
 class Piece:
@@ -29,6 +35,7 @@ class Piece:
         self.after: list[str] = []
         self.defined: list[str] = []
         self.known: dict[str, Element] = {}
+        self.stored: dict[tuple[Element, ...], Memory] = {}
 
 
 class Code:
@@ -44,6 +51,9 @@ class Code:
         self._count = 0
         self._lines = 0
         self._constants: dict[tuple[str, bytes], str] = {}
+        # The pieces before the loops that are open, and in how many of these a name has its value.
+        self._before: list[Piece] = []
+        self._depths: dict[str, int] = {}
 
     @property
     def piece(self) -> Piece:
@@ -58,6 +68,43 @@ class Code:
         """Add a line between pieces, such as the head of a loop."""
         self.items.append(text)
 
+    def open_loop(self, head: str, counter: str = "") -> None:
+        """Begin a loop; what does not change in it is computed before it.
+
+        - `counter`: its variable, if it has one.
+        """
+        self._before.append(self.piece)
+        self._depths[counter] = len(self._before)
+        self.control(head)
+
+    def close_loop(self) -> None:
+        """End the innermost loop."""
+        self.control("}")
+        self._before.pop()
+        depth = len(self._before)
+        for name, inside in self._depths.items():
+            self._depths[name] = min(inside, depth)
+
+    def mark(self) -> tuple[int, int]:
+        """Return the place to which `back_to` returns."""
+        self.control("")
+        return len(self.items), len(self._before)
+
+    def back_to(self, mark: tuple[int, int]) -> None:
+        """Forget all lines since a place."""
+        del self.items[mark[0] :]
+        del self._before[mark[1] :]
+
+    def _depth_of(self, text: str) -> int:
+        """Return in how many of the open loops an expression has to be computed."""
+        now = len(self._before)
+        # An array may be written to, and what `fresh` makes is.
+        names = ((m[0], now if m[1] in "imw" else 0) for m in _MADE.finditer(text))
+        return min(now, max((self._depths.get(*each) for each in names), default=0))
+
+    def _piece_of(self, depth: int) -> Piece:
+        return self.piece if depth == len(self._before) else self._before[depth]
+
     def name(self, prefix: str) -> str:
         """Return a name that nothing has."""
         self._count += 1
@@ -65,20 +112,23 @@ class Code:
 
     def define(self, text: str, kind: str, uniform: bool) -> Element:
         """Add a line that computes a number, and return it."""
-        known = self.piece.known.get(text)
+        depth = self._depth_of(text)
+        piece = self._piece_of(depth)
+        known = piece.known.get(text)
         if known is not None and known.kind == kind and known.uniform == uniform:
             return known
         self._count_line()
         if uniform:
             name = self.name("u")
             self.declared.append(f"{TYPES[kind][1]} {name};")
-            self.piece.together.append(f"{name} = {text};")
+            piece.together.append(f"{name} = {text};")
         else:
             name = self.name("v")
             self.kinds[name] = kind
-            self.piece.defined.append(name)
-            self.piece.each.append(f"{TYPES[kind][0]} {name} = {text};")
-        return self.piece.known.setdefault(text, Element(name, kind, uniform))
+            piece.defined.append(name)
+            piece.each.append(f"{TYPES[kind][0]} {name} = {text};")
+        self._depths[name] = depth
+        return piece.known.setdefault(text, Element(name, kind, uniform))
 
     def fresh(self, kind: str, uniform: bool) -> Element:
         """Return a number that the next line computes."""
@@ -88,7 +138,7 @@ class Code:
         return self.define(f"{text} /* {name} */", kind, uniform)
 
     def keep(self, kind: str, uniform: bool) -> Element:
-        """Return a number that `assign` changes."""
+        """Return a number that `assign` changes, in the loop that is opened next."""
         if uniform:
             name = self.name("u")
             self.declared.append(f"{TYPES[kind][1]} {name};")
@@ -96,6 +146,7 @@ class Code:
             name = self.name("v")
             self.kinds[name] = kind
             self.kept.add(name)
+        self._depths[name] = len(self._before) + 1
         return Element(name, kind, uniform)
 
     def assign(self, changed: list[Element], values: list[Element]) -> None:
@@ -134,13 +185,25 @@ class Code:
             )
         return self._constants[key]
 
-    def store(self, target: str, value: Element, uniform: bool = False) -> None:
-        """Add a line that writes an element of an array."""
+    def store(self, target: str, value: Element) -> None:
+        """Add a line that writes an element of an array that differs between simulations."""
         self._count_line()
-        if uniform:
-            self.piece.together.append(f"{target} = {value.text};")
-        else:
-            self.piece.each.append(f"{target} = {widened(value)};")
+        self.piece.each.append(f"{target} = {widened(value)};")
+
+    def stored(self, values: Sequence[Element], shape: tuple[int, ...]) -> Memory:
+        """Return an array of these elements, which nothing changes."""
+        depth = max(self._depth_of(each.text) for each in values)
+        piece, uniform = self._piece_of(depth), all(each.uniform for each in values)
+        known = piece.stored.get(tuple(values))
+        if known is not None:
+            return known._replace(shape=shape)
+        self._count_line(len(values))
+        memory = self.memory(shape, values[0].kind, uniform)
+        self._depths[memory.name] = depth
+        lines = piece.together if uniform else piece.each
+        for i, each in enumerate(values):
+            lines.append(f"{memory.at(i)} = {each.text if uniform else widened(each)};")
+        return piece.stored.setdefault(tuple(values), memory)
 
     def _count_line(self, lines: int = 1) -> None:
         self._lines += lines
@@ -190,22 +253,32 @@ class Code:
 
 
 def shared_divisions(lines: list[str]) -> list[str]:
-    """Divide by what is divided by more than once through its reciprocal, corrected by a remainder.
+    """Divide by constants, and by what is divided by more than once, through the reciprocal.
 
-    A division takes as long as a dozen multiplications.
+    A division takes as long as a dozen multiplications, so many of them are made of these, too.
     """
     found = [_DIVISION.match(line) for line in lines]
     counts = Counter(each[3] for each in found if each)
+    single = sum(counts[each] == 1 and each[0] == "v" for each in counts)
+    many = single >= MANY_DIVISIONS * len(lines)
     done, known = [], set[str]()
     for line, each in zip(lines, found, strict=True):
-        if each is None or counts[each[3]] < 2:
+        if each is None:
             done.append(line)
             continue
         name, number, divisor = each.groups()
-        if divisor not in known:
-            known.add(divisor)
-            done.append(f"F r{divisor} = 1.f / {divisor};")
-        done.append(f"F {name} = divided(wide({number}), {divisor}, r{divisor});")
+        if divisor[0] != "v":
+            size = abs(float(divisor.strip("()f")))
+            exact = not 1e-30 < size < 1e30 or math.frexp(size)[0] == 0.5
+            by = f"divided(wide({number}), wide({divisor}), wide(1.f / {divisor}))"
+            done.append(line if exact else f"F {name} = {by};")
+        elif counts[divisor] > 1:
+            if divisor not in known:
+                known.add(divisor)
+                done.append(f"F r{divisor} = 1.f / {divisor};")
+            done.append(f"F {name} = divided(wide({number}), {divisor}, r{divisor});")
+        else:
+            done.append(f"F {name} = ratio(wide({number}), {divisor});" if many else line)
     return done
 
 

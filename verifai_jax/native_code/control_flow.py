@@ -14,7 +14,6 @@ from verifai_jax.native_code.values import (
     Form,
     Memory,
     Program,
-    Untranslatable,
     Value,
     constant,
     elements,
@@ -67,7 +66,7 @@ class Carry:
             if isinstance(other, Memory) and other.name == mine.name and not other.offset:
                 continue
             if isinstance(other, Memory) and not memory.uniform:
-                _store(self.t, memory, other)
+                self.t.write(memory, other)
                 moved.append((mine, memory))
                 continue
             for i, each in enumerate(elements(other).ravel()):
@@ -113,14 +112,13 @@ def until_settled(
     emit: Callable[[Carry], list[Value] | None],
 ) -> list[Value]:
     """Write a loop or branch, again as long as more of its values turn out to differ."""
-    t.code.control("")
-    begin = len(t.code.items)
+    mark = t.code.mark()
     while True:
         carry = Carry(t, forms, uniform)
         results = emit(carry)
         if results is not None:
             return results
-        del t.code.items[begin:]
+        t.code.back_to(mark)
 
 
 @rule("scan")
@@ -145,7 +143,7 @@ def _scan(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
             t.code.memory(form.shape, kind_of(form.dtype)) if some else np.empty(0, object)
             for form, some in zip(forms[count:], wanted, strict=True)
         ]
-        t.code.control(f"for (int {head}) {{")
+        t.code.open_loop(f"for (int {head}) {{", i)
         now = [each(i) for each in stacked]
         results = t.closed(program, [*shared, *carry.values, *now])
         if carry.varies(results[:count]):
@@ -153,24 +151,12 @@ def _scan(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
         for out, value, some in zip(outs, results[count:], wanted, strict=True):
             if some:
                 assert isinstance(out, Memory)
-                _store(t, out._replace(offset=f"{i} * {out.size // length}"), value)
+                t.write(out._replace(offset=f"{i} * {out.size // length}"), value)
         carry.assign(results[:count])
-        t.code.control("}")
+        t.code.close_loop()
         return [*carry.values, *outs]
 
     return until_settled(t, forms[:count], [is_uniform(v) for v in start], emit)
-
-
-def _store(t: Translator, out: Memory, value: Value) -> None:
-    if isinstance(value, Memory):
-        i, size = t.code.name("i"), value.size
-        each = f"wide({value.at(i)})" if value.uniform else value.at(i)
-        t.line(f"for (int {i} = 0; {i} < {size}; {i}++) {out.at(i)} = {each};")
-        return
-    for i, each in enumerate(value.ravel()):
-        if not isinstance(each, Element):
-            raise Untranslatable("random keys that a loop collects")
-        t.code.store(out.at(i), each)
 
 
 def _stacked(t: Translator, value: Value) -> Callable[[str], Value]:
@@ -213,7 +199,7 @@ def _while(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
 
     def emit(carry: Carry) -> list[Value] | None:
         carry.assign(start)
-        t.code.control("for (;;) {")
+        t.code.open_loop("for (;;) {")
         (goes_on,) = t.closed(params["cond_jaxpr"], [*asked, *carry.values])
         on = elements(goes_on).item()
         if on.uniform:
@@ -231,7 +217,7 @@ def _while(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
         if carry.varies(results):
             return None
         carry.assign(results)
-        t.code.control("}")
+        t.code.close_loop()
         return carry.values
 
     return until_settled(t, forms, [is_uniform(value) for value in start], emit)

@@ -60,11 +60,21 @@ INLINE I filled(F, int x) { return wide(x); }
 INLINE int filled(float, int x) { return x; }
 INLINE F filled(F, float x) { return wide(x); }
 INLINE float filled(float, float x) { return x; }
-template <class T> INLINE auto to_whole(T x) -> decltype(truncated(x)) {
+template <class T> INLINE auto saturated(T x) -> decltype(truncated(x)) {
   /* What is too small is the smallest number already, on x86; elsewhere all of it is as here. */
   auto r = choose(truth(x >= 2147483648.f), filled(x, 2147483647), truncated(x));
   return choose(truth(x != x), filled(x, 0), r);
 }
+INLINE int to_whole(float x) { return saturated(x); }
+#if defined(__AVX512F__)
+OUTLINE I saturated_seldom(F x) { return saturated(x); }
+INLINE I to_whole(F x) {
+  I r = truncated(x), lowest = wide(-2147483647 - 1);
+  bool beyond = __builtin_ia32_cmpd512_mask(r, lowest, 0, (unsigned short)-1) != 0;
+  return __builtin_expect(beyond, 0) ? saturated_seldom(x) : r; }
+#else
+INLINE I to_whole(F x) { return saturated(x); }
+#endif
 INLINE U to_natural(F x) { U r; for (int l = 0; l < W; l++)
   r[l] = x[l] > 0 ? (x[l] < 4294967296.f ? (unsigned)x[l] : 4294967295u) : 0u; return r; }
 INLINE unsigned to_natural(float x) {
@@ -74,6 +84,18 @@ template <class T> INLINE T greater(T a, T b) { T m = choose(truth(a > b), a, b)
   return choose(truth(a != a), a, m); }
 template <class T> INLINE T lesser(T a, T b) { T m = choose(truth(a < b), a, b);
   return choose(truth(a != a), a, m); }
+/* Instructions that do the same, where a compiler does not find them: they give b for NaN. */
+#if defined(__AVX512F__) && defined(__clang__)
+#define EXTREME(which, a, b) __builtin_ia32_##which##ps512(a, b, 4)
+#elif defined(__AVX512F__)
+#define EXTREME(which, a, b) __builtin_ia32_##which##ps512_mask(a, b, a, (unsigned short)-1, 4)
+#elif defined(__AVX__)
+#define EXTREME(which, a, b) __builtin_ia32_##which##ps256(a, b)
+#endif
+#if defined(EXTREME)
+INLINE F greater(F a, F b) { return choose(a != a, a, EXTREME(max, a, b)); }
+INLINE F lesser(F a, F b) { return choose(a != a, a, EXTREME(min, a, b)); }
+#endif
 INLINE F absolute(F x) { return (F)((U)x & 0x7fffffffu); }
 INLINE float absolute(float x) { return __builtin_fabsf(x); }
 INLINE I absolute(I x) { return choose(x < 0, -x, x); }
@@ -98,6 +120,16 @@ template <class T> INLINE T rounded_down(T x) { T r = nearest(x);
   return choose(truth(r > x), r - 1.f, r); }
 template <class T> INLINE T rounded_up(T x) { T r = nearest(x);
   return with_sign(choose(truth(r < x), r + 1.f, r), x); }
+#if defined(__AVX512F__)
+#define ROUNDED(x, how) __builtin_ia32_rndscaleps_mask(x, how, x, (unsigned short)-1, 4)
+#elif defined(__AVX__)
+#define ROUNDED(x, how) __builtin_ia32_roundps256(x, how)
+#endif
+#if defined(ROUNDED)
+INLINE F nearest(F x) { return ROUNDED(x, 8); }
+INLINE F rounded_down(F x) { return ROUNDED(x, 9); }
+INLINE F rounded_up(F x) { return ROUNDED(x, 10); }
+#endif
 template <class T> INLINE T rounded_away(T x) {
   T a = absolute(x), r = rounded_down(a);
   r = choose(truth(a - r >= 0.5f), r + 1.f, r);
@@ -109,8 +141,17 @@ INLINE F ordinary_ratio(F x, F y) {
   F r = __builtin_ia32_rcp14ps512_mask(y, F(), (unsigned short)-1);
   r = r + r * (1.f - y * r);
   F q = x * r; return q + (x - q * y) * r; }
+/* x / y rounded as the division is, but for numbers near the largest. It takes no longer than the
+   additions that would wait for many divisions. */
+INLINE F ratio(F x, F y) {
+  F r = __builtin_ia32_rcp14ps512_mask(y, F(), (unsigned short)-1), e = 1.f - y * r;
+  if (__builtin_expect(any(~(e < 0.5f)), 0)) return x / y;
+  r = r + r * e;
+  F q = x * r, better = q + (x - q * y) * r;
+  return choose(better == better, better, q); }
 #else
 INLINE F ordinary_ratio(F x, F y) { return x / y; }
+INLINE F ratio(F x, F y) { return x / y; }
 #endif
 INLINE float ordinary_ratio(float x, float y) { return x / y; }
 /* x / y with the reciprocal of y: rounded as the division is, but for numbers near the largest. */
@@ -168,15 +209,14 @@ template <class T> INLINE T exponential1(T x) {
   return choose(truth(absolute(x) < 0.35f), p, choose(truth(x > 88.f) , exponential(x),
     e * e - 1.f)); }
 template <class T> INLINE T hyperbolic(T x) {
-  T end = filled(x, 7.90531110763549805f), c = choose(truth(x > end), end, x);
-  c = choose(truth(c < -end), -end, c);
+  T end = filled(x, 7.90531110763549805f), c = greater(-end, lesser(end, x));
   T s = c * c, p = filled(x, -2.76076847742355e-16f), q = filled(x, 1.19825839466702e-06f);
   p = p * s + 2.00018790482477e-13f; p = p * s - 8.60467152213735e-11f;
   p = p * s + 5.12229709037114e-08f; p = p * s + 1.48572235717979e-05f;
   p = p * s + 6.37261928875436e-04f; p = p * s + 4.89352455891786e-03f;
   q = q * s + 1.18534705686654e-04f; q = q * s + 2.26843463243900e-03f;
   q = q * s + 4.89352518554385e-03f;
-  return choose(truth(absolute(x) < 0.0004f), x, ordinary_ratio(c * p, q)); }
+  return ordinary_ratio(c * p, q); }
 template <class T> INLINE T inverse_error(T x) {
   T w = -logarithm1(-x * x), a = w - 2.5f, b = root(w) - 3.f;
   T p = filled(x, 2.81022636e-08f), q = filled(x, -0.000200214257f);

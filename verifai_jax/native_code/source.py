@@ -64,7 +64,8 @@ def translate(program: Program) -> str:
     vectors = next((k for k in (4, 2) if arena * k * 64 <= CACHE * (4 // k)), 1)
     body = "\n".join(lines)
     function = _FUNCTION.replace("@arena", str(arena)).replace("@body", body)
-    return "\n".join([f"#define K {vectors}", PRELUDE, _HEAD, *t.code.globals, function])
+    head = f"#define K {vectors}\nenum {{ PAIR = {min(vectors, 2)} }};"
+    return "\n".join([head, PRELUDE, _HEAD, *t.code.globals, function])
 
 
 def one(element: Element) -> np.ndarray:

@@ -24,6 +24,8 @@ SIDE_BY_SIDE = 4
 """Sums that a loop makes at the same time, since each addition waits for the one before."""
 PRODUCTS = 512
 """Products up to which a matrix product is written out: more make a compiler slow."""
+SIDE = 8
+"""Rows of a matrix that a loop multiplies at the same time."""
 
 _JOINED = {
     "reduce_sum": "add",
@@ -160,7 +162,11 @@ def _dot(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     if batches * rows * columns * summed == 0:
         return [filled(form.shape, constant(0, "f"))]
     if batches * rows * columns * summed <= PRODUCTS:
-        one, other = elements(left), elements(right)
+        one, other = (
+            # What is used more than once is not computed more than once.
+            elements(t.in_memory(v) if isinstance(v, Memory) and uses > 1 else v)
+            for v, uses in ((left, columns), (right, rows))
+        )
         out = np.empty((batches, rows, columns), object)
         for b, i, j in np.ndindex(out.shape):
             terms = zip(one[b, i], other[b, j], strict=True)
@@ -180,40 +186,41 @@ def _kind(value: Value) -> str:
 def _large_dot(
     t: Translator, left: Value, right: Value, sizes: tuple[int, ...], shape: tuple[int, ...]
 ) -> Memory:
-    """Multiply two matrices in a loop, eight results at a time."""
+    """Multiply two matrices in a loop, eight results of two vectors at a time.
+
+    Each number that is read then serves several products, as many as there are registers for.
+    """
     a, b = t.in_memory(left), t.in_memory(right)
     batches, rows, columns, summed = sizes
     uniform = a.uniform and b.uniform
     out = t.code.memory(shape, "f", uniform)
-    if rows > columns:
-        outer, inner, counts, swapped = a, b, (rows, columns), True
-    else:
-        outer, inner, counts, swapped = b, a, (columns, rows), False
-    form = "float" if uniform else "F"
+    swapped = rows > columns
+    outer, inner, many, few = (a, b, rows, columns) if swapped else (b, a, columns, rows)
     n, i, o, s = (t.code.name("i") for _ in range(4))
-    many, few = counts
-    at = lambda row, column: (  # noqa: E731
-        f"({n} * {rows} + {row}) * {columns} + {column}"
-    )
-    width = 8
+    form = "float" if uniform else "F"
+    second = lambda text: text.replace("[k]", "[k + PAIR - 1]")  # noqa: E731
     lines = [f"for (int {n} = 0; {n} < {batches}; {n}++)"]
     lines.append(f"for (int {i} = 0; {i} < {few}; {i}++) {{")
-    for begin, end, size in ((0, many // width * width, width), (many // width * width, many, 1)):
+    whole = many // SIDE * SIDE
+    for begin, end, size in ((0, whole, SIDE), (whole, many, 1)):
         if begin == end:
             continue
-        lines.append(f"for (int {o} = {begin}; {o} < {end}; {o} += {size}) {{ {form} ")
-        lines[-1] += ", ".join(f"x{j} = {form}()" for j in range(size)) + ";"
-        lines.append(f"for (int {s} = 0; {s} < {summed}; {s}++) {{")
-        each = inner.at(f"({n} * {few} + {i}) * {summed} + {s}")
-        lines.append(f"{'float' if inner.uniform else 'F'} y = {each};")
+        lines.append(f"for (int {o} = {begin}; {o} < {end}; {o} += {size}) {{ {form} y, z, ")
+        lines.append(", ".join(f"x{j} = {form}(), z{j} = x{j}" for j in range(size)) + ";")
+        each = inner.at(f"(({n} * {few} + {i}) * {summed} + {s})")
+        lines.append(f"for (int {s} = 0; {s} < {summed}; {s}++) {{ y = {each}; z = {second(each)};")
         for j in range(size):
-            other = outer.at(f"({n} * {many} + {o} + {j}) * {summed} + {s}")
-            lines.append(f"x{j} += {other} * y;")
+            other = outer.at(f"(({n} * {many} + {o} + {j}) * {summed} + {s})")
+            lines.append(f"x{j} += {other} * y; if (PAIR > 1) z{j} += {second(other)} * z;")
         lines.append("}")
         for j in range(size):
-            cell = at(f"{o} + {j}", i) if swapped else at(i, f"{o} + {j}")
-            lines.append(f"{out.at(f'({cell})')} = x{j};")
+            row, column = (f"({o} + {j})", i) if swapped else (i, f"{o} + {j}")
+            cell = out.at(f"(({n} * {rows} + {row}) * {columns} + {column})")
+            lines.append(f"{cell} = x{j}; if (PAIR > 1) {second(cell)} = z{j};")
         lines.append("}")
     lines.append("}")
-    t.line(" ".join(lines), uniform)
+    if uniform:
+        t.line(" ".join(["{ const int PAIR = 1;", *lines, "}"]), True)
+    else:
+        t.code.control(" ".join(["for (int k = 0; k < K; k += PAIR) {", *lines, "}"]))
     return out

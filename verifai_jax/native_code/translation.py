@@ -199,18 +199,41 @@ class Translator:
         if all(each.value is not None for each in flat):
             array = np.array([each.value for each in flat], DTYPES[kind]).reshape(value.shape)
             return Memory(self.code.table(array, kind), kind, True, value.shape, values=array)
-        memory = self.code.memory(value.shape, kind, all(each.uniform for each in flat))
-        for i, each in enumerate(flat):
-            self.code.store(memory.at(i), each, memory.uniform)
-        return memory
+        return self.code.stored(flat.tolist(), value.shape)
 
     def _stored(self, value: Memory) -> Memory:
         """Compute an array into memory."""
         result = self.code.memory(value.shape, value.kind, value.uniform)
-        i = self.code.name("i")
-        head = f"for (int {i} = 0; {i} < {value.size}; {i}++)"
-        self.line(f"{head} {result.at(i)} = {value.at(i)};", value.uniform)
+        self.write(result, value)
         return result
+
+    def write(self, out: Memory, value: Value) -> None:
+        """Write the elements of a value into an array, from its offset on."""
+        if not value.size:
+            return
+        if not isinstance(value, Memory) and not isinstance(value.flat[0], Element):
+            raise Untranslatable("random keys that a loop collects")
+        one = None if isinstance(value, Memory) or value.size <= SINGLE else same(value)
+        if isinstance(value, np.ndarray) and one is None:
+            for i, each in enumerate(value.ravel()):
+                self.code.store(out.at(i), each)
+            return
+        i = self.code.name("i")
+        if one is None:
+            assert isinstance(value, Memory)
+            one = Element(value.at(i), value.kind, value.uniform)
+        each = one
+        text = each.text if out.uniform or not each.uniform else f"wide({each.text})"
+        head = f"for (int {i} = 0; {i} < {value.size}; {i}++)"
+        self.line(f"{head} {out.at(i)} = {text};", out.uniform)
+
+    def joined_in_memory(self, parts: Sequence[Value], form: Form) -> Memory:
+        """Return large arrays one after another, without a line for each element."""
+        out, begin = self.code.memory(form.shape, kind_of(form.dtype)), 0
+        for part in parts:
+            self.write(out._replace(offset=str(begin)), part)
+            begin += part.size
+        return out
 
     def _operand(self, value: Value, shape: tuple[int, ...]) -> "Element | Value":
         """Return a value in this shape, or its element if all are the same."""

@@ -61,6 +61,14 @@ class Memory(NamedTuple):
         index = f"{self.offset} + {index}" if self.offset else f"{index}"
         return f"{self.name}[{index}]" if self.uniform else f"{self.name}[{index}][k]"
 
+    def part(self, begin: int, shape: tuple[int, ...]) -> "Memory":
+        """Return the elements from an index on, as an array that differs between simulations."""
+        formula = self.formula
+        if formula is not None:
+            return self._replace(shape=shape, formula=lambda i: formula(f"({i} + {begin})"))
+        offset = f"{self.offset} + {begin}" if self.offset else str(begin)
+        return self._replace(shape=shape, offset=offset)
+
     @property
     def size(self) -> int:
         """Number of elements."""

@@ -71,7 +71,9 @@ def plot_replay(
     inputs = {n: values for n, values in _input_signals(replay).items() if n not in curves}
     monitored = list(dict.fromkeys(s for f in formulas.values() for s in f.signals()))
     monitored = [signal for signal in monitored if signal in curves]
-    others = _telling([signal for signal in curves if signal not in monitored], curves, monitored)
+    others = telling_signals(
+        [signal for signal in curves if signal not in monitored], curves, monitored
+    )
     curves |= inputs
     ordered = [*monitored, *inputs, *others]
     if signals is not None:
@@ -151,7 +153,7 @@ def _input_signals(replay: Replay) -> dict[str, Float[np.ndarray, "time *k"]]:
     return {name: np.asarray(found[name]) for name in waveforms}
 
 
-def _telling(
+def telling_signals(
     names: Sequence[str],
     curves: Mapping[str, Shaped[np.ndarray, "t *vector"]],
     shown: Sequence[str],

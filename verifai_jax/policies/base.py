@@ -20,7 +20,8 @@ from jaxtyping import Array, Float, PyTree
 from verifai_jax.core.errors import check_names
 from verifai_jax.policies.errors import PolicyError
 from verifai_jax.policies.onnx_graph import Graph
-from verifai_jax.policies.writing import traced, write
+from verifai_jax.policies.tracing import traced
+from verifai_jax.policies.writing import write
 
 Compute = Callable[[PyTree, PyTree, PyTree], tuple[Any, PyTree]]
 """A pure function `(weights, observation, memory) -> (outputs, memory)`."""

@@ -7,6 +7,7 @@ fixed shapes. Source: the ONNX specification, `docs/IR.md` and `docs/Operators.m
 """
 
 import hashlib
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -21,7 +22,8 @@ from jaxtyping import Array, PyTree
 from verifai_jax.core.errors import check_names, require
 from verifai_jax.core.text import one_line
 from verifai_jax.policies.errors import MAX_BYTES, MAX_NUMBERS, PolicyError
-from verifai_jax.policies.onnx_operators import OPERATORS, Node, output_size
+from verifai_jax.policies.onnx_node import Node
+from verifai_jax.policies.onnx_operators import OPERATORS, output_size
 
 Values = dict[str, Any]
 
@@ -52,8 +54,16 @@ class Graph:
     @cached_property
     def digest(self) -> str:
         """Hash of all parts."""
-        parts = (self.nodes, sorted(self.constants.items()), list(self.inputs.items()))
-        text = repr(_hashable((*parts, self.memory, self.output)))
+        parts = [getattr(self, f.name) for f in fields(self)]
+        text = json.dumps(
+            parts,
+            sort_keys=True,
+            default=lambda part: (
+                vars(part)
+                if isinstance(part, Node)
+                else [part.dtype.str, part.shape, part.tobytes().hex()]
+            ),
+        )
         return hashlib.sha256(text.encode()).hexdigest()[:20]
 
     def __eq__(self, other: object) -> bool:
@@ -104,19 +114,6 @@ class Graph:
             outputs = outputs[0] if outputs.ndim > 1 and outputs.shape[0] == 1 else outputs
         after = tuple(values[name] for _, name in self.memory) or None
         return outputs, after
-
-
-def _hashable(value: object) -> object:
-    """Return a description of parts of a graph that is equal for equal content."""
-    if isinstance(value, np.ndarray | np.generic):
-        return np.asarray(value).dtype.str, np.shape(value), np.asarray(value).tobytes()
-    if isinstance(value, Node):
-        return tuple(_hashable(getattr(value, f.name)) for f in fields(value))
-    if isinstance(value, Mapping):
-        return tuple((name, _hashable(v)) for name, v in sorted(value.items()))
-    if isinstance(value, tuple | list):
-        return tuple(map(_hashable, value))
-    return value
 
 
 def run(nodes: Sequence[Node], values: Values) -> None:

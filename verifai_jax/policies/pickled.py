@@ -9,7 +9,7 @@ Source: Python's `pickletools`, which names and describes the operations.
 """
 
 import pickletools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -50,19 +50,91 @@ class Persistent:
 
 
 _MARK = object()
-_CONSTANTS = {
-    "NONE": lambda: None,
-    "NEWTRUE": lambda: True,
-    "NEWFALSE": lambda: False,
-    "EMPTY_DICT": dict,
-    "EMPTY_LIST": list,
-    "EMPTY_TUPLE": tuple,
-    "EMPTY_SET": list,
+
+
+class _Stack(list[Any]):
+    """The stack of a pickle's program, with what it remembers by number."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.memo: dict[int, Any] = {}
+
+    def take(self, count: int) -> list[Any]:
+        """Take the last values."""
+        taken = self[-count:]
+        del self[-count:]
+        return taken
+
+    def since_mark(self) -> list[Any]:
+        """Take all that was pushed since the last mark, and the mark."""
+        count = 1
+        while self[-count] is not _MARK:
+            count += 1
+        return self.take(count)[1:]
+
+    def remember(self, number: int) -> None:
+        self.memo[number] = self[-1]
+
+    def call(self, function: Any, arguments: Any) -> None:
+        # Old protocols write bytes as a call.
+        is_bytes = function == Name("_codecs", "encode")
+        self.append(arguments[0].encode("latin1") if is_bytes else Record(function, arguments))
+
+    def build(self) -> None:
+        state = self.pop()
+        if isinstance(self[-1], Record):
+            self[-1].state = state
+
+    def add(self, values: list[Any]) -> None:
+        """Append values to the list on top; an object is not asked to append anything."""
+        if isinstance(self[-1], list):
+            self[-1].extend(values)
+
+    def set(self, taken: list[Any]) -> None:
+        """Set items of the dictionary or object on top, keys and values in turn."""
+        items = self[-1].items if isinstance(self[-1], Record) else self[-1]
+        items.update(_pairs(taken))
+
+
+def _pairs(taken: list[Any]) -> Iterable[tuple[Any, Any]]:
+    return zip(taken[::2], taken[1::2], strict=True)
+
+
+def _named(function: Any, arguments: Any, named: Any) -> Record:
+    return Record(function, (*arguments, named))
+
+
+_OPERATIONS: dict[str, Callable[[_Stack, Any], object]] = {
+    **dict.fromkeys(("PROTO", "FRAME", "STOP"), lambda s, a: None),
+    **dict.fromkeys(("GET", "BINGET", "LONG_BINGET"), lambda s, a: s.append(s.memo[int(a)])),
+    **dict.fromkeys(("PUT", "BINPUT", "LONG_BINPUT"), lambda s, a: s.remember(int(a))),
+    **dict.fromkeys(("EMPTY_LIST", "EMPTY_SET"), lambda s, a: s.append([])),
+    **dict.fromkeys(("LIST", "FROZENSET"), lambda s, a: s.append(s.since_mark())),
+    **dict.fromkeys(("APPENDS", "ADDITEMS"), lambda s, a: s.add(s.since_mark())),
+    **dict.fromkeys(("REDUCE", "NEWOBJ"), lambda s, a: s.call(*s.take(2))),
+    "MEMOIZE": lambda s, a: s.remember(len(s.memo)),
+    "MARK": lambda s, a: s.append(_MARK),
+    "POP": lambda s, a: s.pop(),
+    "NONE": lambda s, a: s.append(None),
+    "NEWTRUE": lambda s, a: s.append(True),
+    "NEWFALSE": lambda s, a: s.append(False),
+    "EMPTY_DICT": lambda s, a: s.append({}),
+    "EMPTY_TUPLE": lambda s, a: s.append(()),
+    "TUPLE1": lambda s, a: s.append(tuple(s.take(1))),
+    "TUPLE2": lambda s, a: s.append(tuple(s.take(2))),
+    "TUPLE3": lambda s, a: s.append(tuple(s.take(3))),
+    "TUPLE": lambda s, a: s.append(tuple(s.since_mark())),
+    "DICT": lambda s, a: s.append(dict(_pairs(s.since_mark()))),
+    "APPEND": lambda s, a: s.add(s.take(1)),
+    "SETITEM": lambda s, a: s.set(s.take(2)),
+    "SETITEMS": lambda s, a: s.set(s.since_mark()),
+    "GLOBAL": lambda s, a: s.append(Name(*a.split(" ", 1))),
+    "STACK_GLOBAL": lambda s, a: s.append(Name(*s.take(2))),
+    "NEWOBJ_EX": lambda s, a: s.append(_named(*s.take(3))),
+    "BUILD": lambda s, a: s.build(),
+    "BINPERSID": lambda s, a: s.append(Persistent(s.pop())),
 }
-_IGNORED = {"PROTO", "FRAME", "STOP"}
-_GETS = {"GET", "BINGET", "LONG_BINGET"}
-_PUTS = {"PUT", "BINPUT", "LONG_BINPUT"}
-_TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
+"""What each operation does with the stack and its own argument; others push their argument."""
 
 
 def read_pickle(data: bytes, what: str) -> Any:
@@ -78,144 +150,20 @@ def read_pickle(data: bytes, what: str) -> Any:
 
     **Raises:** `PolicyError` for bytes that are no pickle.
     """
+    stack = _Stack()
     try:
-        return _Reader().run(data)
-    except PolicyError:
-        raise
+        for operation, argument, _ in pickletools.genops(data):
+            known = _OPERATIONS.get(operation.name)
+            if known is not None:
+                known(stack, argument)
+            elif argument is not None:
+                stack.append(argument)  # A number, a text or bytes.
+            else:
+                raise ValueError(f"the operation {operation.name} is not supported")
+        (result,) = stack
     except Exception as error:
         raise PolicyError(f"{what} is damaged: it holds no pickled data ({error})") from error
-
-
-class _Reader:
-    def __init__(self) -> None:
-        self.stack: list[Any] = []
-        self.memo: dict[int, Any] = {}
-
-    def run(self, data: bytes) -> Any:
-        for operation, argument, _ in pickletools.genops(data):
-            self.step(operation.name, argument)
-        (result,) = self.stack
-        return result
-
-    def since_mark(self) -> list[Any]:
-        """Take all that was pushed since the last mark."""
-        start = len(self.stack) - 1
-        while self.stack[start] is not _MARK:
-            start -= 1
-        taken = self.stack[start + 1 :]
-        del self.stack[start:]
-        return taken
-
-    def step(self, name: str, argument: Any) -> None:
-        stack, pop = self.stack, self.stack.pop
-        if name in _IGNORED:
-            return
-        if name in _CONSTANTS:
-            stack.append(_CONSTANTS[name]())
-        elif name in _GETS:
-            stack.append(self.memo[int(argument)])
-        elif name in _PUTS:
-            self.memo[int(argument)] = stack[-1]
-        elif name in _TUPLES:
-            count = _TUPLES[name]
-            taken = tuple(stack[-count:])
-            del stack[-count:]
-            stack.append(taken)
-        elif (method := _METHODS.get(name)) is not None:
-            method(self, argument)
-        elif name == "MARK":
-            stack.append(_MARK)
-        elif name == "POP":
-            pop()
-        elif argument is not None:
-            stack.append(argument)  # A number, a text or bytes.
-        else:
-            raise PolicyError(f"the pickled data has an operation {name}, which is not supported")
-
-    def memoize(self, _: object) -> None:
-        self.memo[len(self.memo)] = self.stack[-1]
-
-    def global_name(self, argument: str) -> None:
-        module, _, name = argument.partition(" ")
-        self.stack.append(Name(module, name))
-
-    def stack_global(self, _: object) -> None:
-        name, module = self.stack.pop(), self.stack.pop()
-        self.stack.append(Name(module, name))
-
-    def call(self, _: object) -> None:
-        arguments, function = self.stack.pop(), self.stack.pop()
-        # Old protocols write bytes as a call.
-        is_bytes = function == Name("_codecs", "encode")
-        self.stack.append(
-            arguments[0].encode("latin1") if is_bytes else Record(function, arguments)
-        )
-
-    def call_with_names(self, _: object) -> None:
-        named, arguments, function = self.stack.pop(), self.stack.pop(), self.stack.pop()
-        self.stack.append(Record(function, (*arguments, named)))
-
-    def build(self, _: object) -> None:
-        state = self.stack.pop()
-        if isinstance(self.stack[-1], Record):
-            self.stack[-1].state = state
-
-    def persistent(self, _: object) -> None:
-        self.stack.append(Persistent(self.stack.pop()))
-
-    def tuple_since(self, _: object) -> None:
-        self.stack.append(tuple(self.since_mark()))
-
-    def list_since(self, _: object) -> None:
-        self.stack.append(self.since_mark())
-
-    def dict_since(self, _: object) -> None:
-        taken = self.since_mark()
-        self.stack.append(dict(zip(taken[::2], taken[1::2], strict=True)))
-
-    def append(self, _: object) -> None:
-        value = self.stack.pop()
-        self.extend([value])
-
-    def appends(self, _: object) -> None:
-        self.extend(self.since_mark())
-
-    def extend(self, values: list[Any]) -> None:
-        if isinstance(self.stack[-1], list):
-            self.stack[-1].extend(values)
-
-    def set_item(self, _: object) -> None:
-        value, key = self.stack.pop(), self.stack.pop()
-        self.set_all([key, value])
-
-    def set_items(self, _: object) -> None:
-        self.set_all(self.since_mark())
-
-    def set_all(self, taken: list[Any]) -> None:
-        target = self.stack[-1]
-        items = target.items if isinstance(target, Record) else target
-        items.update(zip(taken[::2], taken[1::2], strict=True))
-
-
-_METHODS: dict[str, Callable[[_Reader, Any], None]] = {
-    "MEMOIZE": _Reader.memoize,
-    "GLOBAL": _Reader.global_name,
-    "STACK_GLOBAL": _Reader.stack_global,
-    "REDUCE": _Reader.call,
-    "NEWOBJ": _Reader.call,
-    "NEWOBJ_EX": _Reader.call_with_names,
-    "BUILD": _Reader.build,
-    "BINPERSID": _Reader.persistent,
-    "TUPLE": _Reader.tuple_since,
-    "LIST": _Reader.list_since,
-    "FROZENSET": _Reader.list_since,
-    "DICT": _Reader.dict_since,
-    "APPEND": _Reader.append,
-    "APPENDS": _Reader.appends,
-    "ADDITEMS": _Reader.appends,
-    "SETITEM": _Reader.set_item,
-    "SETITEMS": _Reader.set_items,
-}
+    return result
 
 
 def array_of(record: object) -> np.ndarray | None:

@@ -23,7 +23,9 @@ from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook, text_html
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import ProgramCache, Slot
-from verifai_jax.core.sources import Maker, Sources, made_here, sources_of
+from verifai_jax.core.source_collection import made_here, sources_of
+from verifai_jax.core.sources import Maker, Sources
+from verifai_jax.core.text import is_control, printable
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.user_errors import (
     check_called_with,
@@ -117,7 +119,9 @@ class Problem(InNotebook):
     ) -> None:
         if not isinstance(name, str) or not name.strip():
             raise ProblemError(f"a problem needs a name; got {name!r}")
-        check_name("the name of a problem", name, error=ProblemError)
+        check_name("the name of a problem", name, lines=True, error=ProblemError)
+        # It is for people, and no part of the model refers to it.
+        name = "".join("_" if is_control(character) else character for character in name)
         if isinstance(space, Mapping):
             space = FeatureSpace(space)
         if not isinstance(space, FeatureSpace):
@@ -140,7 +144,7 @@ class Problem(InNotebook):
             "system": as_system(system),
             "spec": spec,
             "nominal": nominal,
-            "description": description,
+            "description": printable(str(description)),
             "end": end,
             "draw": draw,
             "priority": priority,
@@ -219,6 +223,24 @@ class Problem(InNotebook):
         fixed = {**(self.nominal or {}), **(nominal or {})}
         own = None if self.nominal is None else fixed
         return replace(self, space=self.space.only(*features, nominal=fixed), nominal=own)
+
+    def with_faults(self, *faults: object, by_simulator: bool = False) -> "Problem":
+        """Return the same problem with faults of its sensors and actuators among its features.
+
+        **Arguments:**
+
+        - `faults`: of `vj.faults`, in the order in which those of one channel apply. What varies of
+          each is a feature under its name, whose nominal value is the weakest, shortest and latest
+          fault.
+        - `by_simulator`: whether the simulator applies them itself, as `vj.faults.on_host` helps
+          it to; for `remote`, and for a `blackbox` of one's own.
+
+        **Raises:** `UnknownNameError` for a channel that the system does not have, with the nearest
+        one; `ValueError` for a name that exists already, a fault that a channel cannot have, and
+        for a system without a loop that is known.
+        """
+        function = lazy_import("verifai_jax.faults.injection", "with_faults")
+        return function(self, faults, by_simulator)
 
     def objective(
         self,

@@ -196,7 +196,7 @@ def _difference(one: Jaxpr, other: Jaxpr) -> tuple[bool, str | None]:
     for a, b in zip(one.eqns, other.eqns, strict=False):
         if a.primitive is not b.primitive or not _same_operands(a, b):
             return True, _line(a)
-        inner = list(zip(_programs(a.params), _programs(b.params), strict=False))
+        inner = list(zip(programs_read(a.params), programs_read(b.params), strict=False))
         for first, second in inner:
             differs, line = difference(first, second)
             if differs:
@@ -218,7 +218,7 @@ def _same_operands(one: JaxprEqn, other: JaxprEqn) -> bool:
     return True
 
 
-def _programs(parameters: dict[str, Any]) -> Iterator[Program]:
+def programs_read(parameters: dict[str, Any]) -> Iterator[Program]:
     """Yield the programs inside an operation, such as the body of a loop."""
     for value in parameters.values():
         for part in value if isinstance(value, tuple | list) else (value,):

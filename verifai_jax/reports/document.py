@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from verifai_jax.comparison.result import Comparison
+from verifai_jax.comparison.result import Comparison, Transfer
 from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names
@@ -17,13 +17,16 @@ from verifai_jax.core.progress import shows_progress
 from verifai_jax.estimation.result import Estimate
 from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
+from verifai_jax.mtl import Judgement
 from verifai_jax.problem.problem import Problem
 from verifai_jax.reports.comparison_report import comparison_page
 from verifai_jax.reports.estimate_report import estimate_page
+from verifai_jax.reports.judgement_report import judgement_page
 from verifai_jax.reports.page import render
 from verifai_jax.reports.run_question import About
 from verifai_jax.reports.run_report import run_page
 from verifai_jax.reports.sweep_report import sweep_page
+from verifai_jax.reports.transfer_report import transfer_page
 from verifai_jax.sweeps.result import Sweep
 
 
@@ -44,8 +47,8 @@ def write_report(
 
     **Arguments:**
 
-    - `result`: a run, a sweep, an estimate or a comparison. The failures of a run that has its
-      problem are simulated again.
+    - `result`: a run, a sweep, an estimate, a comparison, a transfer or a judgement. The failures
+      of a run that has its problem are simulated again.
     - `path`: of the HTML file; the claims go to the same name with the ending `.claims.json`.
     - `units`: of features, by name.
     - `reasons`: why a feature has the range that it has, by name.
@@ -87,10 +90,17 @@ def write_report(
         case Comparison():
             _check(about, result.candidates[0].space, ())
             page = comparison_page(result, about, problem)
+        case Transfer():
+            _check(about, result.space, ())
+            page = transfer_page(result, about)
+        case Judgement():
+            _check(about, None, ())
+            page = judgement_page(result)
         case _:
             kind = type(result).__name__
             raise TypeError(
-                f"a report is on a run, a sweep, an estimate or a comparison; got {kind}"
+                "a report is on a run, a sweep, an estimate, a comparison, a transfer or a "
+                f"judgement; got {kind}"
             )
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as partial:

@@ -19,7 +19,7 @@ from verifai_jax.statistics.paired_rates import PairedRates
 
 NOT_FINITE = ("effective", "relative_error")
 """Numbers of an estimate that JSON has as null where they are not finite."""
-OPTIONAL = ("probability", "method", "p0", "backend")
+OPTIONAL = ("probability", "method", "p0", "backend", "stopped")
 """Entries of an estimate that may be null."""
 
 

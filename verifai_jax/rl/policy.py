@@ -27,7 +27,7 @@ from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.checks import check_count, is_number
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.sources import made_here, sources_of
+from verifai_jax.core.source_collection import made_here, sources_of
 from verifai_jax.core.text import one_line
 from verifai_jax.rl.task.task import Action, Continuous, Discrete
 

@@ -229,7 +229,7 @@ def _collect(
     pqn: PQN, task: Task, state: PQNState, key: Key[Array, ""]
 ) -> tuple[Episodes, Int[Array, " environments"], Experience]:
     choice_key, action_key, step_key = jax.random.split(key, 3)
-    keep, start = _exploration_chances(pqn, state.done, state.updates)
+    keep, start = exploration_chances(pqn, state.done, state.updates)
     # All random numbers of the update at once: in the loop each draw would cost a pass of its own.
     chances = jax.random.uniform(choice_key, (pqn.horizon, pqn.environments))
     options = jax.random.randint(
@@ -245,7 +245,7 @@ def _collect(
         observation = jax.vmap(task.observe)(episodes.state)
         normalised = normalise(state.statistics, observation, pqn.normalise)
         greedy = jnp.argmax(network(state.layers, normalised, pqn.activation), axis=-1)
-        held = _next_held(held, chance, option, keep, start)
+        held = next_held(held, chance, option, keep, start)
         action = jnp.where(held >= 0, held, greedy.astype(jnp.int32))
         episodes, transition = advance(task, episodes, action, key)
         held = jnp.where(transition.over, -1, held)
@@ -257,7 +257,7 @@ def _collect(
     return episodes, held, experience
 
 
-def _exploration_chances(
+def exploration_chances(
     pqn: PQN, done: int | Int[Array, ""], updates: int | Int[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the chances to go on holding a random action, and to begin with one.
@@ -271,13 +271,14 @@ def _exploration_chances(
     return jnp.asarray(keep), epsilon * (1.0 - keep) / jnp.maximum(1.0 - epsilon * keep, 1e-6)
 
 
-def _next_held(
+def next_held(
     held: Int[Array, " environments"],
     chance: Float[Array, " environments"],
     option: Int[Array, " environments"],
     keep: Float[Array, ""],
     start: Float[Array, ""],
 ) -> Int[Array, " environments"]:
+    """Return the random action that each environment holds in the next step; -1 for none."""
     goes_on = (held >= 0) & (chance < keep)
     # Given that the action is not held on, `chance` is uniform on [keep, 1).
     again = jnp.where(held >= 0, (chance - keep) / jnp.maximum(1.0 - keep, 1e-6), chance)

@@ -165,7 +165,7 @@ class SAC:
             ],
         ) -> tuple["SACState", tuple[Transition, Float[Array, "environments k"]]]:
             number, (noise, step_key, learn_key) = numbered
-            carry, transition, observation = _act(self, task, carry, noise, step_key)
+            carry, transition, observation = act(self, task, carry, noise, step_key)
             taken = (state.done * self.horizon + number + 1) * self.environments
             carry = jax.lax.cond(
                 taken >= self.warmup,
@@ -256,7 +256,7 @@ def squash_log_prob(
     return jnp.sum(normal - log_derivative, axis=-1)
 
 
-def _act(
+def act(
     sac: SAC,
     task: Task,
     state: SACState,
@@ -303,7 +303,7 @@ def _learn(sac: SAC, state: SACState, rate: Float[Array, ""], key: Key[Array, ""
             next_observation=normalise(state.statistics, batch.next_observation, sac.normalise),
         )
         noise = jax.random.normal(noise_key, (2, sac.batch, actions))
-        gradient = jax.grad(_loss)(weights, sac, slow, batch, noise)
+        gradient = jax.grad(total_loss)(weights, sac, slow, batch, noise)
         direction, moments = optimizer.update(gradient, moments)
         weights = jax.tree.map(lambda w, d: w - rate * d, weights, direction)
         slow = jax.tree.map(lambda s, f: s + sac.target_rate * (f - s), slow, weights.critics)
@@ -315,7 +315,7 @@ def _learn(sac: SAC, state: SACState, rate: Float[Array, ""], key: Key[Array, ""
     return state._replace(weights=weights, slow=slow, moments=moments)
 
 
-def _loss(
+def total_loss(
     weights: Weights,
     sac: SAC,
     slow: Layers,

@@ -34,6 +34,7 @@ def scenic(
     params: Mapping[str, Any] | None = None,
     model: str | None = None,
     scenario: str | None = None,
+    features: Mapping[str, Domain] | None = None,
 ) -> ScenicProgram:
     """Compile a Scenic program to a feature space and a function of JAX.
 
@@ -55,13 +56,21 @@ def scenic(
     - `params`: global parameters to override.
     - `model`: Scenic module to use as world model.
     - `scenario`: name of the modular scenario to compile, where there are several.
+    - `features`: domains by name, in addition to what the program draws. It reads their values as
+      global parameters while it runs: with `{"push": vj.Reactive({"gap": (0, 50)})}` a behavior
+      asks `globalParameters.push(gap=...)` at each step, and a search learns how to answer.
 
     **Raises:** `MissingExtra` without Scenic; `ProgramError` for a program that does not compile,
-    with Scenic's message, file and line, and for one that draws nothing at random.
+    with Scenic's message, file and line, and for one that draws nothing at random; `ValueError`
+    for a feature whose name the program has taken.
     """
     recipe = Recipe.of(program, mode2D, params or {}, model, scenario)
     compiled, sampling = recipe.compiled()
-    if not sampling.domains:
+    features = features or {}
+    taken = sorted({*features} & {*sampling.domains, *compiled.scenario.params})
+    if taken:
+        raise ValueError(f"the program has a value {taken[0]!r} already: give another name")
+    if not sampling.domains and not features:
         raise ProgramError(
             f"{compiled.filename} draws nothing at random, and nothing happens over time in it (no "
             "behaviour, compose block, monitor, record, end or simulator), so it has one scene and "
@@ -72,6 +81,7 @@ def scenic(
     domains = dict(sampling.domains)
     if sampling.soft:
         domains.update(_soft_domains(domains, constraint, sampling))
+    domains.update(features)
     constrained = bool(constraint.compiled or constraint.by_scenic or constraint.draws)
     return ScenicProgram(
         space=FeatureSpace(domains, constraint if constrained else None),

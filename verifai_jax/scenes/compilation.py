@@ -78,6 +78,7 @@ def compile_program(
     hook = sys.excepthook
     require("scenic", "scenic")
     translator: Any = require("scenic.syntax.translator", "scenic")
+    _with_time_series(require("scenic.syntax.veneer", "scenic"))
     sys.excepthook = hook  # Scenic's own would show every error of the user's program differently.
     path = _path_of(program)
     source = str(program) if path is None else path.read_text()
@@ -101,6 +102,24 @@ def compile_program(
     except Exception as error:
         raise ProgramError(_message(error, filename, source)) from error
     return Compiled(compiled, namespace, source, filename)
+
+
+def _with_time_series(veneer: Any) -> None:
+    """Let programs say `TimeSeries(...)`, which Scenic has from 3.2 on."""
+    if not hasattr(veneer, "TimeSeries"):
+        veneer.TimeSeries = _time_series
+        veneer.__all__ = (*veneer.__all__, "TimeSeries")
+
+
+def _time_series(parameter: Any) -> Any:
+    """Mark a parameter as one with a value at each step of a simulation.
+
+    **Raises:** `TypeError` for something else than a `VerifaiRange` or `VerifaiDiscreteRange`.
+    """
+    if not isinstance(parameter, sys.modules["scenic.core.external_params"].ExternalParameter):
+        raise TypeError(f"TimeSeries takes a VerifaiRange; got {type(parameter).__name__}")
+    parameter.isTimeSeries = True
+    return parameter
 
 
 def _path_of(program: str | Path) -> Path | None:

@@ -10,6 +10,7 @@ Every formula is written once, and computes in NumPy for Scenic and in JAX for c
 
 import abc
 import math
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -50,6 +51,7 @@ class Leaf(abc.ABC):
     domains: Mapping[str, Domain]
 
     is_point = False
+    is_series = False
 
     @abc.abstractmethod
     def draw(self, parts: Parts, given: Given, xp: Any) -> Any:
@@ -140,6 +142,54 @@ class Histogram(Leaf):
     def invert(self, value: Any, given: Given) -> dict[str, Any]:
         cumulative, edges = self._edges()
         return {self.feature: float(np.interp(value, edges, cumulative))}
+
+
+@dataclass(frozen=True, eq=False)
+class Series(Leaf):
+    """A value of each step, `TimeSeries(VerifaiRange(0, 1))`: an array of what one draw takes.
+
+    - `one`: the leaf of one step.
+    """
+
+    one: Leaf
+
+    is_series = True
+
+    def draw(self, parts: Parts, given: Given, xp: Any) -> Any:
+        length = len(parts[self.feature])
+        steps = [
+            self.one.draw({name: part[i] for name, part in parts.items()}, given, xp)
+            for i in range(length)
+        ]
+        return SeriesValue(tuple(steps)) if xp is np else jnp.stack(steps)
+
+    def invert(self, value: Any, given: Given) -> dict[str, Any]:
+        steps = [self.one.invert(step, given) for step in value.steps]
+        return {name: np.array([step[name] for step in steps]) for name in self.domains}
+
+
+@dataclass(frozen=True)
+class SeriesValue:
+    """The value of a `TimeSeries` in a program: `getSample()` returns that of this step."""
+
+    steps: tuple[Any, ...]
+
+    def getSample(self) -> Any:
+        """Return the value of the simulation's current step.
+
+        **Raises:** `RuntimeError` outside a simulation, and beyond the last step.
+        """
+        simulation = sys.modules["scenic.syntax.veneer"].currentSimulation
+        if simulation is None:
+            raise RuntimeError(
+                "a TimeSeries has values in a simulation only: call it in a behavior"
+            )
+        if simulation.currentTime >= len(self.steps):
+            raise RuntimeError(
+                f"a TimeSeries of {len(self.steps)} values is asked at step "
+                f"{simulation.currentTime}: make `param timeBound` the number of steps"
+            )
+        return self.steps[simulation.currentTime]
 
 
 @dataclass(frozen=True, eq=False)

@@ -147,19 +147,28 @@ class Outputs:
             column = jax.pure_callback(computed, answer, asked, vmap_method="broadcast_all")
             for i, (owner, name, _) in enumerate(self._python):
                 found[owner, name] = column[..., i]
-        return {
+        scene = {
             owner: {name: found[owner, name] for name in names}
             for owner, names in self.objects.items()
         }
+        given = {n: value for n, value in features.items() if n not in self.sampling.domains}
+        if given:
+            scene["params"] = {**scene.get("params", {}), **given}
+        return scene
 
     def _computed(self, features: Mapping[str, Any], dtype: Any) -> np.ndarray:
         """Let Scenic compute what JAX does not; NaN where Scenic refuses the scene."""
         features = {name: np.asarray(column) for name, column in features.items()}
-        batch = next(iter(features.values())).shape
+        series = {
+            n for leaf in self.sampling.leaves.values() if leaf.is_series for n in leaf.domains
+        }
+        first = next(iter(features))
+        batch = features[first].shape[: -1 if first in series else None]
         rows = np.full((int(np.prod(batch)), len(self._python)), np.nan, dtype)
         for row, numbers in enumerate(rows):
             here = {
-                name: column.reshape(len(rows), -1)[row, 0] for name, column in features.items()
+                name: column.reshape(len(rows), -1)[row, ... if name in series else 0]
+                for name, column in features.items()
             }
             with LOCK:
                 try:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.core.lazy import lazy_import
@@ -101,6 +102,11 @@ class ScenicProgram:
             raise ValueError(f"system needs a function (scene, key) -> Trace; got {function!r}")
         return SceneSystem(self._outputs, function)
 
+    @property
+    def given(self) -> tuple[str, ...]:
+        """Names of the features that the program does not draw, but reads."""
+        return tuple(name for name in self.space.domains if name not in self._sampling.domains)
+
     def blackbox(
         self, function: Callable[..., Trace], *, seeded: bool = False, **options: Any
     ) -> HostSystem:
@@ -167,7 +173,7 @@ class ScenicProgram:
         refusal = self._sampling.refusal(values, here)
         if refusal is not None:
             raise ValueError(f"Scenic refuses this scene: {refusal}")
-        return self._sampling.scene(values)
+        return self._sampling.scene(values, here)
 
     def of(self, run: Any, row: "int | pd.Series") -> Any:
         """Return Scenic's `Scene` of a row of a run's table.
@@ -191,7 +197,12 @@ class ScenicProgram:
 
         **Raises:** `ValueError` for a scene of another program or compilation.
         """
-        return self._sampling.features_of(scene)
+        features = self._sampling.features_of(scene)
+        for name in self.given:
+            domain = self.space[name]
+            middle = domain.from_unit(jnp.full(domain.size, 0.5))
+            features[name] = scene.params.get(name, middle)
+        return features
 
     def refusal(self, features: Mapping[str, Any]) -> str | None:
         """Return why Scenic's own checker refuses a scene; None if it accepts it."""

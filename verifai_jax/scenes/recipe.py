@@ -43,7 +43,7 @@ class Recipe:
 
     def compiled(self) -> tuple[Compiled, Sampling]:
         """Return the program as this process has compiled it, once."""
-        return _compiled(_Key(self))
+        return compiled_recipe(_Key(self))
 
 
 class _Key:
@@ -61,7 +61,8 @@ class _Key:
 
 
 @functools.lru_cache(maxsize=8)
-def _compiled(key: _Key) -> tuple[Compiled, Sampling]:
+def compiled_recipe(key: _Key) -> tuple[Compiled, Sampling]:
+    """Compile the program of a recipe; the last ones are kept."""
     recipe = key.recipe
     compiled = compile_program(
         recipe.program, recipe.planar, dict(recipe.params), recipe.model, recipe.scenario

@@ -15,17 +15,24 @@ import random
 import sys
 import threading
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from verifai_jax.features import Box, Categorical
+from verifai_jax.features import Array, Box, Categorical
 from verifai_jax.features.domain import Domain
-from verifai_jax.scenes.compilation import Compiled
+from verifai_jax.scenes.compilation import Compiled, ProgramError
 from verifai_jax.scenes.graph import field, is_constructed, is_random, kind_of, law, nodes
 from verifai_jax.scenes.leaf_reading import leaf_of
-from verifai_jax.scenes.leaves import Leaf, NothingToDrawError, OnPolyline
+from verifai_jax.scenes.leaves import (
+    Leaf,
+    NothingToDrawError,
+    OnPolyline,
+    Series,
+    SeriesValue,
+)
 from verifai_jax.scenes.naming import leaf_names, owner_names, unique
 
 SEED = "seed"
@@ -114,11 +121,26 @@ class Sampling:
                 taken = {known.name for known in self.leaves.values()}
                 leaf = leaf_of(node, unique(name, taken | {SEED}), options.get(id(node)))
                 assert leaf is not None
+                if field(drawn, "isTimeSeries"):
+                    leaf = self._series(leaf)
                 self.leaves[id(node)] = leaf
                 self.domains.update(leaf.domains)
             elif _draws(drawn):
                 self.seeded[id(node)] = f"{name} ({kind_of(drawn)})"
                 self._external |= kind_of(drawn) not in COMPUTED and hasattr(type(drawn), "sampler")
+
+    def _series(self, leaf: Leaf) -> Leaf:
+        """Return the leaf of a value at each step.
+
+        **Raises:** `ProgramError` where the program does not say how many steps there are.
+        """
+        bound = self.scenario.params.get("timeBound")
+        if isinstance(bound, bool) or not isinstance(bound, int) or bound < 1:
+            raise ProgramError(
+                f"the TimeSeries {leaf.name} needs a number of steps: write `param timeBound = 50`"
+            )
+        domains = {name: Array(domain, bound) for name, domain in leaf.domains.items()}
+        return Series(leaf.node, leaf.name, domains, leaf)
 
     def _soft(self) -> dict[str, Any]:
         soft: dict[str, Any] = {}
@@ -162,7 +184,7 @@ class Sampling:
         parts = {name: _plain(features[name]) for name in leaf.domains}
         value = leaf.draw(parts, given, np)
         if not leaf.is_point:
-            return value if isinstance(value, int) else float(value)
+            return value if isinstance(value, int | SeriesValue) else float(value)
         vectors = sys.modules["scenic.core.vectors"]
         region = given(field(law(leaf.node), "region"))
         x, y = float(value[0]), float(value[1])
@@ -185,10 +207,16 @@ class Sampling:
         for name, requirement in self.soft.items():
             requirement.active = bool(_plain(features[name]))
 
-    def scene(self, values: Any) -> Any:
-        """Return Scenic's `Scene` of these values."""
+    def scene(self, values: Any, features: Mapping[str, Any] = MappingProxyType({})) -> Any:
+        """Return Scenic's `Scene` of these values, with features that the program does not draw.
+
+        Those become global parameters.
+        """
         with LOCK:
-            return self.scenario._makeSceneFromSample(values)
+            scene = self.scenario._makeSceneFromSample(values)
+        given = {name: _plain(v) for name, v in features.items() if name not in self.domains}
+        scene.params = {**scene.params, **given}
+        return scene
 
     def check_own(self, scene: Any) -> None:
         """Refuse a scene that does not come from this compilation of the program.
@@ -281,7 +309,8 @@ def _mutates(node: Any) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    return np.asarray(value).item() if np.ndim(value) == 0 else value
+    is_number = isinstance(value, np.ndarray | np.generic) and np.ndim(value) == 0
+    return value.item() if is_number else value
 
 
 def digest(*texts: str) -> int:

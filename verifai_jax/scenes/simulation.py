@@ -38,7 +38,7 @@ class OnScenes:
 
     def __call__(self, features: Mapping[str, Any], seed: int) -> Trace:
         _, sampling = self.recipe.compiled()
-        scene = sampling.scene(sampling.values(features))
+        scene = sampling.scene(sampling.values(features), features)
         return self.function(scene, seed) if self.seeded else self.function(scene)
 
 
@@ -68,7 +68,7 @@ class ScenicSimulation:
         """
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
         _, sampling = self.recipe.compiled()
-        scene = sampling.scene(sampling.values(features))
+        scene = sampling.scene(sampling.values(features), features)
         if SEED in features:
             seed = digest(str(seed), f"{float(features[SEED]):z.9g}")
         with LOCK:

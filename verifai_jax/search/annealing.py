@@ -145,7 +145,7 @@ class Annealing(Search[AnnealingState]):
         drawn = cell[:, index] * jnp.where(certain[:, few], either, 1.0)
         sideways = jnp.where(direction[:, index] < 0.5, width, -width)
         step = step.at[:, few].set(jnp.where((drawn > RESAMPLED) & (drawn < either), sideways, 0.0))
-        u = _reflect(own + step)
+        u = reflect(own + step)
         u = u.at[:, few].set(jnp.where(drawn < RESAMPLED, prior[:, few], u[:, few]))
 
         anywhere = jnp.isinf(state.energy[turn]) | (self._coldness(chains) == 0)[turn]
@@ -159,7 +159,7 @@ class Annealing(Search[AnnealingState]):
         before = state.energy[turn]
         spread = self._spread(state, turn, new)
         coldness = self._coldness(chains) / jnp.where(spread > 0, spread, 1.0)
-        sweeps = len(_matchings(chains))
+        sweeps = len(partners_of(chains))
         key = jax.random.fold_in(jax.random.fold_in(state.key, state.tells), 1)
         chance = jnp.log(draw_uniform(key, (batch + sweeps * chains,)))
 
@@ -179,7 +179,7 @@ class Annealing(Search[AnnealingState]):
             spread=spread,
         )
         state = self._start_at_best(state, batch)
-        index = _exchange(state.energy, coldness, chance[batch:].reshape(-1, chains))
+        index = exchange(state.energy, coldness, chance[batch:].reshape(-1, chains))
         return state._replace(
             u=state.u[index], energy=state.energy[index], rests=state.rests[index]
         )
@@ -190,7 +190,7 @@ class Annealing(Search[AnnealingState]):
         """Put the chains at the best points, the best at the coldest."""
         new = observations.score
         u, energy = keep_best(observations.u, new, state.u, state.energy)
-        spread = jnp.where(state.spread == 0, _best_to_median(new), state.spread)
+        spread = jnp.where(state.spread == 0, best_to_median(new), state.spread)
         return state._replace(u=u, energy=energy, spread=spread)
 
     def _start_at_best(self, state: AnnealingState, batch: int) -> AnnealingState:
@@ -225,23 +225,23 @@ class Annealing(Search[AnnealingState]):
         energy = state.energy
         met = jnp.where(jnp.isinf(energy), energy.at[turn].set(new), energy)
         first = jnp.any(jnp.isinf(energy)) & (state.tells * len(turn) < len(energy))
-        return jnp.where(first | (state.spread == 0), _best_to_median(met), state.spread)
+        return jnp.where(first | (state.spread == 0), best_to_median(met), state.spread)
 
 
-def _best_to_median(energy: Float[Array, " n"]) -> Float[Array, ""]:
+def best_to_median(energy: Float[Array, " n"]) -> Float[Array, ""]:
     """Return the spread of the finite entries, which a few large ones do not change."""
     known = jnp.sum(jnp.isfinite(energy))
     ranked = jnp.sort(energy)
     return jnp.where(known > 0, ranked[jnp.maximum(known - 1, 0) // 2] - ranked[0], 0.0)
 
 
-def _reflect(u: Float[Array, "n d"]) -> Float[Array, "n d"]:
+def reflect(u: Float[Array, "n d"]) -> Float[Array, "n d"]:
     """Reflect points into the cube, back and forth between its sides."""
     folded = jnp.abs(u - 2 * jnp.round(u / 2))
     return jnp.clip(folded, 0.0, 1.0)
 
 
-def _matchings(chains: int) -> Int[np.ndarray, "matchings chains"]:
+def partners_of(chains: int) -> Int[np.ndarray, "matchings chains"]:
     """Return partners for exchanges; distances halve, so that a point can get anywhere at once."""
     index = np.arange(chains, dtype=np.int32)
     matchings = []
@@ -253,7 +253,7 @@ def _matchings(chains: int) -> Int[np.ndarray, "matchings chains"]:
     return np.stack(matchings)
 
 
-def _exchange(
+def exchange(
     energy: Float[Array, " chains"],
     coldness: Float[Array, " chains"],
     chance: Float[Array, "matchings chains"],
@@ -272,5 +272,5 @@ def _exchange(
         return (energy[taken], source[taken]), None
 
     start = jnp.minimum(energy, np.float32(1e30)), index
-    (_, source), _ = jax.lax.scan(exchange, start, (jnp.asarray(_matchings(len(energy))), chance))
+    (_, source), _ = jax.lax.scan(exchange, start, (jnp.asarray(partners_of(len(energy))), chance))
     return source

@@ -100,7 +100,7 @@ class Bandit(Search[BanditState]):
         reward = self._rewards(state.score)
         u = jnp.zeros((batch, cube.dim), jnp.float32)
         for indices, edges, branching in self._bandits(cube):
-            part = _draw(
+            part = draw_cells(
                 self._density(state, reward, indices, edges, branching, batch),
                 edges,
                 even[:, indices],
@@ -180,13 +180,13 @@ class Bandit(Search[BanditState]):
             means = (node[..., 1] + mean[..., None]) / count
             budget = jnp.maximum(batch * share, 1.0)
             bonus = self.optimism**2 * jnp.log(1 + total + budget)
-            split = _fill(means, count, exists, budget[..., None], bonus[..., None])
+            split = fill_cells(means, count, exists, budget[..., None], bonus[..., None])
             share = (share[..., None] * split).reshape(d, -1)
             total, mean = node[..., 0].reshape(d, -1), means.reshape(d, -1)
         return share
 
 
-def _fill(
+def fill_cells(
     mean: Float[Array, "*nodes arms"],
     count: Float[Array, "*nodes arms"],
     exists: Bool[np.ndarray, "*nodes arms"],
@@ -217,7 +217,7 @@ def _fill(
     return filled / jnp.where(total > 0, total, 1.0)
 
 
-def _draw(
+def draw_cells(
     density: Float[Array, "d leaves"],
     edges: Float[np.ndarray, "d leaves+1"],
     even: Float[Array, "n d"],

@@ -148,7 +148,7 @@ class TuRBO(Search[TuRBOState]):
         drawing, placing = jax.random.split(key)
         posterior = process.condition(state.hyper, training_data(state.u, state.score, cube))
         best = state.u[jnp.argmin(state.score)]
-        low, high = _box(state, cube, best)
+        low, high = trust_box(state, cube, best)
         count = max(self.candidates, 2 * batch)
         random = draw_uniform(placing, (count, 2 * d))
         pick, position = random[:, :d], random[:, d:]
@@ -223,7 +223,7 @@ class TuRBO(Search[TuRBOState]):
         return process_of(cube).fit(state.hyper, data, FIT_STEPS)
 
 
-def _box(
+def trust_box(
     state: TuRBOState, cube: Cube, best: Float[Array, " d"]
 ) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
     """Return the lowest and the highest corner of the trust region.

@@ -156,6 +156,19 @@ class Cache:
             kinds[kind] = (reused + (name not in self._own), used + 1)
         return kinds
 
+    def entries(self, prefix: str) -> Iterator[dict[str, np.ndarray]]:
+        """Yield the arrays of the finished computations whose names begin like this."""
+        for name in self._log.names():
+            if name.startswith(prefix) and (arrays := self._log.get(name)) is not None:
+                yield arrays
+
+    def clear(self) -> None:
+        """Forget everything but what the cache is of."""
+        about = self._log.get_json(f"{_NOTE}{_ABOUT}")
+        self._log.clear()
+        if about is not None:
+            self.note(_ABOUT, about)
+
     def names(self) -> list[str]:
         """Return the names of all finished computations, sorted."""
         return sorted(name for name in self._log.names() if not name.startswith(_NOTE))

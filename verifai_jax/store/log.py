@@ -33,7 +33,7 @@ Arrays: TypeAlias = Mapping[str, np.ndarray]
 
 MARK = b"VJX1"
 """First bytes of each frame."""
-_HEADER = struct.Struct("<4sIQI")
+HEADER = struct.Struct("<4sIQI")
 """Mark, length of the names, length of the bytes, checksum of both."""
 _PLAIN = re.compile(r"[<>|=]?[biufU]\d{1,9}")
 """NumPy's types of the arrays that can be stored: of numbers and texts."""
@@ -172,12 +172,12 @@ def write_log(path: Path, entries: Mapping[str, Arrays]) -> None:
 def _find_frames(file: IO[bytes]) -> Iterator[dict[str, _Extent] | None]:
     """Yield the entries of each frame of a file; None where there is damage."""
     end, at = file.seek(0, os.SEEK_END), file.seek(0)
-    while header := file.read(_HEADER.size):
+    while header := file.read(HEADER.size):
         with contextlib.suppress(struct.error, ValueError):
-            _, head, body, _ = _HEADER.unpack(header)
+            _, head, body, _ = HEADER.unpack(header)
             # Damaged lengths are larger than any memory.
             yield _extents(header + file.read(min(head + body, end - at)), at)
-            at += _HEADER.size + head + body
+            at += HEADER.size + head + body
             continue
         yield None
         file.seek(at + 1)
@@ -191,18 +191,18 @@ def _extents(frame: bytes, begin: int) -> dict[str, _Extent]:
 
     **Raises:** `ValueError` for anything that is not a frame, or has changed.
     """
-    mark, head, body, own = _HEADER.unpack_from(frame)
+    mark, head, body, own = HEADER.unpack_from(frame)
     if (
         mark != MARK
-        or len(frame) != _HEADER.size + head + body
-        or own != _checksum(frame[: _HEADER.size], frame[_HEADER.size :])
+        or len(frame) != HEADER.size + head + body
+        or own != _checksum(frame[: HEADER.size], frame[HEADER.size :])
     ):
         raise ValueError("no frame")
     extents: dict[str, _Extent] = {}
-    at = begin + _HEADER.size + head
+    at = begin + HEADER.size + head
     # A checksum is no proof of who wrote it: another program's entries are none.
     with contextlib.suppress(ValueError, TypeError, RecursionError):
-        for name, size, arrays in json.loads(frame[_HEADER.size : _HEADER.size + head]):
+        for name, size, arrays in json.loads(frame[HEADER.size : HEADER.size + head]):
             if not 0 <= size <= begin + len(frame) - at:
                 break
             extents[str(name)] = at, int(size), list(arrays)
@@ -211,7 +211,7 @@ def _extents(frame: bytes, begin: int) -> dict[str, _Extent]:
 
 
 def _checksum(header: bytes, content: bytes) -> int:
-    return checksum(content, checksum(header[: _HEADER.size - 4]))
+    return checksum(content, checksum(header[: HEADER.size - 4]))
 
 
 def _encode(entries: Mapping[str, Arrays]) -> bytes:
@@ -224,8 +224,8 @@ def _encode(entries: Mapping[str, Arrays]) -> bytes:
         forms.append((name, size, [(key, v.dtype.str, v.shape) for key, v in arrays.items()]))
         parts += [value.tobytes() for value in arrays.values()]
     head, size = json.dumps(forms).encode(), sum(map(len, parts))
-    content, header = b"".join((head, *parts)), _HEADER.pack(MARK, len(head), size, 0)
-    return _HEADER.pack(MARK, len(head), size, _checksum(header, content)) + content
+    content, header = b"".join((head, *parts)), HEADER.pack(MARK, len(head), size, 0)
+    return HEADER.pack(MARK, len(head), size, _checksum(header, content)) + content
 
 
 def _decode(file: IO[bytes], extent: _Extent) -> dict[str, np.ndarray] | None:

@@ -233,12 +233,7 @@ class Sweep(Drawn):
                 has = [algorithm_uses(self.used, kind, name) for kind in table[ALGORITHM]]
                 table = table.assign(**{name: table[name].where(np.array(has, bool))})
         return hyperparameter_importance(
-            table,
-            self.hyperparameters,
-            self.space,
-            name=self.name,
-            repeats=repeats,
-            seed=seed,
+            table, self.hyperparameters, self.space, name=self.name, repeats=repeats, seed=seed
         )
 
     @suggests_options

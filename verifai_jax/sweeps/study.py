@@ -17,7 +17,8 @@ from typing import Any
 
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.core.sources import Maker, Sources, made_here, sources_of
+from verifai_jax.core.source_collection import made_here, sources_of
+from verifai_jax.core.sources import Maker, Sources
 from verifai_jax.features import FeatureSpace
 from verifai_jax.features.domain import Domain
 from verifai_jax.mtl import Formula

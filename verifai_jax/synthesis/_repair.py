@@ -13,7 +13,7 @@ before and after are those of fresh samples, which the repair has never seen.
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -23,21 +23,22 @@ from verifai_jax.core.budget import Budget, split_budget
 from verifai_jax.core.checks import check_options
 from verifai_jax.core.errors import check_names, suggests_options
 from verifai_jax.core.progress import shows_progress
-from verifai_jax.core.sources import sources_of
+from verifai_jax.core.source_collection import sources_of
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.validation import usual_batch
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.max_min import max_min_step
 from verifai_jax.statistics.smallest_change import smallest_change
-from verifai_jax.synthesis._synthesize import (
+from verifai_jax.synthesis.adversary import attack
+from verifai_jax.synthesis.arguments import (
     AIMS,
     ATTACK,
     attack_search,
     check_numbers,
-    feature_parameters,
+    repaired_arrays,
+    repaired_features,
 )
-from verifai_jax.synthesis.adversary import attack
 from verifai_jax.synthesis.failure_counts import FailureCounts
 from verifai_jax.synthesis.held_out import held_out
 from verifai_jax.synthesis.optimize import (
@@ -51,7 +52,7 @@ from verifai_jax.synthesis.optimize import (
     has_gradients,
     value_merit,
 )
-from verifai_jax.synthesis.parametric import ArrayParameters, FeatureParameters, Parametric
+from verifai_jax.synthesis.parametric import FeatureParameters, Parametric
 from verifai_jax.synthesis.region import Region, region_of
 from verifai_jax.synthesis.results import Repair, Round
 
@@ -130,12 +131,12 @@ def repair(
         )
     loop: Parametric
     if system_of is not None:
-        loop = _array_parameters(
+        loop = repaired_arrays(
             whole, parameters, system_of, nominal, gradient, batch, precision, seed
         )
         start = loop.start
     else:
-        loop, start = _feature_parameters(
+        loop, start = repaired_features(
             whole, parameters, nominal, gradient, batch, budget, precision, backend, seed
         )
     search = attack_search(whole, attack, loop)
@@ -200,70 +201,6 @@ def _check(
         return held_out(loop, start, count, margin, (seed, 1), limits), after
     except KeyboardInterrupt:
         return None, None
-
-
-def _array_parameters(
-    problem: Any,
-    parameters: Any,
-    system_of: Any,
-    nominal: Any,
-    gradient: Any,
-    batch: int,
-    precision: str,
-    seed: int,
-) -> ArrayParameters:
-    if not isinstance(problem, Problem):
-        raise TypeError(f"a Problem is needed; got {type(problem).__name__}")
-    if nominal is not None:
-        raise ValueError("with system_of the parameters are their own nominal values")
-    if gradient is False:
-        raise ValueError(
-            "arrays of parameters are repaired by gradients; leave gradient out, or make the "
-            "parameters features of the space"
-        )
-    problem.space.check_where()
-    return ArrayParameters(
-        problem, parameters, system_of, batch=batch, precision=precision, seed=seed
-    )
-
-
-def _feature_parameters(
-    problem: Any,
-    names: Any,
-    nominal: Any,
-    gradient: Any,
-    batch: int,
-    budget: int,
-    precision: str,
-    backend: Any,
-    seed: int,
-) -> tuple[Any, Float[np.ndarray, " p"]]:
-    named = isinstance(names, str) or (
-        isinstance(names, Sequence) and all(isinstance(name, str) for name in names)
-    )
-    if not named or not len(names):
-        raise ValueError(
-            "parameters must be names of features, at least one; arrays need "
-            f"system_of=function that makes the system of them; got {names!r}"
-        )
-    loop = feature_parameters(problem, names, gradient, batch, budget, precision, backend, seed)
-    if loop.environment is None:
-        raise ValueError(
-            "all features are parameters, so that nothing can vary to find counterexamples in; "
-            "use synthesize"
-        )
-    check_names("parameter of nominal", nominal or {}, loop.names)
-    given = {**(problem.nominal or {}), **(nominal or {})}
-    missing = [name for name in loop.names if name not in given]
-    if missing:
-        raise ValueError(
-            f"a repair starts from nominal values; {', '.join(missing)} "
-            f"{'has' if len(missing) == 1 else 'have'} none: give nominal={{...}}"
-        )
-    values = {name: given[name] for name in loop.names}
-    for name, value in values.items():
-        loop.space[name].check(value, name)
-    return loop, loop.begin(values)
 
 
 class _Repair:

@@ -18,19 +18,23 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax import search as searches
 from verifai_jax.core.budget import Budget, split_budget
-from verifai_jax.core.checks import check_count, check_options
+from verifai_jax.core.checks import check_options
 from verifai_jax.core.errors import check_names, suggests_options
-from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import shows_progress
-from verifai_jax.evaluation.backends import resolved
-from verifai_jax.falsification.validation import check_search, usual_batch
-from verifai_jax.problem.dependence import depends_on_key, without_derivative
+from verifai_jax.falsification.validation import usual_batch
+from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.max_min import max_min_step
 from verifai_jax.synthesis.adversary import attack
+from verifai_jax.synthesis.arguments import (
+    AIMS,
+    ATTACK,
+    attack_search,
+    check_numbers,
+    feature_parameters,
+)
 from verifai_jax.synthesis.failure_counts import FailureCounts
 from verifai_jax.synthesis.held_out import HeldOut, draw, held_out
 from verifai_jax.synthesis.optimize import (
@@ -52,16 +56,12 @@ from verifai_jax.synthesis.results import Synthesis
 if TYPE_CHECKING:
     import pandas as pd
 
-AIMS = ("robustness", "probability")
-"""What parameters are chosen for."""
 CANDIDATES = 32
 """Choices of parameters at a time, and at most in the table at the end."""
 STARTS = 4
 """Choices from which gradients are followed."""
 ADDED = 6
 """Environments that a round adds to the set at most."""
-ATTACK = 20_000
-"""Simulations of an attack at most, however large the budget."""
 EXPLORED = 20_000
 """Simulations of the first look at the parameters at most, where there is no environment."""
 
@@ -397,81 +397,3 @@ class _Synthesis:
         """Return the set, with the robustness of the best parameters where it is known."""
         rho = self.rho if self.rho is not None else np.full(len(self.environments), np.nan)
         return rows_of(self.loop.environment, self.environments).assign(rho=rho)
-
-
-def check_numbers(margin: float, **counts: int) -> None:
-    """Check that numbers are in range.
-
-    **Raises:** `ValueError`.
-    """
-    if isinstance(margin, bool) or not isinstance(margin, int | float) or not margin >= 0:
-        raise ValueError(f"margin must be a robustness of at least 0; got {margin!r}")
-    for name, count in counts.items():
-        check_count(name, count, 0 if name == "held_out" else 1)
-
-
-def feature_parameters(
-    problem: Problem,
-    parameters: Sequence[str] | str | None,
-    gradient: bool | None,
-    batch: int,
-    budget: int,
-    precision: str,
-    backend: str | None,
-    seed: int,
-) -> FeatureParameters:
-    """Return the problem, checked and on its backend, with these features as parameters.
-
-    **Raises:** `ValueError` for what does not fit, before anything compiles.
-    """
-    if not isinstance(problem, Problem):
-        raise TypeError(f"a Problem is needed; got {type(problem).__name__}")
-    in_precision(precision)
-    if gradient and problem.black_box:
-        raise ValueError(
-            f"the system of problem {problem.name!r} is a black box, which has no gradient; leave "
-            "gradient out, and parameters are chosen by cross-entropy"
-        )
-    several = bool(problem.system.backends)
-    # With every name known, before a backend is measured.
-    FeatureParameters(problem, parameters, batch=batch, gradient=False)
-    problem.space.check_where()
-    choice = resolved(
-        problem, gradient=bool(gradient), batch=batch, budget=budget, precision=precision,
-        wanted=backend,
-    )  # fmt: skip
-    choice.problem.check()
-    follows = gradient or (gradient is None and not several)
-    lacking = without_derivative(choice.problem) if follows else None
-    if gradient and lacking is not None:
-        raise ValueError(
-            f"the system of problem {problem.name!r} has no gradient: {lacking} has no derivative; "
-            "leave gradient out, and parameters are chosen by cross-entropy"
-        )
-    wanted = bool(follows) and lacking is None
-    return FeatureParameters(
-        choice.problem, parameters, batch=batch, gradient=wanted, precision=precision, seed=seed
-    )
-
-
-def attack_search(problem: Problem, search: str | Search, loop: Parametric) -> Search:
-    """Return the search over the environment, if it can work there.
-
-    **Raises:** `ValueError` for one that needs gradients where there are none, or of clauses.
-    """
-    if isinstance(search, str):
-        search = searches.named(search)
-    if loop.environment is None:
-        return search
-
-    checked = check_search(problem, search) if loop.problem.black_box else search
-    if not isinstance(checked, Search):
-        raise TypeError(f"attack must be a name or a search like CrossEntropy(); got {search!r}")
-    checked.check(loop.environment.cube)
-    if checked.wants.clauses or (checked.wants.gradient and not loop.differentiable):
-        raise ValueError(
-            f"attack {checked!r} needs gradients that are not available here; use a search that "
-            "needs none, such as 'cross_entropy', whose worst environments are followed downhill "
-            "anyway"
-        )
-    return checked

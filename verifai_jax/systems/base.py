@@ -9,9 +9,11 @@ All else has a default here: a system offers more by overriding it.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import jax
+import numpy as np
 from jaxtyping import Array, Int, Key, PyTree
 
 from verifai_jax.core.compilation import XlaOptimization
@@ -19,6 +21,7 @@ from verifai_jax.core.forks import returning_once
 from verifai_jax.core.notebook import ForUsers
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.user_errors import format_user_error
+from verifai_jax.systems.channels import Link, Passing
 
 KnownSignals: TypeAlias = tuple[str, ...] | Mapping[str, int] | None
 """Names of signals, or names with their numbers of components, 1 for a scalar; None if unknown."""
@@ -78,14 +81,15 @@ class System(ForUsers):
     - `likely`: the engine that is likely the fastest on a CPU.
     - `derived`: how a verb made this system of the one that it was given, as plain data for the
       record of a run; None for a system of a person's own.
+    - `constants`: numbers and texts of the model by name, by which two models can be compared.
     """
 
     _internal = frozenset((
         "abstract", "backend", "backends", "black_box", "can_fold", "can_refine",
-        "can_simulate_batch", "can_simulate_each", "derived", "effort", "exact_step", "fold",
-        "forward_up_to", "known_signals", "lanes", "likely", "may_draw", "refined", "renewed",
-        "reverse_hint", "simulate_batch", "simulate_each", "switches", "traced_factor",
-        "unroll", "why_error", "why_not", "with_backend",
+        "can_simulate_batch", "can_simulate_each", "constants", "derived", "effort", "exact_step",
+        "fold", "forward_up_to", "known_signals", "lanes", "likely", "links", "may_draw", "passing",
+        "refined", "renewed", "reverse_hint", "simulate_batch", "simulate_each", "switches",
+        "traced_factor", "unroll", "why_error", "why_not", "with_backend", "with_links",
     ))  # fmt: skip
 
     black_box: bool = False
@@ -102,6 +106,7 @@ class System(ForUsers):
     backend: str | None = None
     likely: str | None = None
     derived: Mapping[str, Any] | None = None
+    constants: Mapping[str, str | np.ndarray] = MappingProxyType({})
 
     def __call__(self, features: Features, key: Seed = None) -> Trace:
         """Simulate once, the same trace for the same features and key."""
@@ -209,6 +214,26 @@ class System(ForUsers):
         - `features`: numbers by the names of the table's columns.
         """
         return None
+
+    def passing(self, features: Features) -> Passing:
+        """Return what passes between the system and its policy, where faults can be.
+
+        **Arguments:**
+
+        - `features`: `jax.ShapeDtypeStruct`s.
+
+        **Raises:** `ValueError` for a system that has no policy or controller that is known here.
+        """
+        raise ValueError(
+            f"{self!r} has no loop of which observations and actions are known, so that no fault "
+            "can be put in it: make the system by vj.ode, mujoco, brax, gymnax, gymnasium or "
+            "playground, or apply the faults in the simulator and say with_faults(..., "
+            "by_simulator=True)"
+        )
+
+    def with_links(self, links: tuple[Link, ...]) -> "System":
+        """Return the same system with faults between it and its policy; see `passing`."""
+        raise NotImplementedError(f"{self!r} has no with_links(links)")
 
     def may_draw(self, features: Features) -> bool:
         """Return whether a simulation of a host system may depend on its random key.
@@ -327,6 +352,12 @@ class FunctionSystem(System):
         if self._offers("why_not"):
             return self._method("why_not")(backend)
         return super().why_not(backend)
+
+    def passing(self, features: Features) -> Passing:
+        return self._method("passing")(features)
+
+    def with_links(self, links: tuple[Link, ...]) -> System:
+        return as_system(self._method("with_links")(links))
 
     def may_draw(self, features: Features) -> bool:
         return self._method("may_draw")(features)

@@ -8,25 +8,30 @@ an action takes effect so many steps after its decision, and until the first one
 system gets zeros (an environment the first of its choices).
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Key, PyTree
 
-from verifai_jax.systems.base import Features
+from verifai_jax.systems.channels import Instant, Link, Side
+
+Features: TypeAlias = PyTree
 
 DelayOption: TypeAlias = int | Mapping[str, int]
 """The option of a delay: a number of steps, or `{feature: greatest number of steps}`."""
 
 
-class Delay(NamedTuple):
+@dataclass(frozen=True)
+class Delay(Link):
     """A delay: of `max_steps` steps, or of as many as `feature` says, `max_steps` at most."""
 
     max_steps: int = 0
     feature: str | None = None
+    side: Side = "observation"
 
     @property
     def features(self) -> tuple[str, ...]:
@@ -41,6 +46,12 @@ class Delay(NamedTuple):
         """Return whether the feature's value is a whole number from 0 to the greatest."""
         steps = self.steps(features)
         return (steps >= 0) & (steps <= self.max_steps) & (steps % 1 == 0)
+
+    def begin(self, value: PyTree, now: Instant, key: Key[Array, ""] | int | None) -> PyTree:
+        return Line.of(value, self.max_steps)
+
+    def through(self, state: PyTree, value: PyTree, now: Instant) -> tuple[PyTree, PyTree]:
+        return through(state, value, self.steps(now.features))
 
     def refusal(self, features: Features, owner: str) -> str | None:
         """Return what is wrong with the feature's value; None for a delay that `owner` can have."""
@@ -69,16 +80,6 @@ class Delay(NamedTuple):
             )
 
 
-def first_refusal(delays: Iterable[Delay], features: Features, owner: str) -> str | None:
-    """Return what is wrong with the first delay that `owner` cannot have; None if all are right.
-
-    **Arguments:**
-
-    - `features`: numbers by name.
-    """
-    return next(filter(None, (delay.refusal(features, owner) for delay in delays)), None)
-
-
 NO_DELAY = Delay()
 """An observation that is seen at once, an action that takes effect at once."""
 
@@ -88,10 +89,11 @@ def as_delay(option: DelayOption, name: str) -> Delay:
 
     **Raises:** `ValueError` for anything but a number of steps or `{feature: greatest number}`.
     """
-    delay = Delay(option) if isinstance(option, int) else None  # pyright: ignore[reportArgumentType]
+    side: Side = "action" if name == "action_delay" else "observation"
+    delay = Delay(option, side=side) if isinstance(option, int) else None
     if isinstance(option, Mapping) and len(option) == 1:
         ((feature, maximum),) = option.items()
-        delay = Delay(maximum, feature)
+        delay = Delay(maximum, feature, side)
     whole = (
         delay is not None
         and isinstance(delay.max_steps, int)
@@ -138,31 +140,19 @@ def through(line: Line | None, value: PyTree, steps: Any) -> tuple[PyTree, Line 
     return jax.tree.map(lambda leaf: leaf[index], values), Line(values)
 
 
-class Delays(NamedTuple):
-    """The delays of one simulation.
+def links_of(*delays: Delay) -> tuple[Delay, ...]:
+    """Return the delays that delay something."""
+    return tuple(delay for delay in delays if delay.max_steps or delay.feature is not None)
 
-    - `observation`, `action`: in steps; traced where a feature says them.
-    - `max_observation`, `max_action`: the greatest that they may be.
-    - `valid`: whether they are within these.
+
+def joined(links: tuple[Link, ...], faults: tuple[Link, ...]) -> tuple[Link, ...]:
+    """Return links with faults among them.
+
+    A sensor's fault comes before the delay of the observation, an actuator's after that of the
+    action; one fault comes after those before it.
     """
-
-    observation: Any = 0
-    action: Any = 0
-    max_observation: int = 0
-    max_action: int = 0
-    valid: Bool[Array, ""] | bool = True
-
-    @classmethod
-    def under(cls, observation: Delay, action: Delay, features: Features) -> "Delays":
-        """Return two delays as the features of a simulation have them."""
-        return cls(
-            observation.steps(features),
-            action.steps(features),
-            observation.max_steps,
-            action.max_steps,
-            observation.valid(features) & action.valid(features),
-        )
-
-
-NO_DELAYS = Delays()
-"""Nothing is late."""
+    delays = [link for link in links if isinstance(link, Delay)]
+    others = [link for link in (*links, *faults) if not isinstance(link, Delay)]
+    observed = [link for link in others if link.side == "observation"]
+    acted = [link for link in others if link.side == "action"]
+    return (*observed, *delays, *acted)

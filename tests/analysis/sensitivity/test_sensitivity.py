@@ -8,7 +8,7 @@ from checked_types import unchecked
 
 import verifai_jax as vj
 from verifai_jax.analysis.sensitivity.gradients import gradient_sensitivity
-from verifai_jax.analysis.sensitivity.morris import _steps, morris
+from verifai_jax.analysis.sensitivity.morris import elementary_steps, morris
 from verifai_jax.analysis.sensitivity.sensitivity import Coordinates
 from verifai_jax.analysis.sensitivity.sobol import NOISE, sobol_indices
 
@@ -240,7 +240,7 @@ def test_steps_of_discrete_coordinates():
     space = Coordinates(
         ("c", "n", "one"), (3, 5, 1), (False, True, True), ((0.5, 0.3, 0.2), None, None)
     )
-    start, stop, step = _steps(np.array([3, 5, 1]), space, np.random.default_rng(0), 6000)
+    start, stop, step = elementary_steps(np.array([3, 5, 1]), space, np.random.default_rng(0), 6000)
     pairs, counts = np.unique(np.stack([start[:, 0], stop[:, 0]]), axis=1, return_counts=True)
     # Every choice is left for every other one equally often, never for itself.
     assert pairs.T.tolist() == [[0, 1], [0, 2], [1, 0], [1, 2], [2, 0], [2, 1]]

@@ -13,7 +13,7 @@ from verifai_jax.blocks import adaptive
 from verifai_jax.core.errors import MissingExtra, UnknownNameError
 from verifai_jax.core.trace import Status
 from verifai_jax.systems.ode import ode
-from verifai_jax.systems.ode.adaptive import _solvers
+from verifai_jax.systems.ode.adaptive import adaptive_solvers
 
 
 def test_without_diffrax_the_error_names_the_extra(monkeypatch):
@@ -88,7 +88,7 @@ def test_a_problem_with_it_is_falsified():
 @pytest.mark.slow
 def test_each_solver_that_is_known_can_be_used():
     diffrax = pytest.importorskip("diffrax")
-    solvers = _solvers(diffrax)
+    solvers = adaptive_solvers(diffrax)
     assert {"Tsit5", "Dopri8", "Kvaerno5"} <= set(solvers)
     for name in solvers:
         jax.eval_shape(van_der_pol(method=adaptive(name, rtol=1e-3)), {"mu": 1.0}, None)

@@ -26,8 +26,8 @@ import verifai_jax as vj
 from verifai_jax import remote_client
 from verifai_jax.core.trace import Status
 from verifai_jax.core.waveform import Waveform
-from verifai_jax.systems.blackbox._blackbox import TraceForm
-from verifai_jax.systems.remote import connection, server, wire
+from verifai_jax.systems.blackbox.trace_form import TraceForm
+from verifai_jax.systems.remote import absence, connection, server, wire
 from verifai_jax.systems.remote._remote import remote
 
 ROOT = Path(__file__).parents[3]
@@ -315,6 +315,9 @@ def test_features_arrive_as_they_are():
         "wave": wave,
         "steps": steps,
         "open": Waveform(np.ones((2, 2)), "linear"),
+        "push": vj.Reactive({"gap": (0, 60), "v": (-1, 3)}, 2, (-3, 5)).coerce(
+            list(np.linspace(-2, 2, 9))
+        ),
         "pulses": Waveform(np.array([1.0, 2.0]), "pulse", 4.0, (0.5, 2.0), 1.5),
     }
     got = remote_client.features_of(json.loads(wire.to_text(wire.plain(features))))
@@ -325,6 +328,9 @@ def test_features_arrive_as_they_are():
         np.testing.assert_allclose(got["wave"](time_), wave(time_), rtol=1e-6)
         np.testing.assert_allclose(got["steps"](time_), steps(time_), rtol=1e-6)
         assert got["pulses"](time_) == features["pulses"](time_)
+    assert abs(got["push"](20.0, v=1.5) - features["push"](20.0, v=1.5)) < 1e-5
+    with pytest.raises(ValueError, match="this reaction takes gap, v, each once"):
+        got["push"](gap=1.0)
     np.testing.assert_array_equal(got["open"].over(2.0)(1.0), [1.0, 1.0])
     with pytest.raises(ValueError, match="has no duration"):
         got["open"](1.0)
@@ -611,7 +617,7 @@ def test_time_is_counted_from_when_a_client_can_begin():
 
 
 def test_nobody_there(caplog, monkeypatch):
-    monkeypatch.setattr(server, "REMINDER", 0.2)
+    monkeypatch.setattr(absence, "REMINDER", 0.2)
     with remote(patience=0.7) as system:
         outcomes = Asked(system, 3).all()
         host, port = system.address

@@ -60,7 +60,7 @@ def morris(
     d = len(space.names)
     generator = np.random.default_rng(seed)
     counts = np.where(np.array(space.levels) == 0, levels, space.levels).astype(int)
-    start, stop, step = _steps(counts, space, generator, trajectories)
+    start, stop, step = elementary_steps(counts, space, generator, trajectories)
     index = generator.permuted(np.tile(np.arange(d), (trajectories, 1)), axis=1)
     simulate = Simulator(problem, seed, min(batch, trajectories), of)
     cells, rows = start.copy(), np.arange(trajectories)
@@ -101,7 +101,7 @@ def morris(
     )
 
 
-def _steps(
+def elementary_steps(
     counts: Int[np.ndarray, " d"], space: "Coordinates", generator: Any, n: int
 ) -> tuple[Int[np.ndarray, "n d"], Int[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
     """First and last cell of every coordinate on every path, and the signed length of the step."""

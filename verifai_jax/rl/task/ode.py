@@ -25,7 +25,7 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.user_errors import check_called_with, defined_at, explain_user_error
 from verifai_jax.rl.task.stepping import abstract_action
 from verifai_jax.rl.task.task import Action, Continuous, Discrete
-from verifai_jax.systems.ode._ode import Ode, substep, updated
+from verifai_jax.systems.ode.closed_loop import Ode, substep, updated
 from verifai_jax.systems.pytree_checks import as_floating, outline
 
 Tree = TypeVar("Tree")

@@ -9,7 +9,6 @@ A simulation that raises, hangs or kills its process is a row of the table with 
 not end the run.
 """
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -19,7 +18,6 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Key
 
-from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.forks import returning_once
 from verifai_jax.core.gaps import with_gaps
@@ -33,101 +31,9 @@ from verifai_jax.systems.base import (
     System,
     as_system,
 )
+from verifai_jax.systems.blackbox.trace_form import SignalNames, TraceForm
 from verifai_jax.systems.blackbox.workers import Pool
-
-SignalNames = Sequence[str] | Mapping[str, int]
-
-
-@dataclass(frozen=True)
-class TraceForm:
-    """The form that every trace of a simulator must have; a part that is None may be anything.
-
-    **Arguments:**
-
-    - `signals`: names of scalars, or names with their number of components (1 for a scalar).
-    - `dt`: sampling period in seconds.
-    - `length`: number of samples.
-
-    **Raises:** `ValueError` for a declaration that no trace can meet.
-    """
-
-    signals: SignalNames | None = None
-    dt: float | None = None
-    length: int | None = None
-
-    def __post_init__(self) -> None:
-        signals, dt, length = self.signals, self.dt, self.length
-        if signals is not None:
-            named = not isinstance(signals, str) and all(isinstance(n, str) for n in signals)
-            if not named or not len(signals):
-                raise ValueError(f"signals must be names, such as ('x', 'theta'); got {signals!r}")
-            for name, width in self.widths.items():
-                if not isinstance(width, int) or width < 1:
-                    raise ValueError(
-                        f"signals must say how many components {name!r} has, at least 1; "
-                        f"got {width!r}"
-                    )
-        if dt is not None and not (_is_number(dt) and 0 < dt < math.inf):
-            raise ValueError(f"dt must be a positive number of seconds; got {dt!r}")
-        if length is not None:
-            check_count("length", length)
-
-    @property
-    def widths(self) -> dict[str, int]:
-        """The number of components of each signal."""
-        signals = () if self.signals is None else self.signals
-        return dict(signals) if isinstance(signals, Mapping) else dict.fromkeys(signals, 1)
-
-    def abstract(self) -> Trace | None:
-        """Return a trace of this form as shapes; None if the form is incomplete."""
-        if self.signals is None or self.dt is None or self.length is None:
-            return None
-        shapes = {n: (self.length, *([] if w == 1 else [w])) for n, w in self.widths.items()}
-        signals: Any = {n: jax.ShapeDtypeStruct(s, np.float32) for n, s in shapes.items()}
-        return Trace(signals, dt=self.dt)
-
-    def accept(self, trace: object) -> Trace:
-        """Return a simulator's trace with its signals as NumPy arrays, if it has this form.
-
-        **Raises:** `TypeError` for anything but a trace of numbers, `ValueError` for one that is
-        not as declared; both say what was expected and what came.
-        """
-        if not isinstance(trace, Trace):
-            raise TypeError(f"the system must return a Trace; it returned {type(trace).__name__}")
-        signals = {name: np.asarray(signal) for name, signal in trace.signals.items()}
-        for name, signal in signals.items():
-            if signal.dtype.kind not in "biuf":
-                raise TypeError(f"signal {name!r} must hold real numbers; got {signal.dtype}")
-        if self.signals is not None:
-            self._check_signals(signals)
-        if self.dt is not None:
-            wanted = f"the trace must have the sampling period dt={self.dt}"
-            if trace.dt is None:
-                raise ValueError(f"{wanted}; it has sample times")
-            if not math.isclose(trace.dt, self.dt, rel_tol=1e-6):
-                raise ValueError(f"{wanted}; got dt={trace.dt}")
-        if self.length is not None and trace.length != self.length:
-            raise ValueError(f"the trace must have {self.length} samples; got {trace.length}")
-        return replace(trace, signals=signals)
-
-    def _check_signals(self, signals: Mapping[str, np.ndarray]) -> None:
-        widths = self.widths
-        if signals.keys() != widths.keys():
-            missing = ", ".join(name for name in widths if name not in signals)
-            extra = ", ".join(name for name in signals if name not in widths)
-            how = [f"{missing} missing"] * bool(missing) + [f"{extra} not expected"] * bool(extra)
-            raise ValueError(
-                f"the trace must have the signals {', '.join(widths)}; got "
-                f"{', '.join(signals)} ({'; '.join(how)})"
-            )
-        for name, width in widths.items():
-            shape = signals[name].shape
-            if shape[1:] != (() if width == 1 else (width,)):
-                wanted = "[time]" if width == 1 else f"[time, {width}]"
-                hint = ""
-                if not isinstance(self.signals, Mapping):
-                    hint = f"; declare vectors by signals={{{name!r}: {shape[1]}, ...}}"
-                raise ValueError(f"signal {name!r} must be {wanted}; got {list(shape)}{hint}")
+from verifai_jax.systems.channels import Link, Passing
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,6 +94,21 @@ class _RowByRow(System):
         """True for a simulator that says that its step is part of the system."""
         return as_system(self.simulation.function).exact_step
 
+    def passing(self, features: Features) -> Passing:
+        """Return what passes in the loop of the simulator, if it has one that is known."""
+        return as_system(self.simulation.function).passing(features)
+
+    def with_links(self, links: tuple[Link, ...]) -> System:
+        """Return the same simulator with faults in its loop."""
+        simulation = replace(
+            self.simulation, function=_bare(as_system(self.simulation.function).with_links(links))
+        )
+        return self._with(simulation)
+
+    def _with(self, simulation: Simulation) -> System:
+        """Return the same system with another simulation."""
+        raise NotImplementedError
+
 
 @dataclass(frozen=True, eq=False)
 class BlackBox(_RowByRow):
@@ -201,6 +122,9 @@ class BlackBox(_RowByRow):
         - `key`: a JAX random key, or an integer seed.
         """
         return self.simulation(plain_leaves(features), seed_of(key))
+
+    def _with(self, simulation: Simulation) -> System:
+        return BlackBox(simulation)
 
     @property
     def can_refine(self) -> bool:
@@ -237,6 +161,11 @@ class PooledBlackBox(_RowByRow):
     ) -> Iterator[tuple[int, Outcome]]:
         """Simulate each row in a worker; see `System.simulate_each`."""
         return self.pool.outcomes(features, seeds)
+
+    def _with(self, simulation: Simulation) -> System:
+        pool = self.pool
+        options = (pool.workers, pool.timeout, pool.retries, pool.fresh)
+        return PooledBlackBox(simulation, Pool(simulation, simulation.function, *options))
 
     def renewed(self) -> "PooledBlackBox":
         """Return the same simulator in worker processes of its own."""
@@ -464,14 +393,13 @@ def _plain(leaf: object) -> Any:
 
 
 def _finer(function: Callable[..., Trace], factor: int) -> Callable[..., Trace]:
-    finer = as_system(function).refined(factor)
-    return finer.function if isinstance(finer, FunctionSystem) else finer
+    return _bare(as_system(function).refined(factor))
 
 
 def _renewed(function: Callable[..., Trace]) -> Callable[..., Trace]:
-    made = as_system(function).renewed()
-    return made.function if isinstance(made, FunctionSystem) else made
+    return _bare(as_system(function).renewed())
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+def _bare(system: System) -> Callable[..., Trace]:
+    """Return the function of a system that was made of one, which errors speak of."""
+    return system.function if isinstance(system, FunctionSystem) else system

@@ -27,6 +27,7 @@ from verifai_jax.core.user_errors import check_called_with
 from verifai_jax.core.waveform import is_waveform, set_durations
 from verifai_jax.systems.base import KnownSignals
 from verifai_jax.systems.blackbox._blackbox import BlackBox, PooledBlackBox, blackbox
+from verifai_jax.systems.channels import Channels, Link, Passing
 from verifai_jax.systems.delays import NO_DELAY, Delay, DelayOption, as_delay
 from verifai_jax.systems.environments.episode import (
     Moment,
@@ -34,6 +35,7 @@ from verifai_jax.systems.environments.episode import (
     check_signals_option,
     features_at,
     first_memory,
+    names_of_entries,
     policy_that_sees,
     read_signals,
     sampling_period,
@@ -83,6 +85,7 @@ class EpisodeFunction:
     observation_delay: Delay = NO_DELAY
     action_delay: Delay = NO_DELAY
     clip: bool = True
+    links: tuple[Link, ...] = ()
 
     def __post_init__(self) -> None:
         self._env: Any = None
@@ -145,14 +148,21 @@ class EpisodeFunction:
         self._memory = first_memory(self.policy, None)
         changes = any(is_waveform(features[name]) for name in self.features)
         reward, over, rows, overshoots = 0.0, False, [], 0
-        wait, lag = (self._delay(d, features) for d in (self.observation_delay, self.action_delay))
+        for link in (self.observation_delay, self.action_delay, *self.links):
+            if (refusal := link.refusal(features, self.name)) is not None:
+                raise ValueError(refusal)
+        delays = (self.observation_delay, self.action_delay)
+        wait, lag = (int(delay.steps(features)) for delay in delays)
         observations, actions = [], [Fitted(no_action(env.action_space), False) for _ in range(lag)]
+        channels = Channels(self.links, dt, features, np)
+        states = channels.begin(observation, None, seed)
         for k in range(self.steps + 1):
             # Copied: an environment may write its next observation into the same array.
-            observations.append(copy.deepcopy(observation) if wait else observation)
+            seen, states = channels.observation(states, observation, k * dt)
+            observations.append(copy.deepcopy(seen) if wait else seen)
             observed = observations[max(0, k - wait)]
             actions.append(self._act(env, observed, features, k * dt))
-            action = actions[k].action
+            action, states = channels.action(states, actions[k].action, k * dt)
             rows.append(self._sample(env, observation, action, reward, features))
             if self._drawn is not None and (k in self._wanted or not k):
                 self._drawn[k] = env.render()
@@ -181,16 +191,16 @@ class EpisodeFunction:
 
         **Raises:** `UnknownNameError`, `ValueError`.
         """
-        delays = (*self.observation_delay.features, *self.action_delay.features)
+        links = (self.observation_delay, self.action_delay, *self.links)
         check_features(
             features,
-            [*self.features, *delays],
+            [*self.features, *(name for link in links for name in link.features)],
             (self.configure, self.reset, self.signals, policy_that_sees(self.policy)),
             self.name,
             "features={feature: attribute}",
         )
-        self.observation_delay.check(features)
-        self.action_delay.check(features)
+        for link in links:
+            link.check(features)
         env = self.environment.unwrapped
         for attribute in self.features.values():
             # An attribute of the class is one of the environment's as well.
@@ -299,14 +309,19 @@ class EpisodeFunction:
             f"{self.name} and {became}"
         )
 
-    def _delay(self, delay: Delay, features: Mapping[str, Any]) -> int:
-        """Return a delay in steps.
+    def passing(self, features: Mapping[str, Any]) -> Passing:
+        """Return the forms of observations and actions; the names are those of `signals`."""
+        env = self.environment
+        observation, action = (
+            jax.tree.map(_form, getattr(env, f"{name}_space").sample())
+            for name in ("observation", "action")
+        )
+        names = names_of_entries(self.signals)
+        return Passing(observation, action, self.period, self.steps * self.period, names)
 
-        **Raises:** `ValueError` for a feature that says none.
-        """
-        if (refusal := delay.refusal(features, self.name)) is not None:
-            raise ValueError(refusal)
-        return int(delay.steps(features))
+    def with_links(self, links: tuple[Link, ...]) -> "EpisodeFunction":
+        """Return the same episode with faults in it."""
+        return dataclasses.replace(self, links=(*self.links, *links))
 
     def _act(
         self, env: Env, observation: object, features: Mapping[str, Any], time: float
@@ -440,6 +455,12 @@ def gymnasium(
     )
     options: Any = {"workers": workers, "timeout": timeout, "retries": retries}
     return cast("BlackBox | PooledBlackBox", blackbox(episode, seeded=True, **options))
+
+
+def _form(leaf: object) -> Any:
+    """Return the form of an entry of a space, itself where it holds no numbers."""
+    array = np.asarray(leaf)
+    return jax.ShapeDtypeStruct(array.shape, array.dtype) if array.dtype.kind in "biuf" else leaf
 
 
 def _picture(image: Any, name: str) -> UInt8[np.ndarray, "height width 3"]:

@@ -23,8 +23,8 @@ from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.user_errors import check_called_with
 from verifai_jax.core.waveform import is_waveform
 from verifai_jax.systems.base import Carry, Features, Seed
+from verifai_jax.systems.channels import NOTHING_PASSED, Channels, NamedNumbers
 from verifai_jax.systems.checkpointing import checkpointed_scan
-from verifai_jax.systems.delays import NO_DELAYS, Delays, Line, through
 from verifai_jax.systems.pytree_checks import (
     as_precise_as,
     check_like,
@@ -61,7 +61,7 @@ class Episode:
     - `decide(time, observation, memory, key) -> (action, memory)`: see `policy_function`.
     - `signals(time, moment, action) -> dict`: the samples of the signals.
     - `steps`, `dt`: how many at most, and seconds between two samples.
-    - `delays`: of observations and actions.
+    - `channels`: what observations and actions pass through.
     """
 
     name: str
@@ -72,7 +72,7 @@ class Episode:
     signals: Callable[..., dict[str, Array]]
     steps: int
     dt: float
-    delays: Delays = NO_DELAYS
+    channels: Channels = NOTHING_PASSED
 
     def next_moment(self, time: Time, state: PyTree, action: PyTree, key: Key[Array, ""]) -> Moment:
         """Return the moment after a step, `over` as a truth value."""
@@ -98,12 +98,13 @@ def rollout(episode: Episode, key: Seed) -> Trace:
 
     The reward of a sample is that of the step which led to it. The first sample at which the
     episode is over is the last valid one. The status is `NONFINITE` if it ends in a state with a
-    NaN, or in an observation that is not finite, and `ERROR` if a delay is none that it may be.
+    NaN, or in an observation that is not finite, and `ERROR` if a delay or a fault has a
+    number that it may not have.
 
     **Raises:** `ValueError` while JAX traces it, for parts that do not fit together.
     """
     last, age, _, samples = _run(episode, key, None, lambda _, sample: (None, sample))
-    status = _status(last, episode.delays.valid)
+    status = _status(last, episode.channels.valid())
     return Trace(samples, dt=episode.dt, valid=age + 1, status=status, held=True)
 
 
@@ -118,7 +119,7 @@ def fold(
     After the end the last valid sample comes again. **Returns:** the last carry, and the status.
     """
     last, _, carry, _ = _run(episode, key, carry, lambda c, sample: (update(c, sample), None))
-    return carry, _status(last, episode.delays.valid)
+    return carry, _status(last, episode.channels.valid())
 
 
 def _run(
@@ -129,29 +130,30 @@ def _run(
 ) -> tuple[Moment, Any, Any, Any]:
     """Return the last moment, the number of steps, the last `collected` and the outputs."""
     keys = episode_keys(key)
-    first, memory, lines = _first_moment(episode, episode.start(keys.start), keys)
-    delays = episode.delays
+    first, memory, action = _first_moment(episode, episode.start(keys.start), keys)
+    channels = episode.channels
+    states = channels.begin(first.observation, action, key)
 
     def sample(carry: PyTree, k: Int[Array, ""]) -> Any:
-        (moment, memory, (observations, actions), age), collected = carry
+        (moment, memory, states, age), collected = carry
         frozen = (k >= episode.steps) | moment.over
         # Time, and with it randomness, stops with the state: the samples after the end repeat.
         time = age.astype(float) * episode.dt
         decide_key, step_key = (jax.random.fold_in(k, age) for k in (keys.decide, keys.step))
-        observed, observations = through(observations, moment.observation, delays.observation)
+        observed, states = channels.observation(states, moment.observation, time)
         action, after = episode.decide(time, observed, memory, decide_key)
         after = as_precise_as(after, memory)
-        action, actions = through(actions, action, delays.action)
+        action, states = channels.action(states, action, time)
         collected, output = collect(collected, episode.signals(time, moment, action))
         # A state in which an episode has ended may have no finite derivative.
         state = _where(frozen, first.state, moment.state)
         following = _cast(episode.next_moment(time, state, action, step_key), moment)
-        onwards = (following, after, (observations, actions), age + 1)
+        onwards = (following, after, states, age + 1)
         return (_where(frozen, carry[0], onwards), collected), output
 
     # One iteration more than there are steps samples the end and moves nothing.
     ((last, _, _, age), collected), outputs = checkpointed_scan(
-        sample, ((first, memory, lines, jnp.int32(0)), collected), episode.steps + 1
+        sample, ((first, memory, states, jnp.int32(0)), collected), episode.steps + 1
     )
     return last, age, collected, outputs
 
@@ -166,10 +168,8 @@ def _status(last: Moment, valid: Bool[Array, ""] | bool) -> Int[Array, ""]:
     return jnp.where(valid, status, jnp.int32(Status.ERROR))
 
 
-def _first_moment(
-    episode: Episode, first: Moment, keys: _Keys
-) -> tuple[Moment, Any, tuple[Line | None, Line | None]]:
-    """Return the first moment, memory and delay lines in the types that they keep, checked."""
+def _first_moment(episode: Episode, first: Moment, keys: _Keys) -> tuple[Moment, Any, Any]:
+    """Return the first moment and memory in the types that they keep, checked, and no action."""
     first = jax.tree.map(jnp.asarray, first._replace(over=jnp.asarray(first.over, bool)))
     memory = in_working_precision(episode.memory)
     now = jnp.zeros(())
@@ -200,12 +200,7 @@ def _first_moment(
         )
     check_signals(jax.eval_shape(episode.signals, jnp.zeros(()), first, action))
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), action)
-    delays = episode.delays
-    lines = (
-        Line.of(first.observation, delays.max_observation),
-        Line.of(nothing, delays.max_action),
-    )
-    return first, memory, lines
+    return first, memory, nothing
 
 
 def policy_function(policy: object, memory: PyTree = None) -> Decide:
@@ -364,6 +359,21 @@ def check_signals_option(signals: object, state: str = "state") -> None:
         raise ValueError(
             f"signals must have names of their own beside action and reward; got {names}"
         )
+
+
+def names_of_entries(signals: SignalsOption) -> dict[str, NamedNumbers]:
+    """Return where an observation has the entries that the option `signals` names."""
+    if callable(signals) or signals is None:
+        return {}
+    entries = (
+        signals if isinstance(signals, Mapping) else {name: i for i, name in enumerate(signals)}
+    )
+    return {
+        name: NamedNumbers("observation", at)
+        if isinstance(at, str)
+        else NamedNumbers("observation", "", (at,))
+        for name, at in entries.items()
+    }
 
 
 def _entry(observation: PyTree, at: int | str, signal: str, name: str) -> Any:

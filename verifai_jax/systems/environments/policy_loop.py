@@ -7,9 +7,10 @@ its start, its step, its parts and its actions. All else is here: episodes, chec
 import importlib.metadata
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
+import jax
 from jaxtyping import Array, Int, Key, PyTree
 
 from verifai_jax.core.errors import MissingExtra
@@ -17,7 +18,8 @@ from verifai_jax.core.trace import Trace
 from verifai_jax.core.user_errors import check_called_with
 from verifai_jax.core.waveform import set_durations
 from verifai_jax.systems.base import Carry, Features, Seed, System
-from verifai_jax.systems.delays import NO_DELAY, Delay, DelayOption, Delays, as_delay, first_refusal
+from verifai_jax.systems.channels import Channels, Link, Passing, first_refusal
+from verifai_jax.systems.delays import DelayOption, as_delay, joined, links_of
 from verifai_jax.systems.environments.episode import (
     Episode,
     Moment,
@@ -29,12 +31,14 @@ from verifai_jax.systems.environments.episode import (
     first_memory,
     fold,
     has_waveforms,
+    names_of_entries,
     policy_function,
     policy_that_sees,
     read_signals,
     rollout,
     sampling_period,
 )
+from verifai_jax.systems.pytree_checks import in_working_precision
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -55,8 +59,7 @@ class PolicyLoop(System):
     configure: Callable[..., Any] | None
     initial: Mapping[str, Any] | Callable[..., Any] | None
     signals: SignalsOption
-    observation_delay: Delay = NO_DELAY
-    action_delay: Delay = NO_DELAY
+    links: tuple[Link, ...] = ()
 
     @property
     def duration(self) -> float:
@@ -137,7 +140,7 @@ class PolicyLoop(System):
             sample,
             self.steps,
             self.dt,
-            Delays.under(self.observation_delay, self.action_delay, features),
+            Channels(self.links, self.dt, features),
         )
 
     def check(self, features: Features) -> None:
@@ -146,20 +149,38 @@ class PolicyLoop(System):
         **Raises:** `UnknownNameError`, `ValueError`.
         """
         starts = self.initial if isinstance(self.initial, Mapping) else {}
-        delays = (*self.observation_delay.features, *self.action_delay.features)
+        read = [name for link in self.links for name in link.features]
         check_features(
             features,
-            [*self.features, *starts, *delays],
+            [*self.features, *starts, *read],
             (self.configure, self.signals, self.initial, policy_that_sees(self.policy)),
             self.name,
             self.binding,
         )
-        self.observation_delay.check(features)
-        self.action_delay.check(features)
+        for link in self.links:
+            link.check(features)
 
     def why_error(self, features: Features) -> str | None:
-        """Say which delay is none that the environment was made for."""
-        return first_refusal((self.observation_delay, self.action_delay), features, self.name)
+        """Say which delay or fault has a number that it may not have."""
+        return first_refusal(self.links, features, self.name)
+
+    def passing(self, features: Features) -> Passing:
+        """Return the forms of observations and actions; the names are those of `signals`."""
+
+        def first(features: Features, key: Key[Array, ""]) -> Any:
+            episode = self._episode(features)
+            moment = episode.start(key)
+            memory = in_working_precision(episode.memory)
+            return moment.observation, episode.decide(0.0, moment.observation, memory, key)[0]
+
+        key = jax.eval_shape(lambda: jax.random.key(0))
+        observation, action = jax.eval_shape(first, features, key)
+        names = names_of_entries(self.signals)
+        return Passing(observation, action, self.dt, self.duration, names)
+
+    def with_links(self, links: tuple[Link, ...]) -> "PolicyLoop":
+        """Return the same loop with faults in it."""
+        return replace(self, links=joined(self.links, links))
 
 
 def loop_options(
@@ -199,8 +220,9 @@ def loop_options(
         "configure": configure,
         "initial": initial,
         "signals": signals,
-        "observation_delay": as_delay(delays[0], "observation_delay"),
-        "action_delay": as_delay(delays[1], "action_delay"),
+        "links": links_of(
+            as_delay(delays[0], "observation_delay"), as_delay(delays[1], "action_delay")
+        ),
     }
 
 

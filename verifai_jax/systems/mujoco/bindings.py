@@ -24,13 +24,8 @@ from verifai_jax.systems.mujoco.derived_constants import (
     masses_of_geoms,
     recompute_inertia,
 )
-from verifai_jax.systems.mujoco.model import (
-    GEOM_MASS,
-    Location,
-    Model,
-    free_centres_of_mass,
-    locate,
-)
+from verifai_jax.systems.mujoco.model import Model, free_centres_of_mass
+from verifai_jax.systems.mujoco.part_paths import GEOM_MASS, Location, locate
 
 STATE = ("qpos", "qvel", "act", "mocap_pos", "mocap_quat")
 APPLIED = ("ctrl", "xfrc_applied", "qfrc_applied")

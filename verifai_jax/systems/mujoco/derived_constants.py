@@ -18,14 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from verifai_jax.core.devices import enable_compile_cache
-from verifai_jax.systems.mujoco.model import (
-    GEOM_MASS,
-    MjModel,
-    MjSpec,
-    MjxModel,
-    Model,
-    mjx_module,
-)
+from verifai_jax.systems.mujoco.model import MjSpec, MjxModel, Model, mjx_module
+from verifai_jax.systems.mujoco.part_paths import GEOM_MASS, MjModel
 
 _PLANE, _HFIELD, _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = range(7)
 _SHAPES = (_SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX)

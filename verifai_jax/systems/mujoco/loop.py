@@ -18,9 +18,9 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.user_errors import explain_user_error
 from verifai_jax.systems.base import Seed
-from verifai_jax.systems.delays import NO_DELAY, Delay, Line, through
+from verifai_jax.systems.channels import Channels, Link, NamedNumbers, Passing
 from verifai_jax.systems.mujoco.bindings import Bindings, RecordingFeatures
-from verifai_jax.systems.mujoco.model import Location, names, reading
+from verifai_jax.systems.mujoco.part_paths import Location, names, reading
 from verifai_jax.systems.pytree_checks import (
     as_precise_as,
     check_like,
@@ -77,7 +77,7 @@ class Progress(NamedTuple):
     memory: Any
     age: Int[Array, ""]
     finite: Bool[Array, ""]
-    line: Line | None = None
+    states: Any = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +95,8 @@ class Loop:
     substeps: int
     # Integration steps in one of the model's; JAX may trace it.
     finer: Any = 1
-    # Control periods from a decision until it takes effect.
-    delay: Delay = NO_DELAY
+    # What observations and controls pass through: delays, in control periods, and faults.
+    links: tuple[Link, ...] = ()
     # Whether a controller that JAX cannot trace is called by the host; and of one, why it is.
     on_host: bool = False
     said: dict[str, str] = field(default_factory=dict, repr=False)
@@ -181,14 +181,36 @@ class Loop:
             start[name] = jnp.asarray(value, start[name].dtype)
         return start
 
-    def initial_progress(self) -> Progress:
+    def initial_progress(self, features: Features, key: Seed = None) -> Progress:
         """Return the progress before the first sample."""
-        return Progress(
-            in_working_precision(self.controller_memory),
-            jnp.int32(0),
-            jnp.array(True),
-            Line.of(self.rest(), self.delay.max_steps),
-        )
+        zero = jnp.zeros((), jnp.result_type(float))
+        state, _ = self.state(zero, {})
+        states = self.channels(features).begin(state, self.rest(), key)
+        memory = in_working_precision(self.controller_memory)
+        return Progress(memory, jnp.int32(0), jnp.array(True), states)
+
+    def channels(self, features: Features) -> Channels:
+        """Return what observations and controls pass through in one simulation."""
+        return Channels(self.links, self.control_period, features)
+
+    def passing(self) -> Passing:
+        """Return what the controller sees and sets, with the names of sensors, joints, actuators.
+
+        **Raises:** `ValueError` for a loop without a controller.
+        """
+        if self.controller is None:
+            raise ValueError("faults lie between a model and its controller; there is none")
+        state, _ = jax.eval_shape(lambda: self.state(jnp.zeros((), jnp.result_type(float)), {}))
+        compiled, named = self.compiled, {}
+        for kind, path in (("joint", "joint/{}/qpos"), ("sensor", "sensor/{}")):
+            for name in names(compiled, kind):
+                where = reading(compiled, path.format(name))
+                index = tuple(int(i) for i in where.index)
+                named[name] = NamedNumbers("observation", where.array, index)
+        for number, name in enumerate(names(compiled, "actuator")):
+            named.setdefault(name, NamedNumbers("action", "", (number,)))
+        control = jax.ShapeDtypeStruct((compiled.nu,), state.time.dtype)
+        return Passing(state, control, self.control_period, self.duration, named, ("time",))
 
     def rest(self) -> Float[Array, " nu"]:
         """Return the control where nothing controls: the keyframe's, or zero."""
@@ -204,8 +226,10 @@ class Loop:
         """
         time = progress.age.astype(jnp.result_type(float)) * self.control_period
         state, sensors = self.state(time, arrays)
-        ctrl, memory = self.control(state, progress.memory, features)
-        ctrl, line = through(progress.line, ctrl, self.delay.steps(features))
+        channels = self.channels(features)
+        seen, states = channels.observation(progress.states, state, time)
+        ctrl, memory = self.control(seen, progress.memory, features)
+        ctrl, states = channels.action(states, ctrl, time)
         inputs = {"ctrl": ctrl, **self.bindings.applied_at(features, time)}
         frozen = k >= self.periods
         if self.terminate is not None:
@@ -214,7 +238,7 @@ class Loop:
         finite = progress.finite
         for value in (*inputs.values(), *(arrays[name] for name in ("qpos", "qvel", "act"))):
             finite &= jnp.all(jnp.abs(value) <= HUGE)
-        after = Progress(memory, progress.age + 1, finite, line)
+        after = Progress(memory, progress.age + 1, finite, states)
         unchanged = progress._replace(finite=finite)
         after = jax.tree.map(lambda new, old: jnp.where(frozen, old, new), after, unchanged)
         return Sample(inputs, signals, frozen), after
@@ -334,6 +358,7 @@ class Loop:
             if any(variable is one for one in touched)
         }
         read |= {location.array for location in self.locations.values()}
+        read |= {name for link in self.links for name in link.arrays}
         return frozenset(read & set(fields))
 
     def check(self, features: Features) -> None:
@@ -342,11 +367,12 @@ class Loop:
         **Raises:** `ValueError`.
         """
         self.bindings.check(features)
-        if self.delay.feature is not None:
-            check_names("feature of action_delay:", self.delay.features, features)
-        self.delay.check(features)
+        linked = [name for link in self.links for name in link.features]
+        check_names("feature of action_delay:", linked, features)
+        for link in self.links:
+            link.check(features)
         nu = self.compiled.nu
-        used = {binding.feature for binding in self.bindings.all} | {*self.delay.features}
+        used = {binding.feature for binding in self.bindings.all} | {*linked}
         key = jax.eval_shape(lambda: jax.random.key(0))
 
         def everything(features: Features, key: Key[Array, ""]) -> Any:

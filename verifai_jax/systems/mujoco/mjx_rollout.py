@@ -22,7 +22,8 @@ from verifai_jax.systems.base import Features, Seed
 from verifai_jax.systems.mujoco.bindings import Bindings
 from verifai_jax.systems.mujoco.derived_constants import recompute_constants
 from verifai_jax.systems.mujoco.loop import Loop, Progress, Sample
-from verifai_jax.systems.mujoco.model import MjModel, MjxData, MjxModel, Model, mjx_module
+from verifai_jax.systems.mujoco.model import MjxData, MjxModel, Model, mjx_module
+from verifai_jax.systems.mujoco.part_paths import MjModel
 
 # Values at which MJX looks once, to see whether there is any friction; features may change them.
 _SWITCHES = ("dof_frictionloss", "tendon_frictionloss")
@@ -55,7 +56,7 @@ def rollout(loop: Loop, features: Features, key: Seed) -> Trace:
         sensordata=blank.sensordata,
     )
 
-    progress = loop.initial_progress()
+    progress = loop.initial_progress(features, key)
     arrays = {name: jnp.zeros(shape, physics.qpos.dtype) for name, shape in loop.shapes.items()}
     form: Sample = jax.eval_shape(
         lambda: loop.sample(jnp.int32(0), arrays, progress, features)[0],
@@ -129,7 +130,7 @@ def rollout(loop: Loop, features: Features, key: Seed) -> Trace:
         signals,
         dt=loop.control_period,
         valid=progress.age + 1 if ends else None,
-        status=jnp.where(loop.delay.valid(features), status, jnp.int32(Status.ERROR)),
+        status=jnp.where(loop.channels(features).valid(), status, jnp.int32(Status.ERROR)),
         held=ends,
         finite=loop.finite_signals(),
     )

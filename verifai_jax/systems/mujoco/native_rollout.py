@@ -130,6 +130,7 @@ class _Program:
         self.sizes = [int(np.prod(loop.shapes[name])) for name in self.names]
         self.stage = self._stage()
         self.start = jax.jit(_in_blocks(loop.start))
+        self.begin = jax.jit(_in_blocks(loop.initial_progress))
         self.leaves = jax.jit(_in_blocks(loop.bindings.leaves))
         self.sample = jax.jit(
             lambda k, *rows: _in_blocks(lambda *row: self._sample(k, *row))(*rows)
@@ -188,7 +189,7 @@ class _Part:
         self.loop, self.program = native.loop, program
         self.alive = alive
         self.failed = np.broadcast_to(
-            ~np.asarray(self.loop.delay.valid(features)), alive.shape
+            ~np.asarray(self.loop.channels(features).valid(), bool), alive.shape
         ).copy()
         count = len(keys)
         self.batch = native.batch(count, number)
@@ -209,9 +210,7 @@ class _Part:
             self.batch.forward(stage=program.stage)
         dtype = np.float64 if jax.config.read("jax_enable_x64") else np.float32
         self.packed = np.zeros((count, sum(program.sizes)), dtype)
-        self.progress = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), self.loop.initial_progress()
-        )
+        self.progress = program.begin(self.features, keys)
         self.refused = require("mujoco.batch", extra="mujoco").SimulationError
         self.samples: list[dict[str, Any]] = []
         self.sampled: Any = None

@@ -18,13 +18,14 @@ import numpy as np
 from jaxtyping import Array, Key, PyTree
 
 from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import suggests_options, unknown_name
+from verifai_jax.core.errors import require, suggests_options, unknown_name
 from verifai_jax.core.fingerprint import used_inputs
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import set_durations
 from verifai_jax.systems.base import Features, Seed, System
+from verifai_jax.systems.channels import Link, Passing, first_refusal
 from verifai_jax.systems.clock import count_periods
-from verifai_jax.systems.delays import DelayOption, as_delay
+from verifai_jax.systems.delays import DelayOption, as_delay, joined, links_of
 from verifai_jax.systems.mujoco.bindings import Bound, resolve_bindings
 from verifai_jax.systems.mujoco.loop import Loop, Signals
 from verifai_jax.systems.mujoco.mjx_rollout import has_constraints, reverse_hint, rollout, why_not
@@ -73,6 +74,22 @@ class MuJoCo(System):
         """Sentences on what was changed in the model, and on a controller that runs in Python."""
         return (*self.loop.bindings.model.notes, *self.loop.said.values())
 
+    @property
+    def constants(self) -> dict[str, str | np.ndarray]:
+        """Options and arrays of the model by name, without what MuJoCo computes of the others."""
+        mujoco, compiled = require("mujoco", extra="mujoco"), self.loop.compiled
+        found: dict[str, str | np.ndarray] = {}
+        for name in dir(compiled.opt):
+            value = getattr(compiled.opt, name)
+            if isinstance(value, int | float | np.ndarray) and not name.startswith("_"):
+                kinds = getattr(mujoco, f"mjt{name.capitalize()}", None)
+                found[f"option/{name}"] = np.asarray(value) if kinds is None else kinds(value).name
+        for name in dir(compiled):
+            value = getattr(compiled, name) if name[-1] != "0" else None
+            if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+                found[name] = value
+        return found
+
     def why_slow_to_compile(self, gradient: bool) -> str:
         """Say why MJX compiles this model for minutes, and what is cheaper; empty if it is quick.
 
@@ -96,10 +113,16 @@ class MuJoCo(System):
         )
 
     def why_error(self, features: Features) -> str | None:
-        """Return what is wrong with the delay of a simulation that ended with `ERROR`, if it is."""
-        return (
-            self.loop.delay.refusal(features, "this system") if self.loop.delay.max_steps else None
-        )
+        """Say which delay or fault has a number that it may not have."""
+        return first_refusal(self.loop.links, features, "this system")
+
+    def passing(self, features: Features) -> Passing:
+        """Return what the controller sees and sets."""
+        return self.loop.passing()
+
+    def with_links(self, links: tuple[Link, ...]) -> "MuJoCo":
+        """Return the same loop with faults in it."""
+        return replace(self, loop=replace(self.loop, links=joined(self.loop.links, links)))
 
     @property
     def likely(self) -> str:
@@ -170,7 +193,9 @@ class MuJoCo(System):
 
         def trace(features: Features) -> Trace:
             zeros = {name: jnp.zeros(shape) for name, shape in loop.shapes.items()}
-            sampled, progress = loop.sample(jnp.int32(0), zeros, loop.initial_progress(), features)
+            sampled, progress = loop.sample(
+                jnp.int32(0), zeros, loop.initial_progress(features), features
+            )
             signals = {
                 name: jnp.broadcast_to(value, (loop.periods + 1, *value.shape))
                 for name, value in sampled.signals.items()
@@ -188,7 +213,9 @@ class MuJoCo(System):
         return jax.eval_shape(trace, features)
 
     def may_draw(self, features: Features) -> bool:
-        """Return whether the state at time 0, which alone gets the key, depends on it."""
+        """Return whether the state at time 0, or a fault, depends on the key."""
+        if any(link.draws for link in self.loop.links):
+            return True
         features, key = (
             set_durations(features, self.duration),
             jax.eval_shape(lambda: jax.random.key(0)),
@@ -314,7 +341,7 @@ def mujoco(
         control_period=float(control_period),
         periods=count_periods(duration, control_period, "duration", "control_period"),
         substeps=count_periods(control_period, timestep, "control_period", "the model's timestep"),
-        delay=delay,
+        links=links_of(delay),
     )
     _ = loop.locations
     system = MuJoCo(loop)

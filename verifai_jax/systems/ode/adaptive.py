@@ -40,7 +40,7 @@ def adaptive(
         if not is_number(tolerance) or not 0 < tolerance < 1:
             raise ValueError(f"{name} must lie between 0 and 1; got {tolerance!r}")
     check_count("max_steps", max_steps)
-    solvers = _solvers(diffrax)
+    solvers = adaptive_solvers(diffrax)
     if solver not in solvers:
         raise unknown_name("solver of diffrax", solver, solvers)
     # Implicit solvers take the tolerances of their root finder from the controller.
@@ -69,7 +69,7 @@ def adaptive(
     return step
 
 
-def _solvers(diffrax: Any) -> dict[str, Any]:
+def adaptive_solvers(diffrax: Any) -> dict[str, Any]:
     """Return the adaptive solvers of ordinary differential equations, by name."""
     return {
         name: kind

@@ -22,13 +22,8 @@ from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.trace import Trace
 from verifai_jax.systems.base import Features, Outcome, Seed, System
-from verifai_jax.systems.blackbox._blackbox import (
-    SignalNames,
-    TraceForm,
-    plain_leaves,
-    seed_of,
-    single_trace,
-)
+from verifai_jax.systems.blackbox._blackbox import plain_leaves, seed_of, single_trace
+from verifai_jax.systems.blackbox.trace_form import SignalNames, TraceForm
 from verifai_jax.systems.remote import wire
 from verifai_jax.systems.remote.connection import Batch, Rules
 from verifai_jax.systems.remote.server import Server

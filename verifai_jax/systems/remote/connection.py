@@ -15,7 +15,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
-from verifai_jax.systems.blackbox._blackbox import TraceForm
+from verifai_jax.systems.blackbox.trace_form import TraceForm
 from verifai_jax.systems.remote import wire
 
 GREETING_SECONDS = 10.0

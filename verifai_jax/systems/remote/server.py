@@ -1,8 +1,7 @@
 """The server thread of `remote`: its clients, the points that each of them has, and timeouts.
 
-Clients come and go while the run goes on: the points of one that vanishes go to others. One thread
-owns all sockets and points, so that nothing is locked; the run's thread only puts points into its
-inbox and takes outcomes from a queue. What goes over the wire is `wire`'s.
+The points of a client that vanishes go to others. One thread owns all sockets and points, so that
+nothing is locked; the run's thread only puts points into its inbox and takes outcomes from a queue.
 """
 
 import contextlib
@@ -21,6 +20,7 @@ from typing import Any
 from verifai_jax.core.trace import Status
 from verifai_jax.systems.base import Outcome
 from verifai_jax.systems.remote import connection, wire
+from verifai_jax.systems.remote.absence import Absence
 from verifai_jax.systems.remote.connection import Batch, Client, Point, Rules, keep_alive
 
 log = logging.getLogger("verifai_jax.remote")
@@ -37,8 +37,6 @@ MAX_CLIENTS = 256
 """Clients that may be connected at a time."""
 REMEMBERED = 1 << 16
 """Simulations of which is remembered which client made them."""
-REMINDER = 10.0
-"""Seconds without a client until the log says so; then twice as long, up to 60."""
 
 
 class Server(threading.Thread):
@@ -56,8 +54,7 @@ class Server(threading.Thread):
         self._wake, self._waker = socket.socketpair()
         self._selector = selectors.DefaultSelector()
         self._ids = itertools.count(1)
-        self._alone_since: float | None = None
-        self._remind = REMINDER
+        self._absence = Absence()
         self._refused_until = 0.0
         for sock in (*listening, self._wake):
             sock.setblocking(False)
@@ -180,10 +177,7 @@ class Server(threading.Thread):
         self._flush(client)
 
     def _make_room(self) -> None:
-        """Drop the oldest connection that is not a client, if there is one.
-
-        Connections that say nothing must not shut out those that do.
-        """
+        """Drop the oldest connection that says nothing, which must not shut out those that do."""
         others = [client for client in self.clients if not client.here]
         if others:
             oldest = min(others, key=lambda client: client.since)
@@ -417,17 +411,16 @@ class Server(threading.Thread):
                 if client.leaving:
                     self._drop(client, "")
                 else:
-                    self._send_away(
-                        client, f"no hello came within {connection.GREETING_SECONDS:zg} s"
-                    )
+                    why = f"no hello came within {connection.GREETING_SECONDS:zg} s"
+                    self._send_away(client, why)
                     self._flush(client)
-            elif self.rules.timeout is not None and client.has:
-                self._end_overdue(client, client.overdue(now, self.rules.timeout))
+            elif self.rules.timeout is not None and (
+                overdue := client.overdue(now, self.rules.timeout)
+            ):
+                self._end_overdue(client, overdue)
         self._look_for_clients(now)
 
     def _end_overdue(self, client: Client, overdue: list[Point]) -> None:
-        if not overdue:
-            return
         took = f"took longer than {self.rules.timeout:zg} s"
         for point in overdue:
             del client.has[point.id]
@@ -443,11 +436,9 @@ class Server(threading.Thread):
         here = any(client.here for client in self.clients)
         wanted = any(not p.batch.cancelled for p in itertools.chain(self.waiting, self.lost))
         if here or not wanted:
-            self._alone_since, self._remind = None, REMINDER
+            self._absence.end()
             return
-        if self._alone_since is None:
-            self._alone_since = now
-        alone, patience = now - self._alone_since, self.rules.patience
+        alone, patience = self._absence.seconds(now), self.rules.patience
         if patience is not None and alone > patience:
             message = f"no simulator was connected for {patience:zg} s"
             log.warning("%s: %d points are given up", message, len(self.waiting) + len(self.lost))
@@ -455,13 +446,5 @@ class Server(threading.Thread):
                 self._settle(point, Outcome(None, Status.ERROR, message))
             self.waiting.clear()
             self.lost.clear()
-        elif alone > self._remind:
-            self._remind += min(self._remind, 60.0)
-            host, port = self.listening[0].getsockname()[:2]
-            log.warning(
-                "no simulator has connected to %s for %.0f s; start one with "
-                "`python -m verifai_jax.remote_client --address %s MODULE:FUNCTION`",
-                (host, port),
-                alone,
-                f"[{host}]:{port}" if ":" in host else f"{host}:{port}",
-            )
+        else:
+            self._absence.remind(alone, *self.listening[0].getsockname()[:2])

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from verifai_jax.core.errors import check_names, unknown_name
+from verifai_jax.core.reaction import Reaction
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import is_waveform
 
@@ -194,7 +195,8 @@ def _raw_array(name: str, value: dict[str, Any], raw: bytes) -> np.ndarray:
 
 
 def plain(value: Any) -> Any:
-    """Return features for JSON: arrays as lists, a waveform as an object of its control points.
+    """Return features for JSON: arrays as lists, a waveform as an object of its control points,
+    a reaction as one of its parameters.
 
     **Raises:** `TypeError` for a value that JSON cannot hold.
     """
@@ -205,6 +207,9 @@ def plain(value: Any) -> Any:
         data = {"knots": knots, "hold": value.hold, "duration": value.duration}
         options = {"times": value.times, "width": value.width}
         return data | {name: plain(part) for name, part in options.items() if part is not None}
+    if isinstance(value, Reaction):
+        parts = {n: getattr(value, n) for n in ("parameters", "inputs", "hidden", "bounds")}
+        return plain(parts)
     if isinstance(value, tuple | list):
         return [plain(inner) for inner in value]
     if value is None or isinstance(value, str | bool | int | float):

@@ -1,0 +1,27 @@
+"""Requirements against a problem: mined bounds that no search breaks, traces that tell apart."""
+
+import jax.numpy as jnp
+import pytest
+
+import verifai_jax as vj
+from verifai_jax import mtl
+
+pytestmark = pytest.mark.thorough
+
+
+def falling(features, key):
+    t = 0.1 * jnp.arange(11)
+    return vj.Trace({"x": features["top"] - features["speed"] * t, "t": t}, dt=0.1)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    space = {"top": vj.Box(4.0, 5.0), "speed": vj.Box(0.0, 2.0)}
+    return vj.Problem("falls", space, falling, "always x > 0")
+
+
+def test_the_tightest_bound_that_no_search_breaks(problem):
+    mined = mtl.mine("always x > ?d", problem, budget=1500)
+    assert mined.values["d"] == pytest.approx(2.0, abs=0.02)
+    assert mined.searched > 0
+    assert "found by search, no proof" in mined.summary()

@@ -1,0 +1,52 @@
+"""`verifai-jax fmea FILE.py:NAME`: the failure table of a problem with faults."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from verifai_jax.cli import arguments
+from verifai_jax.cli.json_output import command, draw, give_result
+
+
+@command()
+@arguments.TARGET
+@click.option("--rate", type=float, help="Occurrences of each fault in an hour.")
+@click.option("--mission-time", type=float, help="Hours of a mission.")
+@click.option(
+    "--samples", type=int, default=512, show_default=True, help="Simulations of each fault."
+)
+@click.option(
+    "--budget",
+    type=int,
+    default=2000,
+    show_default=True,
+    help="Simulations of the search where no sample of a fault fails.",
+)
+@click.option("--pairs/--no-pairs", default=True, show_default=True, help="Try pairs of faults.")
+@click.option("--confidence", type=float, default=0.95, show_default=True)
+@arguments.SEED
+@click.option(
+    "--folder",
+    type=click.Path(path_type=Path),
+    help="Folder to write, and to go on in  [default: runs/fmea-NAME]",
+)
+@arguments.PLOT
+@arguments.PROGRESS
+def fmea(target: str, folder: Path | None, plot: Path | None, **options: Any) -> None:
+    """Table what each fault of TARGET (FILE.py:NAME) does, and how probable that is."""
+    from verifai_jax.core.text import printable
+    from verifai_jax.failure_table import fmea as run
+
+    problem = arguments.load_problem(target)
+    into = folder or Path("runs") / f"fmea-{target.rpartition(':')[2]}"
+    found = run(problem, folder=into, target=target, **options)
+    click.echo(printable(str(found)))
+    found.to_csv(into / "fmea.csv")
+    click.echo(f"  table        {into / 'fmea.csv'}")
+    for effect in found:
+        if effect.row is not None:
+            click.echo(f"  {effect.name}: {effect.command}")
+    give_result(name=found.name, effects=found.effects, healthy=found.healthy)
+    if plot is not None:
+        draw(found, plot)

@@ -1,0 +1,93 @@
+"""Commands whose finished simulations are kept until the command is done.
+
+    with kept_until_done() as kept:
+        found = estimate(problem)
+        kept.stopped(found.stopped)
+
+The same command goes on from them, whatever ended it: the folder follows from its arguments.
+"""
+
+import contextlib
+import hashlib
+import json
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from verifai_jax.cli.json_output import as_plain
+
+if TYPE_CHECKING:
+    from verifai_jax.evaluation.unfinished import Unfinished
+
+WORDS = "verifai_jax.words"
+"""Entry of a context that has the words of the command line."""
+FOLDER = Path("runs") / "unfinished"
+"""Where what is not done lies, a folder a command."""
+EARLY = ("interrupted", "max_seconds")
+"""What ends work before it is done."""
+_BESIDES = frozenset(
+    ("max_seconds", "cluster", "fail_on", "plot", "report", "table", "pictures", "into")
+)
+"""Options on which no simulation depends."""
+
+
+class Kept:
+    """The end of a command, as it is told here."""
+
+    def __init__(self, work: "Unfinished | None") -> None:
+        self._work = work
+
+    def stopped(self, why: str | None) -> None:
+        """Take note that there is a result, and what ended the work.
+
+        **Arguments:**
+
+        - `why`: what ended it early; None or anything else if it is done.
+        """
+        if self._work is None:
+            return
+        self._work.done = why not in EARLY
+        if not self._work.done:
+            click.echo(f"  resume       {command_line()}")
+
+
+@contextlib.contextmanager
+def kept_until_done() -> Iterator[Kept]:
+    """Keep the simulations of the present command until it says that it is done.
+
+    Where nothing can be written, or the same command is at work, nothing is kept.
+    """
+    from verifai_jax.core.progress import goes_on_with
+    from verifai_jax.evaluation.unfinished import keeping
+
+    context = click.get_current_context()
+    work = {"command": context.info_name} | {
+        name: as_plain(value) for name, value in context.params.items() if name not in _BESIDES
+    }
+    digest = hashlib.sha256(json.dumps(work, sort_keys=True).encode()).hexdigest()[:12]
+    folder = FOLDER / f"{context.info_name}-{digest}"
+    try:
+        with contextlib.ExitStack() as held:
+            kept = None
+            with contextlib.suppress(ValueError):
+                kept = held.enter_context(keeping(folder, work))
+                held.enter_context(goes_on_with(command_line(), lambda: True))
+            try:
+                yield Kept(kept)
+            except KeyboardInterrupt:
+                if kept is not None and not kept.empty:
+                    click.echo(f"  resume       {command_line()}", err=True)
+                raise
+    finally:
+        for parent in (FOLDER, FOLDER.parent):
+            with contextlib.suppress(OSError):
+                parent.rmdir()
+
+
+def command_line() -> str:
+    """Return the present command as a shell reads it."""
+    context = click.get_current_context()
+    return shlex.join(["verifai-jax", *context.meta.get(WORDS, [context.info_name or ""])])

@@ -1,0 +1,86 @@
+"""`verifai-jax monitor requirements.toml logs/`: many requirements on many recordings."""
+
+import concurrent.futures
+import contextlib
+import multiprocessing
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from verifai_jax.cli.exit_codes import BROKEN, CommandError
+from verifai_jax.cli.json_output import give_result
+from verifai_jax.core.text import printable
+
+if TYPE_CHECKING:
+    from verifai_jax.mtl import Judgement
+
+Command = TypeVar("Command", bound=Callable[..., object])
+
+
+def fleet_options(command: Command) -> Command:
+    """Add the options of many requirements on many recordings."""
+    files = click.Path(path_type=Path, dir_okay=False)
+    for option in (
+        click.option("--jobs", type=click.IntRange(1), default=1, help="Processes that judge."),
+        click.option("--junit", type=files, help="File of the verdicts as JUnit XML."),
+        click.option("--report", type=files, help="HTML file of the report."),
+    ):
+        command = option(command)
+    return command
+
+
+def is_fleet(
+    formula: str, recordings: Sequence[Path], report: Path | None, junit: Path | None
+) -> bool:
+    """Return whether a command line is about several requirements or recordings."""
+    several = len(recordings) > 1 or recordings[0].is_dir()
+    named = Path(formula).suffix.lower() in (".toml", ".csv", ".yaml", ".yml")
+    return several or named or report is not None or junit is not None
+
+
+def monitor_fleet(
+    formula: str,
+    recordings: Sequence[Path],
+    constants: Mapping[str, float],
+    definitions: Mapping[str, str],
+    report: Path | None,
+    junit: Path | None,
+    jobs: int,
+    options: Mapping[str, Any],
+) -> "Judgement":
+    """Judge requirements, a file of them or one formula, on recordings; print what was found.
+
+    **Arguments:**
+
+    - `jobs`: processes that judge; more than one are started for it.
+    - `options`: of `judge`: how recordings are read.
+
+    **Raises:** `CommandError` where nothing has a verdict.
+    """
+    from verifai_jax import mtl
+
+    if Path(formula).suffix.lower() in (".toml", ".csv", ".yaml", ".yml"):
+        requirements = mtl.read_requirements(formula, constants, definitions)
+    else:
+        requirements = [mtl.Requirement("formula", mtl.parse(formula, constants, definitions))]
+    with contextlib.ExitStack() as stack:
+        executor = None
+        if jobs > 1:
+            spawned = multiprocessing.get_context("spawn")
+            pool = concurrent.futures.ProcessPoolExecutor(jobs, mp_context=spawned)
+            executor = stack.enter_context(pool)
+        found = mtl.judge(requirements, recordings, executor=executor, **options)
+    click.echo(printable(str(found)))
+    for name, path, write in (("report", report, found.report), ("junit", junit, found.junit)):
+        if path is not None:
+            click.echo(f"{name} {write(path)}")
+    give_result(
+        failing=len(found.failing),
+        without_verdict=len(found.without_verdict),
+        verdicts=[row._asdict() for row in found.rows],
+    )
+    if len(found.without_verdict) == len(found.rows):
+        raise CommandError("no requirement had a verdict on any recording", BROKEN)
+    return found

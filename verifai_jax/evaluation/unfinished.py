@@ -1,0 +1,222 @@
+"""Finished simulations of work that may be killed, in a folder until the work is done.
+
+    with keeping(folder, {"command": "estimate", "seed": 0}) as kept:
+        found = estimate(problem)
+        kept.done = True
+
+A verb that is called again with the same arguments asks its evaluators for the same simulations, in
+the same order. So it has those that are in the folder at once, and goes on from there with the
+same result, however the earlier call ended. A simulation is recalled for the same evaluator, point,
+random key and temperature, and while the model is what it was; otherwise the work begins anew.
+"""
+
+import contextlib
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from verifai_jax.core.progress import write_line
+from verifai_jax.core.sources import Sources, list_changes
+from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.verdicts import RowVerdict, Verdicts
+from verifai_jax.problem.problem import Problem
+from verifai_jax.store.cache import Cache, CacheError, locked_cache
+from verifai_jax.store.log import Arrays
+
+KIND = "unfinished"
+"""Kind of the cache."""
+_PRESENT: ContextVar["Unfinished | None"] = ContextVar("unfinished", default=None)
+"""The work that evaluators of this process are part of."""
+
+
+class Unfinished:
+    """The folder of work that goes on when it is called again.
+
+    - `done`: set by whoever has the result; what is in the folder is removed then.
+    """
+
+    def __init__(self, cache: Cache, folder: Path) -> None:
+        self.done = False
+        self.cache, self.folder = cache, folder
+        self.begun = time.time()
+        self._parts = 0
+        self._keeps = True
+
+    @property
+    def empty(self) -> bool:
+        """True while no simulation is kept."""
+        return not self.cache.names() and not any(self.folder.glob("*.rows"))
+
+    def part(self, problem: Problem, *mode: object) -> "Part":
+        """Return the simulations of the next evaluator; a changed model has none yet.
+
+        **Arguments:**
+
+        - `problem`: of the evaluator.
+        - `mode`: what else its verdicts depend on, as text.
+        """
+        number, self._parts = self._parts, self._parts + 1
+        formulas = {name: str(formula) for name, formula in problem.formulas.items()}
+        columns = list(map(str, problem.space.columns))
+        about = [problem.name, formulas, problem.end, columns, [*map(str, mode)]]
+        sources, name = problem.sources(), f"part/{number}"
+        known = self.cache.note(name)
+        if known is not None:
+            then = Sources.from_json(known["sources"])
+            changes = then.changes(sources)
+            if changes or known["about"] != about or then.commit != sources.commit:
+                why = list_changes(changes) or "it asks for other simulations"
+                write_line(f"note: begun anew, since the model has changed since then: {why}")
+                self.cache.clear()
+                for path in self.folder.glob("*.rows"):
+                    path.unlink()
+                known = None
+        if known is None:
+            with self.writing():
+                self.cache.note(name, {"about": about, "sources": sources.to_json()})
+        return Part(self, number)
+
+    def settle(self, number: int) -> None:
+        """Note which files a part has read by now, and which ones it has written."""
+        name = f"part/{number}"
+        noted = self.cache.note(name)
+        if noted is not None:
+            settled = Sources.from_json(noted["sources"]).settled(self.begun).to_json()
+            self.cache.note(name, {**noted, "sources": settled})
+
+    @contextlib.contextmanager
+    def writing(self) -> Iterator[None]:
+        """Keep no more where nothing can be written: the work itself needs no disk."""
+        try:
+            yield
+        except (OSError, CacheError) as error:
+            if self._keeps:
+                write_line(f"note: goes on without keeping what is finished: {error}")
+            self._keeps = False
+
+    def put(self, number: int, entries: Mapping[str, Arrays]) -> None:
+        """Keep finished simulations of a part."""
+        if self._keeps:
+            with self.writing():
+                self.cache.put(entries)
+
+
+class Part:
+    """The finished simulations of one evaluator."""
+
+    def __init__(self, of: Unfinished, number: int) -> None:
+        self.of, self.number = of, number
+        self.journal = _Rows(of, number)
+        self._known = {
+            key: (arrays, i)
+            for arrays in of.cache.entries(f"{number}/")
+            for i, key in enumerate(_keys(arrays))
+        }
+        self._settled = False
+
+    def recall_or(
+        self,
+        points: Float[np.ndarray, "n d"],
+        numbers: Int[np.ndarray, " n"],
+        temperature: Float[np.ndarray, " n"] | float,
+        simulate: Callable[[], Verdicts],
+    ) -> Verdicts:
+        """Return verdicts of these points: those that are kept, or else those of `simulate`.
+
+        **Arguments:**
+
+        - `numbers`: of the simulations, which their random keys come from.
+        """
+        asked = {
+            "points": np.asarray(points),
+            "numbers": np.asarray(numbers, np.int64),
+            "temperature": np.broadcast_to(np.asarray(temperature, np.float32), len(points)),
+        }
+        if self._known:
+            found = [self._known.get(key) for key in _keys(asked)]
+            if all(found):
+                return Verdicts.concatenate([_verdict(*one) for one in found if one is not None])
+        verdicts = simulate()._replace(features=None)
+        self.of.put(self.number, {f"{self.number}/{numbers[0]}": {**asked, **_arrays(verdicts)}})
+        self.settle()
+        return verdicts
+
+    def settle(self) -> None:
+        """Note what the first simulations have read."""
+        if not self._settled:
+            self._settled = True
+            with self.of.writing():
+                self.of.settle(self.number)
+
+
+class _Rows(Journal):
+    """Simulations of a host system, on disk one by one."""
+
+    def __init__(self, of: Unfinished, number: int) -> None:
+        super().__init__(of.folder, f"{number}.rows")
+        self._of = of
+
+    def add(self, row: int, point: Float[np.ndarray, " d"], verdict: RowVerdict) -> None:
+        with self._of.writing():
+            super().add(row, point, verdict)
+
+
+def present() -> Unfinished | None:
+    """Return the work whose simulations are kept now; None where nobody wants that."""
+    return _PRESENT.get()
+
+
+@contextlib.contextmanager
+def keeping(folder: Path, work: Mapping[str, Any]) -> Iterator[Unfinished]:
+    """Keep the simulations of all evaluators that are used within, until the work is done.
+
+    **Arguments:**
+
+    - `folder`: which is made, and removed once the work is done, or if nothing is in it.
+    - `work`: the arguments of the call, as plain data.
+
+    **Raises:** `FolderInUse` and `ValueError` as `locked_cache`; `CacheError` for a folder of
+    other work.
+    """
+    with locked_cache(folder, KIND) as cache:
+        cache.claim(work)
+        kept = Unfinished(cache, folder)
+        token = _PRESENT.set(kept)
+        try:
+            yield kept
+        finally:
+            _PRESENT.reset(token)
+            if kept.done or kept.empty:
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def _keys(asked: Arrays) -> Iterator[bytes]:
+    for rows in zip(asked["points"], asked["numbers"], asked["temperature"], strict=True):
+        yield b"".join(np.asarray(row).tobytes() for row in rows)
+
+
+_FIELDS = ("rho", "status", "violated", "gradient", "clauses", "clause_gradients", "coverage_ids",
+           "guidance")  # fmt: skip
+"""Fields of verdicts that are kept."""
+
+
+def _arrays(verdicts: Verdicts) -> dict[str, np.ndarray]:
+    kept = {name: getattr(verdicts, name) for name in _FIELDS}
+    arrays = {name: np.asarray(value) for name, value in kept.items() if value is not None}
+    if verdicts.messages is not None:
+        arrays["messages"] = np.array([text or "" for text in verdicts.messages], dtype="U")
+    return arrays
+
+
+def _verdict(arrays: Arrays, row: int) -> Verdicts:
+    fields: dict[str, Any] = {
+        name: arrays[name][row : row + 1] for name in _FIELDS if name in arrays
+    }
+    messages = [str(arrays["messages"][row])] if "messages" in arrays else None
+    return Verdicts(**fields, messages=messages)

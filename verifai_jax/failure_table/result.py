@@ -1,0 +1,186 @@
+"""The result of `fmea`: a row for each fault, and for each pair that fails where neither does."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.figure import Drawn
+from verifai_jax.core.notebook import InNotebook, frame_html
+from verifai_jax.core.text import format_percent, format_seconds
+from verifai_jax.falsification.run import Run
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """The effect of a fault, or of a pair of faults.
+
+    - `faults`: their names.
+    - `fails`: whether any simulation with it, and without another fault, breaks the property.
+    - `severity`: the least at which one does, by the name of the number; empty if none does.
+    - `row`: of the counterexample in the run of the table; None if there is none.
+    - `verdict`: of the confirmation of that counterexample, see `vj.confirm`.
+    - `broken`: the name of the formula.
+    - `delay`: seconds from the onset to the violation.
+    - `shown_by`: the signal that differs first from the same simulation without the fault;
+      `shown_after` seconds from the onset.
+    - `occurrence`: probability that it happens in a mission.
+    - `probability`, `low`, `high`: of a mission that fails by it, with the interval.
+    - `failures`, `simulations`: the samples of the fault's prior that this rests on.
+    - `command`: what simulates the counterexample again.
+    """
+
+    faults: tuple[str, ...]
+    fails: bool
+    severity: Mapping[str, float]
+    row: int | None
+    verdict: str
+    broken: str
+    delay: float
+    shown_by: str
+    shown_after: float
+    occurrence: float
+    probability: float
+    low: float
+    high: float
+    failures: int
+    simulations: int
+    command: str
+
+    @property
+    def name(self) -> str:
+        """The names of the faults, as one."""
+        return " + ".join(self.faults)
+
+    @property
+    def confirmed(self) -> bool:
+        """True if the counterexample failed in every closer replay."""
+        return self.verdict == "confirmed"
+
+
+@dataclass(frozen=True, eq=False)
+class FailureTable(Drawn, InNotebook):
+    """Faults and their effects, the most probable failure first; made by `fmea`.
+
+    - `name`: of the problem.
+    - `effects`: the rows.
+    - `run`: the counterexamples as a run, for `replay`, `explain` and `confirm`; None if no fault
+      fails.
+    - `rate`: of each fault, in an hour; `mission_time`: in hours; None for probabilities of a
+      failure given that the fault happens.
+    - `confidence`: of each interval.
+    - `healthy`: whether the nominal features without a fault keep the property.
+    - `seconds`: wall-clock time.
+    """
+
+    _picture = "failure_table", "plot_failure_table"
+    """The probability of each row with its interval."""
+
+    name: str
+    effects: tuple[Effect, ...]
+    run: Run | None = field(repr=False)
+    rate: Mapping[str, float] | None
+    mission_time: float | None
+    confidence: float
+    healthy: bool
+    seconds: float
+
+    def __iter__(self) -> Iterator[Effect]:
+        return iter(self.effects)
+
+    def __len__(self) -> int:
+        return len(self.effects)
+
+    def __getitem__(self, name: str) -> Effect:
+        """Return the row of a fault, or of a pair: `table["gyro_bias + motor_stuck"]`.
+
+        **Raises:** `UnknownNameError` for a fault that has none.
+        """
+        for effect in self.effects:
+            if effect.name == name:
+                return effect
+        raise unknown_name("row of the failure table", name, [each.name for each in self.effects])
+
+    @property
+    def table(self) -> "pd.DataFrame":
+        """A row for each effect, by name."""
+        import pandas as pd
+
+        rows = [
+            {
+                "fails": each.fails,
+                "severity": _severity(each),
+                "property": each.broken,
+                "onset_to_violation": each.delay,
+                "shown_by": each.shown_by,
+                "shown_after": each.shown_after,
+                "occurrence": each.occurrence,
+                "probability": each.probability,
+                "low": each.low,
+                "high": each.high,
+                "verdict": each.verdict,
+                "replay": each.command,
+            }
+            for each in self.effects
+        ]
+        names = [each.name for each in self.effects]
+        return pd.DataFrame(rows, index=pd.Index(names, name="fault"))
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write the table to a file.
+
+        **Arguments:**
+
+        - `path`: of the file.
+        """
+        self.table.to_csv(path)
+
+    def replay(self, name: str) -> Any:
+        """Simulate the counterexample of a row again, and keep the trace.
+
+        **Raises:** `UnknownNameError`; `ValueError` for a row without a counterexample.
+        """
+        effect = self[name]
+        if effect.row is None or self.run is None:
+            raise ValueError(f"{name} has no counterexample: nothing failed with it")
+        return self.run.replay(effect.row)
+
+    def __str__(self) -> str:
+        failing = [each for each in self.effects if each.fails]
+        what = "in a mission" if self.rate is not None else "given that it happens"
+        lines = [
+            f"{self.name}: {len(failing)} of {len(self.effects)} faults and pairs break the "
+            f"property; probabilities {what}, {format_percent(self.confidence)} intervals; "
+            f"{self.seconds:z.0f} s"
+        ]
+        width = max((len(each.name) for each in self.effects), default=0)
+        for each in self.effects:
+            line = f"  {each.name:<{width}}  {each.probability:z.2g} "
+            line += f"({each.low:z.2g} to {each.high:z.2g})"
+            if not each.fails:
+                line += f", no failure in {each.simulations:,} samples"
+            elif each.row is None:
+                line += ", fails under few random keys"
+            else:
+                line += f", {each.verdict}\n    from {_severity(each)}; breaks {each.broken} "
+                line += f"{format_seconds(each.delay, 3)} after the onset"
+                if each.shown_by:
+                    shown = format_seconds(each.shown_after, 3)
+                    line += f";\n    {each.shown_by} shows it after {shown}"
+            lines.append(line)
+        if not self.healthy:
+            lines.append("  note: the nominal features break the property without any fault")
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+    def _notebook_parts(self) -> Iterator[str]:
+        yield frame_html(self.table)
+
+
+def _severity(effect: Effect) -> str:
+    return ", ".join(f"{name} {value:z.4g}" for name, value in effect.severity.items())

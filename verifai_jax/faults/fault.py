@@ -1,0 +1,242 @@
+"""Descriptions of faults: a channel, when one begins and ends, and numbers for how bad it is.
+
+Each number is fixed, or a domain, which makes it a feature of the problem.
+"""
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, ClassVar, NamedTuple, TypeAlias
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
+
+from verifai_jax.core.checks import check_count, check_name, is_number
+from verifai_jax.features import Categorical, Domain, Struct
+
+Number: TypeAlias = float | Domain
+Ranges: TypeAlias = Mapping[str, tuple[float, float]]
+Vector: TypeAlias = Float[Array | np.ndarray, " n"]
+
+
+def within(**ranges: tuple[float, float]) -> Ranges:
+    """Return the ends between which numbers have to lie, by their names."""
+    return MappingProxyType(ranges)
+
+
+class Moment(NamedTuple):
+    """The things that a fault knows at an instant.
+
+    - `xp`: `jax.numpy`, or `numpy` on the host.
+    - `number`: its numbers by name.
+    - `live`: whether the instant lies in its time; `since`: seconds since its onset, from 0 on.
+    - `time`, `period`: of the instant, and between two instants, in seconds.
+    - `first`: whether nothing passed before; `acts`: whether the channel is part of an action.
+    - `other`: the numbers of the channel that it reads instead, if it does.
+    - `uniform`: makes so many random numbers of this instant between 0 and 1.
+    """
+
+    xp: Any
+    number: Mapping[str, Any]
+    live: Bool[Any, ""]
+    since: Any
+    time: Any
+    period: float
+    first: Any
+    acts: bool
+    other: Vector | None
+    uniform: Callable[[int], Vector]
+
+
+class FaultFeatures(Struct):
+    """The numbers of a fault that vary; nominal is the weakest, shortest and latest fault.
+
+    - `fault`: whose they are; None for the choice of `AtMost`.
+    """
+
+    fault: "Fault | None"
+
+    def __init__(
+        self,
+        fields: Mapping[str, Domain],
+        nominal: Mapping[str, PyTree],
+        fault: "Fault | None" = None,
+    ) -> None:
+        super().__init__(fields)
+        object.__setattr__(self, "_nominal", dict(nominal))
+        object.__setattr__(self, "fault", fault)
+
+    @property
+    def nominal(self) -> dict[str, PyTree]:
+        return dict(self._nominal)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fault:
+    """A fault of one channel; its kinds derive from it.
+
+    **Arguments:**
+
+    - `channel`: `"observation"`, `"action"`, one entry of them, `"observation[2]"`, or the name of
+      a sensor, a signal, a joint, an actuator or a part of the state.
+    - `onset`: seconds from the beginning of the simulation until the fault; below 0 it has begun
+      before.
+    - `duration`: seconds until the channel recovers; None for never.
+    - `name`: of the fault, and of its feature: `gyro_dropout` when left out.
+
+    **Raises:** `ValueError` for numbers that are not finite or out of range, with their names.
+    """
+
+    severity: ClassVar[str] = "duration"
+    """The number that says how bad it is."""
+    off: ClassVar[float] = 0.0
+    """The severity at which there is no fault."""
+    ranges: ClassVar[Ranges] = MappingProxyType({})
+    """The numbers of this kind, each with the ends between which it has to lie."""
+    choices: ClassVar[bool] = True
+    """Whether a channel of whole numbers can have it."""
+    draws: ClassVar[bool] = False
+    """Whether it draws random numbers."""
+
+    channel: str = field(kw_only=False)
+    onset: Number = 0.0
+    duration: Number | None = None
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        kind = type(self).__name__
+        if not isinstance(self.channel, str) or not self.channel.strip():
+            raise ValueError(f"{kind} needs a channel, such as 'action'; got {self.channel!r}")
+        if self.name is None:
+            stem = re.sub(r"\W+", "_", self.channel).strip("_")
+            object.__setattr__(self, "name", f"{stem}_{_words(kind)}")
+        check_name("the name of a fault", self.name)
+        for name, (low, high) in self.all_ranges.items():
+            value = getattr(self, name)
+            if value is None and name == "duration":
+                continue
+            if not is_number(value) and not (isinstance(value, Domain) and value.size == 1):
+                raise ValueError(
+                    f"{name} of {kind} must be a number, or a domain of one number such as "
+                    f"vj.Box(0, 1); got {value!r}"
+                )
+            first, last = ends(value)
+            if not (math.isfinite(first) and math.isfinite(last)):
+                raise ValueError(f"{name} of {kind} must be finite; got {value!r}")
+            if first < low or last > high:
+                within = f"at least {low:zg}" if high == math.inf else f"from {low:zg} to {high:zg}"
+                raise ValueError(f"{name} of {kind} must be {within}; got {value!r}")
+
+    @property
+    def label(self) -> str:
+        """The name of the fault."""
+        assert self.name is not None
+        return self.name
+
+    @property
+    def all_ranges(self) -> dict[str, tuple[float, float]]:
+        """All numbers by name, each with the ends between which it has to lie."""
+        times = {"onset": (-math.inf, math.inf), "duration": (0.0, math.inf)}
+        return {**self.ranges, **times}
+
+    @property
+    def numbers(self) -> dict[str, Number]:
+        """All numbers by name; no duration where the channel does not recover."""
+        values = {name: getattr(self, name) for name in self.all_ranges}
+        return {name: value for name, value in values.items() if value is not None}
+
+    @property
+    def domains(self) -> dict[str, Domain]:
+        """The numbers that vary."""
+        return {n: value for n, value in self.numbers.items() if isinstance(value, Domain)}
+
+    @property
+    def grade(self) -> str:
+        """The number that varies and says how bad the fault is."""
+        return next(
+            n for n in (self.severity, "duration", "onset", *self.domains) if n in self.domains
+        )
+
+    @property
+    def feature(self) -> FaultFeatures | None:
+        """The feature that the fault is; None for one of which nothing varies."""
+        if not self.domains:
+            return None
+        nominal = {name: self.weakest(name) for name in self.domains}
+        return FaultFeatures(self.domains, nominal, self)
+
+    def weakest(self, name: str) -> PyTree:
+        """Return the value of a number at which the fault is least: latest, shortest, weakest."""
+        low, high = ends(self.numbers[name])
+        wanted = {"onset": math.inf, "duration": 0.0, self.severity: self.off}.get(name)
+        value = (low + high) / 2 if wanted is None else min(max(wanted, low), high)
+        domain = self.numbers[name]
+        whole = isinstance(domain, Domain) and domain.levels != (0,)
+        return round(value) if whole else value
+
+    def memory(self, zero: Vector, period: float) -> PyTree:
+        """Return what it remembers at first, for entries like `zero`."""
+        return ()
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        """Return the entries that the fault makes of `good` ones, and what it remembers then."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class AtMost:
+    """Several faults of which at most `count` happen in one simulation.
+
+    They are chosen by the feature `name`, whose entries are each the name of a fault or `none`,
+    equally likely.
+
+    **Arguments:**
+
+    - `count`: of faults in one simulation.
+    - `faults`: of which they are chosen.
+    - `name`: of the feature.
+
+    **Raises:** `ValueError` for a count that is not positive, and for things that are no faults.
+    """
+
+    count: int
+    faults: tuple[Fault, ...]
+    name: str = "fault"
+
+    def __post_init__(self) -> None:
+        check_count("count", self.count)
+        faults = tuple(self.faults) if isinstance(self.faults, list | tuple) else ()
+        if not faults or not all(isinstance(fault, Fault) for fault in faults):
+            raise ValueError(f"AtMost needs a list of faults; got {self.faults!r}")
+        check_name("the name of AtMost", self.name)
+        object.__setattr__(self, "faults", faults)
+
+    @property
+    def label(self) -> str:
+        """The name of the feature."""
+        return self.name
+
+    @property
+    def feature(self) -> FaultFeatures:
+        """The feature that says which faults happen."""
+        chosen = Categorical("none", *(fault.label for fault in self.faults))
+        slots = {str(i + 1): chosen for i in range(min(self.count, len(self.faults)))}
+        return FaultFeatures(slots, dict.fromkeys(slots, "none"))
+
+
+def ends(value: Number) -> tuple[float, float]:
+    """Return the least and the greatest that a number may be."""
+    if not isinstance(value, Domain):
+        return float(value), float(value)
+    low, high = getattr(value, "low", None), getattr(value, "high", None)
+    if not (is_number(low) and is_number(high)):
+        low, high = (value.from_unit(jnp.full(1, end)) for end in (0.0, 1.0))
+    return float(low), float(high)
+
+
+def _words(kind: str) -> str:
+    """Return the name of a kind as that of a feature: `loss_of_authority`."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", kind).lower()

@@ -1,0 +1,248 @@
+"""A fault in the loop of a system: the link that observations or actions pass through."""
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Key, PyTree
+
+from verifai_jax.core.errors import unknown_name
+from verifai_jax.faults.chance import uniform
+from verifai_jax.faults.fault import AtMost, Fault, Moment
+from verifai_jax.faults.kinds import WrongChannel
+from verifai_jax.faults.smoothing import blend
+from verifai_jax.features import FeatureSpace
+from verifai_jax.problem.problem import Problem
+from verifai_jax.systems.channels import Channels, Entries, Instant, Link, Passing, Side
+
+SLACK = 1e-3
+"""Periods by which an instant may be rounded: a fault with onset 0.3 acts at 30 times 0.01 s."""
+
+
+@dataclass(frozen=True)
+class Injected(Link):
+    """A fault, and where in an observation or an action it is.
+
+    - `choice`: the feature of `AtMost` that decides whether it happens, and its number there.
+    """
+
+    fault: Fault
+    entries: Entries
+    other: Entries | None = None
+    choice: tuple[str, int] | None = None
+
+    @property
+    def side(self) -> Side:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.entries.side
+
+    @property
+    def draws(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.fault.draws
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        own = (self.fault.label,) if self.fault.domains else ()
+        return own if self.choice is None else (*own, self.choice[0])
+
+    @property
+    def arrays(self) -> tuple[str, ...]:
+        both = (self.entries, *([] if self.other is None else [self.other]))
+        return tuple(n for e in both if e.side == "observation" for n in e.names if n)
+
+    def check(self, features: PyTree) -> None:
+        for name in self.features:
+            if name not in features:
+                raise unknown_name("feature", name, features)
+
+    def numbers(self, features: PyTree) -> dict[str, Any]:
+        """Return the numbers of the fault in one simulation."""
+        drawn = features[self.fault.label] if self.fault.domains else {}
+        return {name: drawn.get(name, value) for name, value in self.fault.numbers.items()}
+
+    def valid(self, features: PyTree) -> Any:
+        valid: Any = True
+        for name in self.fault.domains:
+            number = features[self.fault.label][name]
+            valid = valid & (abs(number) < np.inf)
+            if name == "duration":
+                valid = valid & (number >= 0)
+        return valid
+
+    def refusal(self, features: PyTree, owner: str) -> str | None:
+        for name in self.fault.domains:
+            # Of a table, whose columns have the names of both, or of a simulation.
+            column, whole = f"{self.fault.label}.{name}", features.get(self.fault.label)
+            number = features.get(column) if whole is None else whole[name]
+            good = number is not None and np.isfinite(number)
+            if number is not None and not (good and (name != "duration" or number >= 0)):
+                return f"{name} of fault {self.fault.label!r} of {owner} must be a number; " + (
+                    "and it may not be negative; " * (name == "duration") + f"got {number}"
+                )
+        return None
+
+    def begin(self, value: PyTree, now: Instant, key: Key[Array, ""] | int | None) -> PyTree:
+        if now.xp is np:
+            zero = np.zeros(self.entries.count)
+        else:
+            zero = jnp.zeros_like(self.entries.take(value, jnp))
+        memory = self.fault.memory(zero, now.period)
+        if not self.draws:
+            return memory
+        number = zlib.crc32(self.fault.label.encode())
+        if now.xp is np:
+            return np.array([int(key or 0), number], np.uint32), memory
+        key = jax.random.key(0) if key is None else key
+        return jax.random.key_data(jax.random.fold_in(key, number))[-2:], memory
+
+    def through(self, state: PyTree, value: PyTree, now: Instant) -> tuple[PyTree, PyTree]:
+        xp, number = now.xp, self.numbers(now.features)
+        seed, memory = state if self.draws else (None, state)
+        good = self.entries.take(value, xp)
+        since = now.time - number["onset"]
+        lead = since / now.period
+        # A fault that never ends has ended in no sample, and its end moves nothing.
+        trail = (since - number["duration"]) / now.period if "duration" in number else -2.0
+        possible = self._happens(now.features)
+        live = possible & (lead >= -SLACK) & (trail < -SLACK)
+        severity = self.fault.severity
+        on = live if severity == "duration" else live & (number[severity] != self.fault.off)
+        at = Moment(
+            xp, number, live, xp.maximum(since, 0.0), now.time, now.period, now.step == 0,
+            self.side == "action", None if self.other is None else self.other.take(value, xp),
+            lambda count: uniform(seed, now.step, count, xp),
+        )  # fmt: skip
+        bad, after = self.fault.corrupt(good, memory, at)
+        after = after if xp is np else jax.tree.map(_like, after, memory)
+        bad = xp.broadcast_to(xp.asarray(bad), good.shape).astype(good.dtype)
+        if xp is np or self.entries.whole:
+            faulty = xp.where(on, bad, good)
+        else:
+            edges = (jnp.asarray(edge, good.dtype) for edge in (lead, trail))
+            faulty = blend(on, live, jnp.asarray(possible), *edges, bad, good)
+        return self.entries.put(value, faulty, xp), after if seed is None else (seed, after)
+
+    def _happens(self, features: PyTree) -> Any:
+        if self.choice is None:
+            return np.bool_(True)
+        happens: Any = np.bool_(False)
+        for chosen in features[self.choice[0]].values():
+            happens = happens | (chosen == self.choice[1])
+        return happens
+
+
+def inject(fault: Fault, passing: Passing, choice: tuple[str, int] | None = None) -> Injected:
+    """Return a fault as a link in the loop of a system.
+
+    **Raises:** `UnknownNameError` for a channel that the system does not have; `ValueError` for one
+    that cannot have this fault.
+    """
+    kind, entries = type(fault).__name__, passing.entries(fault.channel)
+    if entries.whole and not fault.choices:
+        raise ValueError(
+            f"channel {fault.channel!r} has whole numbers, such as choices, which {kind} cannot "
+            "change; Dropout, Stuck, Freeze, Delay, HeldAction and PacketLoss can"
+        )
+    other = None
+    if isinstance(fault, WrongChannel):
+        other = passing.entries(fault.source)
+        if other.side != entries.side or other.count not in (1, entries.count):
+            raise ValueError(
+                f"source of WrongChannel must be part of the same {entries.side} as "
+                f"{fault.channel!r}, with 1 or {entries.count} entries; got {fault.source!r}"
+            )
+    return Injected(fault, entries, other, choice)
+
+
+def with_faults(problem: Problem, faults: Sequence[object], by_simulator: bool = False) -> Problem:
+    """Return a problem with faults; see `Problem.with_faults`."""
+    chosen, features = _each(faults), {}
+    if not chosen:
+        raise ValueError("with_faults needs at least one fault; got none")
+    names, space = [*problem.space.domains], problem.space
+    for each in (*(e for e in faults if isinstance(e, AtMost)), *(fault for fault, _ in chosen)):
+        if each.label in names:
+            raise ValueError(
+                f"there is a feature or a fault {each.label!r} already: give the fault another "
+                "name=..."
+            )
+        names.append(each.label)
+        if each.feature is not None:
+            features[each.label] = each.feature
+    system, nominal = problem.system, problem.nominal
+    if not by_simulator:
+        passing = system.passing(space.feature_form)
+        system = system.with_links(tuple(inject(f, passing, choice) for f, choice in chosen))
+    if nominal is not None:
+        nominal = {**nominal, **{name: domain.nominal for name, domain in features.items()}}
+    space = FeatureSpace({**space.domains, **features}, space.where)
+    return replace(problem, space=space, system=system, nominal=nominal)
+
+
+def _each(faults: Sequence[object]) -> list[tuple[Fault, tuple[str, int] | None]]:
+    """Return each fault, with the feature that chooses it and its number there, if one does."""
+    found = []
+    for each in faults:
+        if isinstance(each, AtMost):
+            found += [(fault, (each.name, i)) for i, fault in enumerate(each.faults, 1)]
+        elif isinstance(each, Fault):
+            found.append((each, None))
+        else:
+            raise ValueError(f"with_faults takes faults, such as vj.faults.Bias; got {each!r}")
+    return found
+
+
+class OnHost:
+    """Faults in the loop of a simulator of one's own; made by `on_host`."""
+
+    def __init__(
+        self, faults: Sequence[object], features: PyTree, seed: int, period: float
+    ) -> None:
+        self._faults, self._given = _each(faults), (features, seed, period)
+        self._loops: dict[Side, tuple[Channels, Any]] = {}
+
+    def observation(self, time: float, value: PyTree) -> PyTree:
+        """Return what the policy sees at `time` seconds; to be called once at each instant."""
+        return self._through("observation", time, value)
+
+    def action(self, time: float, value: PyTree) -> PyTree:
+        """Return the action that takes effect at `time`; to be called once at each instant."""
+        return self._through("action", time, value)
+
+    def _through(self, side: Side, time: float, value: PyTree) -> PyTree:
+        if side not in self._loops:
+            features, seed, period = self._given
+            forms = {"observation": (), "action": (), side: jax.tree.map(np.asarray, value)}
+            passing = Passing(**forms, period=period, duration=np.inf)
+            own = [each for each in self._faults if each[0].channel.startswith(side)]
+            links = tuple(inject(fault, passing, choice) for fault, choice in own)
+            channels = Channels(links, period, features, np)
+            self._loops[side] = channels, channels.begin(None, None, seed)
+        channels, states = self._loops[side]
+        pass_on = channels.observation if side == "observation" else channels.action
+        value, states = pass_on(states, value, time)
+        self._loops[side] = channels, states
+        return value
+
+
+def on_host(
+    faults: Sequence[Fault | AtMost], features: PyTree, seed: int = 0, *, period: float
+) -> OnHost:
+    """Apply faults in a simulator of one's own, such as a client of `remote`.
+
+    **Arguments:**
+
+    - `faults`: those of `problem.with_faults(..., by_simulator=True)`, each with a channel that
+      begins with `observation` or `action`.
+    - `features`: of the simulation, as the simulator gets them.
+    - `seed`: of the simulation, from which random faults draw.
+    - `period`: seconds between two observations.
+    """
+    return OnHost(faults, features, seed, period)
+
+
+def _like(new: Any, old: Any) -> Any:
+    return jnp.asarray(new, old.dtype)

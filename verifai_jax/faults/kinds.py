@@ -1,0 +1,295 @@
+"""The sixteen kinds of faults."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from verifai_jax.faults.chance import normal
+from verifai_jax.faults.fault import Fault, Moment, Number, Ranges, Vector, ends, within
+from verifai_jax.faults.smoothing import straight
+
+FEW = 16
+"""Values of a line up to which each is an array of its own."""
+POSITIVE = (0.0, math.inf)
+ANY = (-math.inf, math.inf)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dropout(Fault):
+    """The channel reads `value` instead of what it should: a sensor that is disconnected."""
+
+    ranges: ClassVar[Ranges] = within(value=ANY)
+    value: Number = 0.0
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        return at.xp.full_like(good, 1) * at.number["value"], memory
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stuck(Dropout):
+    """The channel is stuck at `value`, such as a valve that is open."""
+
+    value: Number  # pyright: ignore[reportGeneralTypeIssues]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Freeze(Fault):
+    """The channel repeats its last value before the onset."""
+
+    def memory(self, zero: Vector, period: float) -> PyTree:
+        return zero
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        held = at.xp.where(at.live & ~at.first, memory, good)
+        return held, held
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldAction(Fault):
+    """The channel changes only every `hold` seconds, and is held between."""
+
+    severity = "hold"
+    ranges: ClassVar[Ranges] = within(hold=POSITIVE)
+    channel: str = field(default="action", kw_only=False)
+    hold: Number
+
+    def memory(self, zero: Vector, period: float) -> PyTree:
+        return zero
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        steps = at.xp.maximum(1, at.xp.round(at.number["hold"] / at.period))
+        passed = at.xp.round(at.since / at.period)
+        fresh = ~at.live | (passed % steps == 0) | at.first
+        held = at.xp.where(fresh, good, memory)
+        return held, held
+
+
+@dataclass(frozen=True, kw_only=True)
+class Delay(Fault):
+    """The channel is `seconds` late, in whole periods.
+
+    It swings by `swing` seconds up and down once in `cycle` seconds.
+    """
+
+    severity = "seconds"
+    ranges: ClassVar[Ranges] = within(seconds=POSITIVE, swing=POSITIVE, cycle=(1e-9, math.inf))
+    seconds: Number
+    swing: Number = 0.0
+    cycle: Number = 1.0
+
+    def memory(self, zero: Vector, period: float) -> PyTree:
+        return _line(zero, (ends(self.seconds)[1] + ends(self.swing)[1]) / period)
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        number = at.number
+        turn = at.xp.sin(2 * math.pi * at.time / number["cycle"])
+        return _late(good, memory, number["seconds"] + number["swing"] * turn, at)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClockJitter(Fault):
+    """Each value is late by a random time up to `jitter` seconds, in whole periods."""
+
+    severity = "jitter"
+    draws = True
+    ranges: ClassVar[Ranges] = within(jitter=POSITIVE)
+    jitter: Number
+
+    def memory(self, zero: Vector, period: float) -> PyTree:
+        return _line(zero, ends(self.jitter)[1] / period)
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        return _late(good, memory, at.uniform(1)[0] * at.number["jitter"], at)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PacketLoss(Fault):
+    """Each value is lost with probability `loss`; the last one that arrived is used instead."""
+
+    severity = "loss"
+    draws = True
+    ranges: ClassVar[Ranges] = within(loss=(0.0, 1.0))
+    loss: Number
+
+    def memory(self, zero: Vector, period: float) -> PyTree:
+        return zero
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        lost = at.live & (at.uniform(1)[0] < at.number["loss"]) & ~at.first
+        held = at.xp.where(lost, memory, good)
+        if at.xp is np or good.dtype.kind != "f":
+            return held, held
+        # On average: the derivative of the probability with which the older value is used.
+        expected = held + (memory - good) * at.number["loss"]
+        constant = (memory - good) * _still(at.number["loss"])
+        return straight(held, expected - constant), held
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bias(Fault):
+    """A constant `offset` is added."""
+
+    severity, choices = "offset", False
+    ranges: ClassVar[Ranges] = within(offset=ANY)
+    offset: Number
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        return good + at.number["offset"], memory
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drift(Fault):
+    """An offset is added that grows by `rate` in each second since the onset."""
+
+    severity, choices = "rate", False
+    ranges: ClassVar[Ranges] = within(rate=ANY)
+    rate: Number
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        return good + at.number["rate"] * at.since, memory
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise(Fault):
+    """Normal noise with standard deviation `std` is added, independent at each instant."""
+
+    severity, choices, draws = "std", False, True
+    ranges: ClassVar[Ranges] = within(std=POSITIVE)
+    std: Number
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        noise = normal(at.uniform(len(good)), at.xp)
+        return good + at.number["std"] * noise, memory
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spikes(Fault):
+    """Single values are off by `height`, up or down, `rate` times a second on average."""
+
+    severity, choices, draws = "height", False, True
+    ranges: ClassVar[Ranges] = within(height=POSITIVE, rate=POSITIVE)
+    height: Number
+    rate: Number = 1.0
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        chance = at.uniform(2 * len(good))
+        sign = at.xp.where(chance[len(good) :] < 0.5, -1.0, 1.0)
+        hit = chance[: len(good)] < at.number["rate"] * at.period
+        return at.xp.where(hit, good + sign * at.number["height"], good), memory
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quantisation(Fault):
+    """Values are rounded to multiples of `step`."""
+
+    severity, choices = "step", False
+    ranges: ClassVar[Ranges] = within(step=POSITIVE)
+    step: Number
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        step = at.xp.where(at.number["step"] > 0, at.number["step"], 1.0)
+        exact = good / step
+        rounded = at.xp.round(exact) * step
+        if at.xp is np:
+            return rounded, memory
+        # Rounding has no slope: the value is followed, and the remainder grows with the step.
+        return straight(rounded, good + _still(at.xp.round(exact) - exact) * step), memory
+
+
+@dataclass(frozen=True, kw_only=True)
+class Saturation(Fault):
+    """Values are limited to between `-limit` and `limit`."""
+
+    severity, off, choices = "limit", math.inf, False
+    ranges: ClassVar[Ranges] = within(limit=POSITIVE)
+    limit: Number
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        return at.xp.clip(good, -at.number["limit"], at.number["limit"]), memory
+
+
+@dataclass(frozen=True, kw_only=True)
+class LossOfAuthority(Fault):
+    """The share `loss` of the channel has no effect, of an actuator above all."""
+
+    severity, choices = "loss", False
+    ranges: ClassVar[Ranges] = within(loss=(0.0, 1.0))
+    channel: str = field(default="action", kw_only=False)
+    loss: Number
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        return good * (1 - at.number["loss"]), memory
+
+
+@dataclass(frozen=True, kw_only=True)
+class SignFlip(Fault):
+    """The channel has the wrong sign."""
+
+    choices = False
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        return -good, memory
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrongChannel(Fault):
+    """The channel has the values of the channel `source`, as with two wires exchanged."""
+
+    source: str
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        assert at.other is not None
+        return at.other, memory
+
+
+KINDS: tuple[type[Fault], ...] = (
+    Delay, Dropout, Freeze, Bias, Drift, Noise, Spikes, Quantisation, Saturation, Stuck,
+    LossOfAuthority, HeldAction, PacketLoss, ClockJitter, SignFlip, WrongChannel,
+)  # fmt: skip
+"""All kinds."""
+
+
+def _line(zero: Vector, periods: float) -> Any:
+    """Return the last values of something at first, the newest at index 0.
+
+    A few are arrays of their own: they move up without a copy, where an array of them all is
+    written anew at each step.
+    """
+    count = math.ceil(periods - 1e-6) + 1
+    if count <= FEW:
+        return (zero,) * count
+    return zero[None] * np.zeros((count, 1), zero.dtype)
+
+
+def _late(good: Vector, line: Any, seconds: Any, at: Moment) -> tuple[Vector, Any]:
+    """Return the value of some seconds ago, in whole periods, and the line with the newest."""
+    xp, few = at.xp, isinstance(line, tuple)
+    line = (good, *line[:-1]) if few else xp.concatenate([good[None], line[:-1]])
+    if not at.acts:
+        # Before the first observation there was none other; before the first action, no action.
+        line = jax.tree.map(lambda values: xp.where(at.first, good, values), line)
+    latest = len(line) - 1
+
+    def value(index: Any) -> Any:
+        if not few:
+            return line[index]
+        chosen = line[0]
+        for i, earlier in enumerate(line[1:], 1):
+            chosen = xp.where(index == i, earlier, chosen)
+        return chosen
+
+    periods = xp.clip(seconds / at.period, 0, latest)
+    whole = value(xp.round(periods).astype(np.int32))
+    if xp is np or good.dtype.kind != "f" or not latest:
+        return whole, line
+    left = xp.clip(xp.floor(periods).astype(np.int32), 0, latest - 1)
+    share = periods - left
+    return straight(whole, value(left) * (1 - share) + value(left + 1) * share), line
+
+
+def _still(value: Any) -> Any:
+    return jax.lax.stop_gradient(value)

@@ -1,0 +1,251 @@
+"""The maps between the points of the unit cube and the features of a space, in JAX.
+
+`FeatureSpace` is what a person makes of them; searches, engines and tables use what is here.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from verifai_jax.core.cube import Cube
+from verifai_jax.core.precision import in_precision
+from verifai_jax.features.compound import Struct
+from verifai_jax.features.domain import Domain, Numbers, as_real
+
+
+class PointMaps:
+    """Points `[dim]` of the unit cube to features by name, and back; programs are compiled once.
+
+    **Arguments:**
+
+    - `root`: the domains by name, as one domain.
+    - `where`: the constraint between features, or None.
+    """
+
+    def __init__(self, root: Struct, where: Callable[[Any], Bool[Array, ""]] | None) -> None:
+        self.root = root
+        self.where = where
+
+    def __getstate__(self) -> dict[str, Any]:
+        # What follows from the domains is computed where it is wanted, and so are programs.
+        kind = type(self)
+        return {
+            name: value
+            for name, value in vars(self).items()
+            if not isinstance(getattr(kind, name, None), cached_property)
+        }
+
+    @property
+    def domains(self) -> dict[str, Domain]:
+        """Domains by name, in the order written."""
+        return dict(self.root.fields)
+
+    @cached_property
+    def levels(self) -> tuple[int, ...]:
+        """Number of cells of each coordinate; 0 if it is continuous."""
+        return self.root.levels
+
+    @cached_property
+    def weights(self) -> tuple[tuple[float, ...] | None, ...]:
+        """Probabilities of the cells of each coordinate; None for equal ones."""
+        return self.root.weights
+
+    @cached_property
+    def ordered(self) -> tuple[bool, ...]:
+        """Order of each coordinate: True if its values have one."""
+        return self.root.ordered
+
+    @cached_property
+    def lengths(self) -> tuple[int, ...]:
+        """Indices of the coordinates that are lengths of arrays, on which others depend."""
+        return self.root.lengths
+
+    @cached_property
+    def signals(self) -> tuple[tuple[int, ...], ...]:
+        """The coordinates of each function of time, in the order of its control points."""
+        return self.root.signals
+
+    @cached_property
+    def coordinates(self) -> tuple[str, ...]:
+        """Names of the coordinates, such as `x0`, `cars.length`, `cars[0].x`."""
+        return self.root.coordinates("")
+
+    def labels(self, duration: float | None = None) -> dict[str, str]:
+        """Return the names of the coordinates for people: `{"wind[3]": "wind at 1.5 s", ...}`.
+
+        **Arguments:**
+
+        - `duration`: of a simulation in seconds, for signals that have none of their own; without
+          it their control points keep their numbers.
+        """
+        return dict(zip(self.coordinates, self.root.labels("", duration), strict=True))
+
+    @property
+    def dim(self) -> int:
+        """Number of unit coordinates."""
+        return len(self.levels)
+
+    @property
+    def point_form(self) -> jax.ShapeDtypeStruct:
+        """Shape and type of a point of the unit cube, for abstract evaluation."""
+        return jax.ShapeDtypeStruct((self.dim,), jnp.result_type(float))
+
+    @property
+    def feature_form(self) -> dict[str, Any]:
+        """Shapes and types of the features of a point, for abstract evaluation."""
+        return jax.eval_shape(self.unflatten, self.point_form)
+
+    def feature_form_in(self, precision: str) -> dict[str, Any]:
+        """Return the form of the features in `"float32"` or `"float64"`, whatever JAX is set to."""
+        with in_precision(precision):
+            return jax.eval_shape(self.unflatten, jax.ShapeDtypeStruct((self.dim,), precision))
+
+    @cached_property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the feature columns of a table, such as `x0`, `cars[0].x`, `point[1]`."""
+        return self.root.columns("")
+
+    def unflatten(self, u: Numbers) -> dict[str, Any]:
+        """Convert a point `[dim]` of the unit cube to features; real ones have the dtype of `u`.
+
+        Pure JAX; `jax.vmap` it for batches.
+
+        **Arguments:**
+
+        - `u`: the point, `[dim]` with entries in `[0, 1]`.
+
+        **Returns:** the features by name, as a system sees them.
+
+        **Raises:** `ValueError` for a point of another shape.
+        """
+        u = as_real(u)
+        if u.shape != (self.dim,):
+            raise ValueError(
+                f"u must have shape [{self.dim}], one coordinate for each of "
+                f"{', '.join(self.columns[:8])}{', ...' * (self.dim > 8)}; got {list(u.shape)}"
+            )
+        return self.root.from_unit(u)
+
+    def flatten(self, features: Mapping[str, Any]) -> Float[Array, " dim"]:
+        """Convert features to the point `[dim]` of the unit cube; discrete ones to cell centres.
+
+        Pure JAX on the values that `unflatten` gives; takes plain Python values too. Nothing is
+        checked.
+
+        **Arguments:**
+
+        - `features`: by name; constant, fixed ones and events may be left out.
+
+        **Returns:** the point, `[dim]`.
+        """
+        return self.root.to_unit(self.root.coerce(self.completed(features)))
+
+    @cached_property
+    def features_at(self) -> Callable[[Numbers], dict[str, Any]]:
+        """Points `[n, dim]` to features `[n, ...]`: `unflatten`, compiled once for each `n`."""
+        return jax.jit(jax.vmap(self.unflatten))
+
+    @cached_property
+    def point_of(self) -> Callable[[Mapping[str, Any]], Float[Array, " dim"]]:
+        """Features of one simulation to a point `[dim]`: `flatten`, compiled."""
+        return jax.jit(self.flatten)
+
+    @cached_property
+    def points_at(self) -> Callable[[Mapping[str, Any]], Float[Array, "n dim"]]:
+        """Features `[n, ...]` to points `[n, dim]`: `flatten`, compiled once for each `n`."""
+        return jax.jit(jax.vmap(self.flatten))
+
+    @cached_property
+    def width(self) -> int:
+        """Number of real numbers among the features of one simulation."""
+        leaves = jax.tree.leaves(self.feature_form)
+        return sum(math.prod(leaf.shape) for leaf in leaves if _is_real(leaf))
+
+    def unflatten_given(
+        self, u: Float[Array, " dim"], values: Float[Array, " width"]
+    ) -> dict[str, Any]:
+        """Return features with given real numbers, others as `unflatten` gives them. Pure JAX.
+
+        **Arguments:**
+
+        - `u`: the point of the unit cube nearest to the features.
+        - `values`: their real numbers, one after another; where one is NaN, that of the point.
+        """
+        leaves, form = jax.tree.flatten(self.unflatten(u))
+        start = 0
+        for i, leaf in enumerate(leaves):
+            if _is_real(leaf):
+                given = values[start : start + leaf.size].reshape(leaf.shape).astype(leaf.dtype)
+                leaves[i] = jnp.where(jnp.isnan(given), leaf, given)
+                start += leaf.size
+        return jax.tree.unflatten(form, leaves)
+
+    @cached_property
+    def cube(self) -> Cube:
+        """The unit cube of this space, as searches see it."""
+        return Cube(
+            levels=self.levels,
+            weights=self.weights,
+            ordered=self.ordered,
+            names=self.coordinates,
+            lengths=self.lengths,
+            signals=self.signals,
+            sequences=self.root.sequences,
+        )
+
+    def accepts(self, features: Mapping[str, Any]) -> Bool[Array, ""]:
+        """Return whether the constraint holds; True without one. Pure JAX."""
+        return jnp.asarray(True if self.where is None else self.where(features))
+
+    @cached_property
+    def accepts_points(self) -> Callable[[Numbers], Bool[Array, " n"]]:
+        """The constraint as a compiled function of points `[n, dim]` of the unit cube."""
+        return jax.jit(jax.vmap(lambda u: self.accepts(self.unflatten(u))))
+
+    @property
+    def items(self) -> int:
+        """Number of items at most that `without_items` can take away, such as events."""
+        return self.root.items
+
+    @cached_property
+    def without_items(self) -> Callable[[Numbers, Numbers], Float[Array, "n dim"]]:
+        """Take those items away from points `[n, dim]` that `[n, items]` selects; compiled."""
+        return jax.jit(jax.vmap(self.root.without))
+
+    @cached_property
+    def settle(self) -> Callable[[Numbers], Float[Array, "n dim"]]:
+        """Move coordinates of points `[n, dim]` that mean nothing to one value; compiled."""
+        return jax.jit(jax.vmap(self.root.settled))
+
+    @cached_property
+    def used(self) -> Callable[[Numbers], Bool[Array, "n dim"]]:
+        """Say which coordinates of points `[n, dim]` mean something; compiled."""
+        return jax.jit(jax.vmap(self.root.used))
+
+    @cached_property
+    def coverage_ids_at(self) -> Callable[[Numbers], Int[Array, "n ids"]]:
+        """Return what points `[n, dim]` cover, such as transitions of an automaton; compiled."""
+        return jax.jit(jax.vmap(lambda u: self.root.coverage_ids(self.unflatten(u))))
+
+    @property
+    def constraint(self) -> Callable[[Numbers], Bool[Array, " n"]] | None:
+        """The compiled constraint `[n, dim] -> [n]`; None for a space without one."""
+        return None if self.where is None else self.accepts_points
+
+    def completed(self, features: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return features with the constant, fixed ones and events that were left out."""
+        if not isinstance(features, Mapping):
+            return features
+        held = ((name, domain.held_at) for name, domain in self.root.fields)
+        known = {name: value for name, value in held if value is not None}
+        known |= {n: d.nominal for n, d in self.root.fields if d.nominal is not None}
+        return {**known, **features}
+
+
+def _is_real(leaf: jax.Array | jax.ShapeDtypeStruct) -> bool:
+    return bool(jnp.issubdtype(leaf.dtype, jnp.floating))

@@ -1,0 +1,218 @@
+"""Formulas with parameters, `always[0, ?T] (distance > ?d)`: numbers and times to be found.
+
+    template = read_parametric("always[0, ?T] (distance > ?d)")
+    template.names, template.times        # ('T', 'd'), {'T'}
+    template.formula({"T": 4.0, "d": 2.0})
+    template.direction("d")               # -1: a larger d is harder to satisfy
+
+A text is parsed once. A number stands in the tree as a signal named `?d`, and a time as a float
+that nobody writes, so that putting values in is a walk over the tree.
+"""
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from verifai_jax.core.errors import check_names
+from verifai_jax.mtl import formula as ast
+from verifai_jax.mtl._parse import parse
+from verifai_jax.mtl.expression import Arithmetic, Number, Signal, constant_value, expression
+from verifai_jax.mtl.formula import Formula, Interval, Term
+from verifai_jax.mtl.tree import postorder
+
+_WORDS = re.compile(r'"[^"\n]*"|[\[\],:]|\?([A-Za-z_]\w*)')
+_START, _END = 1e-300, 1e300
+"""Times of parameters while their values are unknown: multiples of these, below and above any that
+a person writes, so that an interval with one of them and another number ends after it starts."""
+
+_CLOSED = {">": ">=", "<": "<=", "!=": "!="}
+_OPEN = {">=": ">", "<=": "<", "==": "=="}
+
+
+@dataclass(frozen=True)
+class Parametric:
+    """A formula with parameters.
+
+    - `text`: as it was written.
+    - `tree`: the formula in which signals and times stand for the parameters.
+    - `names`: the parameters in order of appearance.
+    - `slots`: the times in the tree that stand for parameters.
+    """
+
+    text: str
+    tree: Formula
+    names: tuple[str, ...]
+    slots: Mapping[float, str]
+
+    @property
+    def times(self) -> frozenset[str]:
+        """The parameters that are ends of intervals."""
+        return frozenset(self.slots.values())
+
+    def formula(self, values: Mapping[str, float]) -> Formula:
+        """Return the formula with values for all parameters.
+
+        A comparison with a parameter includes equality, so that the formula holds at the tightest
+        value too: `x > ?d` becomes `x >= 4.2`.
+
+        **Raises:** `UnknownNameError` for values of other names; `ValueError` for an interval that
+        ends before it starts.
+        """
+        check_names("parameter", values, self.names)
+        return self._filled(self.tree, values, True)
+
+    def _filled(self, f: Formula, values: Mapping[str, float], positive: bool) -> Formula:
+        match f:
+            case ast.Predicate(comparison, left, right):
+                if not any(name in self.names for name in _parameters(left, right)):
+                    return f
+                comparison = (_CLOSED if positive else _OPEN).get(comparison, comparison)
+                left, right = (_with_numbers(e, values) for e in (left, right))
+                return ast.Predicate(comparison, left, right)
+            case ast.Atom(e):
+                if not _parameters(e):
+                    return f
+                number = Number(0.0)
+                return ast.Predicate(">=" if positive else ">", _with_numbers(e, values), number)
+            case ast.Leaf():
+                return f
+        positive ^= isinstance(f, ast.Not)
+        operands = [self._filled(part, values, positive) for part in f.operands()]
+        if not f.operator.timed:
+            return ast.build(f.operator.word, operands)
+        ends = [
+            values[self.slots[t]] if t in self.slots else t
+            for t in (f.interval.start, f.interval.end)
+        ]
+        return ast.build(f.operator.word, operands, Interval(*ends))
+
+    def direction(self, name: str) -> int:
+        """Return how the robustness changes as a parameter grows, as the tree has it.
+
+        **Returns:** 1, it never falls; -1, it never rises; 0, the tree does not tell.
+        """
+        signs = self._signs(self.tree, name)
+        return signs.pop() if len(signs) == 1 else 0
+
+    def _signs(self, f: Formula, name: str) -> set[int]:
+        if isinstance(f, ast.Not):
+            return {-sign for sign in self._signs(f.operand, name)}
+        if isinstance(f, ast.Predicate):
+            margin = Arithmetic("-", (expression(f.left), expression(f.right)))
+            signs = _term_signs(margin, f"?{name}")
+            if f.comparison in ("==", "!="):
+                return {0} if signs else set()
+            return signs if f.comparison in (">", ">=") else {-sign for sign in signs}
+        if isinstance(f, ast.Atom):
+            return _term_signs(f.expression, f"?{name}")
+        signs = {sign for part in f.valued() for sign in self._signs(part, name)}
+        if f.side and f.operator.timed:
+            sign = f.sign if isinstance(f, ast.Window) else 1
+            ends = ((f.interval.start, -sign), (f.interval.end, sign))
+            signs |= {effect for time, effect in ends if self.slots.get(time) == name}
+        return signs
+
+    def range_of_time(self, name: str) -> tuple[float, float]:
+        """Return the least and the greatest value of a time that the other times leave it."""
+        low, high = 0.0, math.inf
+        for part in postorder(self.tree):
+            if isinstance(part, Formula) and part.side and part.operator.timed:
+                start, end = part.interval.start, part.interval.end
+                if self.slots.get(start) == name and end not in self.slots:
+                    high = min(high, end)
+                if self.slots.get(end) == name and start not in self.slots:
+                    low = max(low, start)
+        return low, high
+
+    def together(self, one: str, other: str) -> bool:
+        """Return whether two parameters stand in one comparison."""
+        leaves = (part for part in self.tree.subformulas() if part.terms())
+        return any({one, other} <= set(_parameters(*leaf.terms())) for leaf in leaves)
+
+
+def read_parametric(
+    text: str,
+    constants: Mapping[str, float] | None = None,
+    definitions: Mapping[str, Formula | str] | None = None,
+) -> Parametric:
+    """Read a formula in which `?name` stands for numbers and for ends of intervals.
+
+    **Arguments:**
+
+    - `constants`, `definitions`: as of `parse`.
+
+    **Raises:** `FormulaSyntaxError` as `parse`; `ValueError` for a name that is both a number and a
+    time, or a text without a parameter.
+    """
+    if not isinstance(text, str):
+        raise TypeError(f"the text of a formula with parameters is needed; got {text!r}")
+    names: dict[str, bool] = {}
+    slots: dict[float, str] = {}
+    known: dict[str, float] = dict(constants or {})
+    inside = False
+
+    def put(match: re.Match[str]) -> str:
+        nonlocal inside
+        word, name = match[0], match[1]
+        inside = (inside or word == "[") and word != "]"
+        if name is None:
+            return word
+        if names.setdefault(name, inside) != inside:
+            raise ValueError(
+                f"?{name} is an end of an interval and a number in {text!r}: give them two names"
+            )
+        if not inside:
+            return f'"?{name}"'
+        is_end = match.string[: match.start()].rstrip()[-1] in ",:"
+        slot = (len(slots) + 1) * (_END if is_end else _START)
+        slots[slot] = name
+        known[f"{name}__{len(slots)}"] = slot
+        return f"{name}__{len(slots)}"
+
+    plain = _WORDS.sub(put, text)
+    if not names:
+        raise ValueError(
+            f"{text!r} has no parameter: write ?name for a number or a time that is to be found, "
+            "as in always[0, ?T] (distance > ?d)"
+        )
+    return Parametric(text, parse(plain, known, definitions), tuple(names), slots)
+
+
+def _parameters(*terms: Term) -> list[str]:
+    return [name[1:] for term in terms for name in term.signals() if name.startswith("?")]
+
+
+def _with_numbers(e: Term, values: Mapping[str, float]) -> Term:
+    match e:
+        case Signal(name) if name.startswith("?"):
+            return Number(values[name[1:]])
+        case Arithmetic(name, arguments):
+            filled = tuple(expression(_with_numbers(a, values)) for a in arguments)
+            return Arithmetic(name, filled)
+    return e
+
+
+def _term_signs(e: Term, name: str) -> set[int]:
+    """Return the directions in which an expression moves as a signal grows; 0 for unknown."""
+    if name not in e.signals():
+        return set()
+    match e:
+        case Signal():
+            return {1}
+        case Arithmetic("+" | "min" | "max" | "sqrt", arguments):
+            return {sign for a in arguments for sign in _term_signs(a, name)}
+        case Arithmetic("-", (left, right)):
+            return _term_signs(left, name) | {-sign for sign in _term_signs(right, name)}
+        case Arithmetic("neg", (inner,)):
+            return {-sign for sign in _term_signs(inner, name)}
+        case Arithmetic("*" | "/" as word, (left, right)):
+            if (factor := constant_value(right)) is not None:
+                return {sign * _sign(factor) for sign in _term_signs(left, name)}
+            if word == "*" and (factor := constant_value(left)) is not None:
+                return {sign * _sign(factor) for sign in _term_signs(right, name)}
+    return {0}
+
+
+def _sign(number: float) -> int:
+    return (number > 0) - (number < 0)

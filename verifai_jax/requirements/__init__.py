@@ -1,0 +1,12 @@
+"""Answers about requirements from simulations and searches, for the questions that `mtl` asks.
+
+`vj.mtl.mine` takes a problem instead of recordings.
+"""
+
+from verifai_jax.requirements.by_search import mine_by_search, simulated
+
+__all__ = ["mine_by_search", "simulated"]
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

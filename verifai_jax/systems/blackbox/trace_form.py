@@ -1,0 +1,110 @@
+"""The form of the traces that a simulator declares, to which each of them is held."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+
+from verifai_jax.core.checks import check_count
+from verifai_jax.core.trace import Trace
+
+SignalNames = Sequence[str] | Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class TraceForm:
+    """The form that every trace of a simulator must have; a part that is None may be anything.
+
+    **Arguments:**
+
+    - `signals`: names of scalars, or names with their number of components (1 for a scalar).
+    - `dt`: sampling period in seconds.
+    - `length`: number of samples.
+
+    **Raises:** `ValueError` for a declaration that no trace can meet.
+    """
+
+    signals: SignalNames | None = None
+    dt: float | None = None
+    length: int | None = None
+
+    def __post_init__(self) -> None:
+        signals, dt, length = self.signals, self.dt, self.length
+        if signals is not None:
+            named = not isinstance(signals, str) and all(isinstance(n, str) for n in signals)
+            if not named or not len(signals):
+                raise ValueError(f"signals must be names, such as ('x', 'theta'); got {signals!r}")
+            for name, width in self.widths.items():
+                if not isinstance(width, int) or width < 1:
+                    raise ValueError(
+                        f"signals must say how many components {name!r} has, at least 1; "
+                        f"got {width!r}"
+                    )
+        if dt is not None and not (_is_number(dt) and 0 < dt < math.inf):
+            raise ValueError(f"dt must be a positive number of seconds; got {dt!r}")
+        if length is not None:
+            check_count("length", length)
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """The number of components of each signal."""
+        signals = () if self.signals is None else self.signals
+        return dict(signals) if isinstance(signals, Mapping) else dict.fromkeys(signals, 1)
+
+    def abstract(self) -> Trace | None:
+        """Return a trace of this form as shapes; None if the form is incomplete."""
+        if self.signals is None or self.dt is None or self.length is None:
+            return None
+        shapes = {n: (self.length, *([] if w == 1 else [w])) for n, w in self.widths.items()}
+        signals: Any = {n: jax.ShapeDtypeStruct(s, np.float32) for n, s in shapes.items()}
+        return Trace(signals, dt=self.dt)
+
+    def accept(self, trace: object) -> Trace:
+        """Return a simulator's trace with its signals as NumPy arrays, if it has this form.
+
+        **Raises:** `TypeError` for anything but a trace of numbers, `ValueError` for one that is
+        not as declared; both say what was expected and what came.
+        """
+        if not isinstance(trace, Trace):
+            raise TypeError(f"the system must return a Trace; it returned {type(trace).__name__}")
+        signals = {name: np.asarray(signal) for name, signal in trace.signals.items()}
+        for name, signal in signals.items():
+            if signal.dtype.kind not in "biuf":
+                raise TypeError(f"signal {name!r} must hold real numbers; got {signal.dtype}")
+        if self.signals is not None:
+            self._check_signals(signals)
+        if self.dt is not None:
+            wanted = f"the trace must have the sampling period dt={self.dt}"
+            if trace.dt is None:
+                raise ValueError(f"{wanted}; it has sample times")
+            if not math.isclose(trace.dt, self.dt, rel_tol=1e-6):
+                raise ValueError(f"{wanted}; got dt={trace.dt}")
+        if self.length is not None and trace.length != self.length:
+            raise ValueError(f"the trace must have {self.length} samples; got {trace.length}")
+        return replace(trace, signals=signals)
+
+    def _check_signals(self, signals: Mapping[str, np.ndarray]) -> None:
+        widths = self.widths
+        if signals.keys() != widths.keys():
+            missing = ", ".join(name for name in widths if name not in signals)
+            extra = ", ".join(name for name in signals if name not in widths)
+            how = [f"{missing} missing"] * bool(missing) + [f"{extra} not expected"] * bool(extra)
+            raise ValueError(
+                f"the trace must have the signals {', '.join(widths)}; got "
+                f"{', '.join(signals)} ({'; '.join(how)})"
+            )
+        for name, width in widths.items():
+            shape = signals[name].shape
+            if shape[1:] != (() if width == 1 else (width,)):
+                wanted = "[time]" if width == 1 else f"[time, {width}]"
+                hint = ""
+                if not isinstance(self.signals, Mapping):
+                    hint = f"; declare vectors by signals={{{name!r}: {shape[1]}, ...}}"
+                raise ValueError(f"signal {name!r} must be {wanted}; got {list(shape)}{hint}")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -1,0 +1,18 @@
+"""Contract suites: run them on domains, searches and systems of your own.
+
+    check_domain(MyDomain(...))                          # round trips, shapes, table columns
+    check_search(MySearch(...), Cube((0, 0, 4)))         # init / ask / tell
+    check_system(my_simulator, space)                    # one clock, same alone and in batches
+
+Each raises `AssertionError` that says which law is broken.
+
+    @given(strategy(space))                             # features for tests of Hypothesis
+    def test_keeps_lane(features): ...
+"""
+
+from verifai_jax.testing.domains import check_domain
+from verifai_jax.testing.searches import check_batch_independence, check_search
+from verifai_jax.testing.strategies import strategy
+from verifai_jax.testing.systems import check_system
+
+__all__ = ["check_batch_independence", "check_domain", "check_search", "check_system", "strategy"]
