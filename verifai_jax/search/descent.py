@@ -234,19 +234,16 @@ AT_ONCE = 2
 """Maximum number of descents of a round: few, so that within a thousand simulations some come far.
 """
 
-EARLY = 300.0
-"""Simulations before the first descent begins, from the best point of the others: most budgets of
-the ARCH competition, in which they need no help. Rosenbrock's function in ten dimensions fell below
-1 within 1500 simulations from 10, 10, 9 and 9 of 10 seeds in batches of 1, 2, 4 and 16; beginning
-at 400, with four descents at once, from 10, 7 and 9 in batches of 1, 4 and 16."""
+EARLY = 400.0
+"""Simulations before the first descent begins, from the best point of the others: more than most
+budgets of the ARCH competition, in which they need no help. Rosenbrock's function in ten dimensions
+fell below 1 within 1500 simulations from 10, 9, 9 and 9 of 10 seeds in batches of 1, 2, 4 and 16;
+beginning at 500 from 2 of 10 in batches of 1, where the others are in the wrong hollow by then."""
 
 TRIAL = 24.0
 """Simulations of descents, before `BEGINS`, that may lower no robustness: a dozen slopes, in which
-one from a good point gets on if any does."""
-
-WORTH = 4.0
-"""Simulations in vain that they may spend for each that they had spent when they last got on: a
-valley that led to a minimum which is no failure has others, to be met from other starts."""
+one from a good point gets on if any does. They may spend as many more as they had spent when they
+last got on: a valley that led to a minimum which is no failure has others nearby."""
 
 BEGINS = 1500.0
 """Simulations before descents go on that are behind the others: the budget of the ARCH competition.
@@ -371,7 +368,7 @@ def waits(state: InteriorState) -> bool:
 
 def _tried(state: InteriorState) -> Bool[Array, ""]:
     """Return whether the descents have been in vain for as long as they are given."""
-    return state.since >= TRIAL + WORTH * (state.spent - state.since)
+    return state.since >= TRIAL + (state.spent - state.since)
 
 
 def _max_credit(state: InteriorState) -> float:
