@@ -286,6 +286,11 @@ class CartPoleTask:
                 features[name] = NOMINAL[name] * factor(unit, spread)
         return Episode(state, features)
 
+    def start(self, key: Key[Array, ""], features: Features) -> Episode:
+        """Start with the features of a problem, all else nominal."""
+        state = State(*(jnp.asarray(part, float) for part in initial(features)))
+        return Episode(state, {name: features[name] for name in ("masspole", "length")})
+
     def step(
         self, key: Key[Array, ""], state: Episode, action: Int[Array, ""]
     ) -> tuple[Episode, Scalar, Bool[Array, ""]]:

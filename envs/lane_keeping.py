@@ -37,6 +37,7 @@ Scalar = Float[Array, ""]
 Controller = Callable[[Any, "State", Features], Scalar]
 
 DT = 0.04  # A lane camera gives 25 images a second.
+NOISE_KNOTS = 11  # of the noise of a task that varies, as in `specs.lane_keeping`
 GRAVITY = 9.81
 LANE_WIDTH = 3.5
 CAR_WIDTH = 1.8
@@ -239,10 +240,17 @@ def neural(policy: Policy | str | Path = POLICY_FILE) -> Controller:
 
 
 class Drive(NamedTuple):
-    """A car in training: its state, and the road that it is on."""
+    """A car in training: its state, the road that it is on, what else varies, and the time."""
 
     car: State
     road: Waveform
+    others: dict[str, Any]
+    time: Scalar
+
+    @property
+    def features(self) -> dict[str, Any]:
+        """All features of the episode that its steps use."""
+        return {"curvature": self.road, **self.others}
 
 
 @dataclass(frozen=True)
@@ -251,9 +259,13 @@ class LaneKeepingTask:
 
     The reward of a step is 1 in the middle of the lane, less for offset, heading and for steering
     in jerks; leaving the lane ends the episode.
+
+    - `varied`: whether the car differs from one episode to the next, so that an episode can `start`
+      with the features of a problem; those that the task draws itself stay nominal.
     """
 
     time_limit: int = 250
+    varied: bool = False
 
     @property
     def action(self) -> Continuous:
@@ -271,23 +283,36 @@ class LaneKeepingTask:
             "speed0": NOMINAL["speed0"] + 3.0 * speed,
             "curvature": Waveform(knots, duration=300.0),
         }
-        state = State(*map(jnp.asarray, initial(features)))
-        return Drive(jax.tree.map(lambda x: x.astype(float), state), features["curvature"])
+        if self.varied:
+            features |= {name: NOMINAL[name] for name in ("wheelbase", "lag", "friction", "bias")}
+            features["noise"] = Waveform(jnp.zeros(NOISE_KNOTS))
+        return self.start(key, features)
+
+    def start(self, key: Key[Array, ""], features: Features) -> Drive:
+        """Start with these features: a road, and a car unless that is nominal."""
+        state = State(*(jnp.asarray(part, float) for part in initial(features)))
+        duration, others = self.time_limit * DT, {}
+        for name, value in features.items():
+            if name in ("wheelbase", "lag", "friction", "bias", "noise"):
+                wave = isinstance(value, Waveform)
+                others[name] = value.over(duration) if wave else jnp.asarray(value, float)
+        return Drive(state, features["curvature"], others, jnp.zeros(()))
 
     def step(
         self, key: Key[Array, ""], state: Drive, action: Float[Array, "1"]
     ) -> tuple[Drive, Scalar, Bool[Array, ""]]:
         """Take one step of 0.04 s."""
-        features = {"curvature": state.road}
-        before, command, time = state.car, action[0], jnp.zeros(())
+        features, time = state.features, state.time
+        before, command = state.car, action[0]
         rates = dynamics(time, before, command, features)
         after = rk4(lambda t, s: dynamics(t, s, command, features), time, before, DT)
         reward = 1 - after.offset**2 - 20 * after.heading**2 - rates.steer**2
-        return Drive(after, state.road), reward, jnp.abs(after.offset) > LANE_WIDTH / 2
+        over = jnp.abs(after.offset) > LANE_WIDTH / 2
+        return state._replace(car=after, time=time + DT), reward, over
 
     def observe(self, state: Drive) -> Float[Array, "5"]:
         """Return the input that `neural` gives to the network."""
-        seen = measured(jnp.zeros(()), state.car, {"curvature": state.road})
+        seen = measured(state.time, state.car, state.features)
         return jnp.stack(observation(seen))
 
 

@@ -191,11 +191,12 @@ FARTHEST = {"start_range": -0.5 - LEFT, "start_speed_range": MAX_SPEED, "shaping
 
 
 class Episode(NamedTuple):
-    """A state, and the physics of this episode."""
+    """A state, the physics of this episode, and what is added to the velocity that is observed."""
 
     state: State
     power: Scalar
     gravity: Scalar
+    velocity_bias: Scalar | float = 0.0
 
 
 @jax.tree_util.register_dataclass
@@ -238,6 +239,10 @@ class MountainCarTask:
         """Start at rest at the bottom of the valley, or as the ranges say."""
         return _reset(self, key, NOMINAL["power"])
 
+    def start(self, key: Key[Array, ""], features: Features) -> Episode:
+        """Start with the features of a problem, all else nominal."""
+        return _start(features, NOMINAL)
+
     def step(
         self, key: Key[Array, ""], state: Episode, action: Int[Array, ""]
     ) -> tuple[Episode, Scalar, Bool[Array, ""]]:
@@ -245,8 +250,8 @@ class MountainCarTask:
         return _step(self, state, action - 1.0, lambda there: -1.0, continuous=False)
 
     def observe(self, state: Episode) -> Float[Array, "2"]:
-        """Return position and velocity as `observed`."""
-        return observed(state.state)
+        """Return position and velocity as `observed`, with the episode's bias."""
+        return _observe(state)
 
 
 @jax.tree_util.register_dataclass
@@ -277,6 +282,10 @@ class ContinuousMountainCarTask:
         """Start at rest at the bottom of the valley, or as the ranges say."""
         return _reset(self, key, NOMINAL_CONTINUOUS["power"])
 
+    def start(self, key: Key[Array, ""], features: Features) -> Episode:
+        """Start with the features of a problem, all else nominal."""
+        return _start(features, NOMINAL_CONTINUOUS)
+
     def step(
         self, key: Key[Array, ""], state: Episode, action: Float[Array, "1"]
     ) -> tuple[Episode, Scalar, Bool[Array, ""]]:
@@ -289,8 +298,8 @@ class ContinuousMountainCarTask:
         return _step(self, state, throttle, reward, continuous=True)
 
     def observe(self, state: Episode) -> Float[Array, "2"]:
-        """Return position and velocity as `observed`."""
-        return observed(state.state)
+        """Return position and velocity as `observed`, with the episode's bias."""
+        return _observe(state)
 
 
 Either = MountainCarTask | ContinuousMountainCarTask
@@ -302,7 +311,21 @@ def _reset(task: Either, key: Key[Array, ""], power: float) -> Episode:
         State(-0.5 + task.start_range * position, task.start_speed_range * velocity),
         power * factor(engine, task.power_range),
         NOMINAL["gravity"] * factor(pull, task.gravity_range),
+        jnp.zeros(()),
     )
+
+
+def _start(features: Features, nominal: Features) -> Episode:
+    names = ("position0", "velocity0", "power", "gravity", "velocity_bias")
+    position, velocity, *physics = (
+        jnp.asarray({**nominal, **features}[name], float) for name in names
+    )
+    return Episode(State(position, velocity), *physics)
+
+
+def _observe(episode: Episode) -> Float[Array, "2"]:
+    position, velocity = episode.state
+    return observed(State(position, velocity + episode.velocity_bias))
 
 
 def _step(

@@ -31,6 +31,7 @@ SPENT = re.compile(
     r"[\d.,]+ (?:ms|s|min|h)(?= to compile| to search| to simulate| to confirm| to run| of a core)"
     r"|(?<=failing, )[\d.,]+ (?:ms|s|min|h)\b"
     r"|(?<=simulations in )[\d.,]+ (?:ms|s|min|h)(?=, stopped)"
+    r"|(?<=% intervals; )[\d.,]+ (?:ms|s|min|h)\b"
     r"|[\d.,]+ (?=(?:simulations|steps)/s\b)"
 )
 """Time that the machine needed, and its speed."""

@@ -28,6 +28,7 @@ LAYERS = (
     },
     {"failure_modes", "failure_table"},
     {"sweeps", "augmentation", "checking"},
+    {"hardening"},
     {"plotting"},
     {"reports"},
     {"cli", "testing"},

@@ -81,6 +81,8 @@ if TYPE_CHECKING:
     from verifai_jax.fuzzing import FuzzCoverage as FuzzCoverage
     from verifai_jax.fuzzing import FuzzRun as FuzzRun
     from verifai_jax.fuzzing import fuzz as fuzz
+    from verifai_jax.hardening import Hardening as Hardening
+    from verifai_jax.hardening import harden as harden
     from verifai_jax.mtl import Formula as Formula
     from verifai_jax.mtl import FormulaSyntaxError as FormulaSyntaxError
     from verifai_jax.mtl import always as always

@@ -151,7 +151,7 @@ NUMBERS = {
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("name", set(KINDS) - {"noise", "spikes", "packets", "jitter"})
+@pytest.mark.parametrize("name", sorted({*KINDS} - {"noise", "spikes", "packets", "jitter"}))
 def test_against_a_loop_by_hand(simulate, name):
     good = [float(course(k)) for k in range(STEPS + 1)]
     trace = simulate(name, onset=0.7, duration=1.1, **NUMBERS.get(name, {}))

@@ -121,7 +121,7 @@ def _named(recordings: Any) -> Iterator[tuple[str, Any]]:
         yield from ((str(name), source) for name, source in recordings.items())
         return
     alone = isinstance(recordings, str | Path | Trace) or hasattr(recordings, "columns")
-    several: Iterable[Any] = [recordings] if alone else recordings
+    several: Any = [recordings] if alone else recordings
     for index, source in enumerate(several, 1):
         if not isinstance(source, str | Path):
             yield f"recording {index}", source
@@ -166,7 +166,7 @@ def _judged(
     trace = trace.trim()
     dt, stride, fine = period(trace), trace.stride, trace.finely()
     wanted = dict.fromkeys(n for each in requirements for n in each.formula.signals())
-    known = {n: np.asarray(fine.signals[n]) for n in wanted if n in fine.signals}
+    known: dict[str, Any] = {n: np.asarray(fine.signals[n]) for n in wanted if n in fine.signals}
     signals = {n: _lengthened(np.asarray(s)) for n, s in numbers_of_signals(known).items()}
     shapes = tuple((n, s.shape) for n, s in signals.items())
     truncated = reading.end == "truncate"
@@ -184,7 +184,7 @@ def _judged(
         # At a robustness of zero the comparison decides.
         truths = [float(v) > 0 for v in _values(group, "boolean", signals, valid)]
     rows = {each.id: Row(name, each.id, error=faults[each.id]) for each in requirements}
-    clock = fine.clock()
+    clock = np.asarray(fine.clock())
     for each, value, holds in zip(sound, values, truths, strict=True):
         if math.isnan(value):
             missing = f"no verdict: {first_nan(each.formula, trace)}"

@@ -214,8 +214,8 @@ def _read_csv(path: Path) -> Any:
 def _are_units(second: list[str], third: list[str]) -> bool:
     """Return whether the row below the names has texts alone, and the next one numbers."""
     named = [cell.strip().strip('"') for cell in second]
-    words = {"nan", "null", "na", "true", "false"}
-    values = any(NUMBER.match(cell) or cell.lower() in words for cell in named)
+    constants = {"nan", "null", "na", "true", "false"}
+    values = any(NUMBER.match(cell) or cell.lower() in constants for cell in named)
     if values or len(named) != len(third):
         return False
     return any(cell and NUMBER.match(below) for cell, below in zip(named, third, strict=True))

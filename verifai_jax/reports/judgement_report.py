@@ -88,8 +88,13 @@ def _found(judgement: Judgement) -> Section:
     outliers = judgement.outliers()
     if len(outliers):
         found = [
-            (row.requirement, row.file, f"{row.robustness:z.4g}", f"{row.distance:z.3g}")
-            for row in outliers.itertuples()
+            (
+                row["requirement"],
+                row["file"],
+                f"{row['robustness']:z.4g}",
+                f"{row['distance']:z.3g}",
+            )
+            for row in outliers.to_dict("records")
         ]
         heads = ["requirement", "recording", "robustness", "distance"]
         content.append(table(heads, found[:MAX_ROWS], "Recordings unlike the others"))

@@ -15,7 +15,7 @@ rounding of float32 in each update where they are.
 
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple, TypeAlias
 
@@ -165,6 +165,16 @@ class BatchedTraining:
                 part = numbers[start : start + maximum]
                 self._advance(structure, part, done, until)
                 yield from part
+
+    def change_task(self, number: int, task: Task) -> None:
+        """Go on with other numbers in the task of a run; nothing is compiled again.
+
+        **Raises:** `ValueError` for a task of another structure.
+        """
+        changed = replace(self.configurations[number], task=task)
+        if _structure_of(changed) != self._structures[number]:
+            raise ValueError("a run can go on only with a task of the same structure and shapes")
+        self.configurations[number] = changed
 
     def policy(self, number: int) -> Policy:
         """Return the policy that a run has reached, on the host, without exploration."""

@@ -72,8 +72,12 @@ class OdeTask:
     def reset(self, key: Key[Array, ""]) -> OdeState:
         """Start as the loop does, under features drawn for this episode."""
         features_key, start_key = jax.random.split(key)
-        features = jax.tree.map(jnp.asarray, self.features(features_key))
-        state = as_floating(self.loop.initial(features, start_key), "initial")
+        return self.start(start_key, self.features(features_key))
+
+    def start(self, key: Key[Array, ""], features: PyTree) -> OdeState:
+        """Start as the loop does, under these features."""
+        features = jax.tree.map(jnp.asarray, features)
+        state = as_floating(self.loop.initial(features, key), "initial")
         return OdeState(jnp.zeros((), jax.tree.leaves(state)[0].dtype), state, features)
 
     def step(

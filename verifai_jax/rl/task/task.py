@@ -66,6 +66,9 @@ class Task(Protocol):
     - `step(key, state, action) -> (state, reward, terminated)`: one step of the environment.
     - `observe(state) -> [k]`: the numbers that the policy is given.
 
+    A task may also have `start(key, features) -> state`, the first state of an episode with given
+    features of a problem; `vj.harden` trains on counterexamples by it.
+
     The object is a static argument of compiled programs, so it must be hashable; or it is a pytree,
     whose numbers are then arguments of the program, so that other values compile nothing.
     """

@@ -1,0 +1,15 @@
+"""Training that hardens a policy: train, attack, add what fails to the training, certify.
+
+result = vj.harden(study, rounds=4)
+print(result)                           # failure probability before and after, return lost, cost
+"""
+
+from verifai_jax.hardening._harden import harden
+from verifai_jax.hardening.mixture import HardeningError
+from verifai_jax.hardening.result import Hardening
+
+__all__ = ["Hardening", "HardeningError", "harden"]
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

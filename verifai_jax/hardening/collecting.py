@@ -1,0 +1,105 @@
+"""Failures of a stage's policy, as points around which it is trained next.
+
+found = collect(problem, failing, seed=3, added=64, table=512, shrunk=4)
+found.points, found.sources                 # [n, d], and for each where it comes from
+
+Failures of the certificate and of its attack are simulated again and confirmed beside uniform
+samples; that table has rules, and its worst rows are shrunk. The attack's failures are drawn from
+the search's own proposal, so that their neighbourhoods stand for it.
+"""
+
+from typing import NamedTuple, Protocol
+
+import jax
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from verifai_jax.analysis import rules
+from verifai_jax.counterexamples import shrink
+from verifai_jax.falsification import falsify
+from verifai_jax.problem.problem import Problem
+from verifai_jax.search import PointList
+
+SHRINKING = 300
+"""Simulations to shrink a counterexample: a near failure is wanted, not the nearest."""
+PRIOR = 4096
+"""Samples of the prior of which those within the rules are kept."""
+
+
+class Collected(NamedTuple):
+    """Points of the unit cube to train around.
+
+    - `points`: `[n, d]`.
+    - `sources`: of each, `"counterexample"`, `"shrunk"` or `"rule"`.
+    - `simulations`: spent to confirm and shrink.
+    """
+
+    points: Float[np.ndarray, "n d"]
+    sources: np.ndarray
+    simulations: int
+
+
+def collect(
+    problem: Problem, failing: pd.DataFrame, *, seed: int, added: int, table: int, shrunk: int
+) -> Collected:
+    """Confirm failures, and make the points to train around of them.
+
+    **Arguments:**
+
+    - `problem`: of the policy.
+    - `failing`: rows that fail, the worst first.
+    - `seed`: of the uniform samples beside them.
+    - `added`: points at most.
+    - `table`: uniform samples that tell the rules where nothing fails.
+    - `shrunk`: counterexamples that are shrunk, where the problem says what is nominal.
+    """
+    space, points, sources = problem.space, [np.zeros((0, problem.space.dim), np.float32)], []
+    if not len(failing):
+        return Collected(points[0], np.zeros(0, np.str_), 0)
+
+    def add(found: Float[np.ndarray, "n d"], source: str) -> None:
+        points.append(np.asarray(found, np.float32))
+        sources.extend([source] * len(found))
+
+    # From the worst to the mildest: the worst ones alone are often of one kind.
+    spread = np.unique(np.linspace(0, len(failing) - 1, added).astype(int))
+    known = space.points(failing.iloc[spread])
+    uniform = np.asarray(space.points_at(space.sample(jax.random.key(seed), table)))
+    points_to_run = np.concatenate([known, uniform])
+    run = falsify(problem, PointList(points_to_run), len(points_to_run), seed=seed, progress=False)
+    end_if_interrupted(run)
+    simulations, confirmed = run.simulations, run.table.counterexamples
+    if shrunk and len(confirmed):
+        worst = np.linspace(0, len(confirmed) - 1, shrunk).astype(int)
+        for row in confirmed.sort_values("rho").index[np.unique(worst)]:
+            try:
+                small = shrink(run, int(row), budget=SHRINKING, others=False, progress=False)
+            except ValueError:
+                continue  # No nominal features, or a failure of its own random key alone.
+            end_if_interrupted(small)
+            add(small.u[None], "shrunk")
+            simulations += small.simulations
+    if len(confirmed):
+        drawn = space.rows(space.sample(jax.random.key(seed + 1), PRIOR))
+        prior = pd.DataFrame({name: np.asarray(column) for name, column in drawn.items()})
+        try:
+            within = prior.loc[rules(run).matches(prior)].iloc[: added // 4]
+        except ValueError:
+            within = prior.iloc[:0]  # Nothing or everything fails, so that there is no rule.
+        if len(within):
+            add(space.points(within), "rule")
+        kept = confirmed.iloc[: added - len(sources)]
+        add(space.points(kept), "counterexample")
+    return Collected(np.concatenate(points), np.array(sources, np.str_), simulations)
+
+
+class _Stopped(Protocol):
+    @property
+    def stopped(self) -> str | None: ...
+
+
+def end_if_interrupted(result: _Stopped) -> None:
+    """Raise again the Ctrl-C that a result ended early by: part of it is no round's number."""
+    if result.stopped == "interrupted":
+        raise KeyboardInterrupt
