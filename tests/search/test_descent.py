@@ -11,19 +11,11 @@ from scipy.optimize import linprog
 from verifai_jax.core.cube import Cube
 from verifai_jax.mtl.clauses import ABSENT
 from verifai_jax.search import Gradient, Observations, Portfolio
-<<<<<<< HEAD
-from verifai_jax.search.linear_steps import HALVINGS, minimax
-
-D, K = 5, 4
-FREE = np.ones(D, bool)
-solve = jax.jit(minimax, static_argnums=())
-=======
-from verifai_jax.search.gradient import HALVINGS, minimax_direction
+from verifai_jax.search.linear_steps import HALVINGS, minimax_direction
 
 D, K = 5, 4
 FREE = np.ones(D, bool)
 solve = jax.jit(minimax_direction, static_argnums=())
->>>>>>> main
 
 
 def exact(clauses, gradients, point, radius):

@@ -15,7 +15,7 @@ HALVINGS = 24
 float32 has bits, so that more would change nothing."""
 
 
-def minimax(
+def minimax_direction(
     clauses: Float[Array, " clauses"],
     gradients: Float[Array, "clauses d"],
     point: Float[Array, " d"],
