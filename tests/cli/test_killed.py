@@ -171,6 +171,27 @@ def test_compiled_simulations_are_kept(tmp_path, monkeypatch, problem):
 
 
 @pytest.mark.thorough
+def test_a_run_within_the_work_has_its_table_again(tmp_path, monkeypatch):
+    from verifai_jax.evaluation.engine import Engine
+
+    def system(features, key):
+        return vj.Trace({"x": features["part"]["a"] * jnp.ones(3)}, dt=1.0)
+
+    space = {"part": vj.Struct({"a": vj.Normal(0, 1), "b": vj.Categorical("on", "off")})}
+    problem = vj.Problem("nested", space, system, "always x <= 1.5")
+    options = {"search": "uniform", "budget": 300, "confirm": False, "progress": False}
+    whole = vj.falsify(problem, **options).table.all
+    with keeping(tmp_path / "kept", {"of": "it"}):
+        first = vj.falsify(problem, **options).table.all
+    monkeypatch.setattr(Engine, "evaluate", lambda *_, **__: pytest.fail("simulated again"))
+    with keeping(tmp_path / "kept", {"of": "it"}) as kept:
+        again = vj.falsify(problem, **options).table.all
+        kept.done = True
+    assert first.equals(whole)
+    assert again.equals(whole)
+
+
+@pytest.mark.thorough
 def test_another_model_has_no_finished_work(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SLOW", "0")

@@ -12,7 +12,6 @@ data augmentation, IJCAI 2018; Dreossi et al., VerifAI: a toolkit for the formal
 of artificial intelligence-based systems, CAV 2019.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -26,6 +25,7 @@ from verifai_jax.augmentation.study import Plan, Study
 from verifai_jax.augmentation.task import SupervisedTask
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.fingerprint import stable_text
 from verifai_jax.core.precision import reproducible_settings
 from verifai_jax.core.progress import ProgressBar
 from verifai_jax.core.source_collection import sources_of
@@ -161,18 +161,14 @@ def _fingerprint(task: SupervisedTask, plan: Plan) -> dict[str, Any]:
         "functions": {name: _name(getattr(task, name)) for name in functions},
         "measures": list(task.measures),
         "presence": task.has_presence,
-        "options": {f.name: _text(getattr(plan, f.name)) for f in fields(plan)},
+        "options": {f.name: stable_text(getattr(plan, f.name)) for f in fields(plan)},
         "version": __version__,
     }
 
 
 def _features(space: FeatureSpace) -> dict[str, str]:
-    return {name: _text(domain) for name, domain in space.domains.items()}
+    return {name: stable_text(domain) for name, domain in space.domains.items()}
 
 
 def _name(function: Any) -> str | None:
     return None if function is None else getattr(function, "__qualname__", type(function).__name__)
-
-
-def _text(value: object) -> str:
-    return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(value))

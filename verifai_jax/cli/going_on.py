@@ -35,7 +35,7 @@ _BESIDES = frozenset(
 
 
 class Kept:
-    """The end of a command, as it is told here."""
+    """The finished simulations of a command, which go once it is done."""
 
     def __init__(self, work: "Unfinished | None") -> None:
         self._work = work

@@ -36,8 +36,7 @@ def is_fleet(
 ) -> bool:
     """Return whether a command line is about several requirements or recordings."""
     several = len(recordings) > 1 or recordings[0].is_dir()
-    named = Path(formula).suffix.lower() in (".toml", ".csv", ".yaml", ".yml")
-    return several or named or report is not None or junit is not None
+    return several or _is_file(formula) or report is not None or junit is not None
 
 
 def monitor_fleet(
@@ -61,7 +60,7 @@ def monitor_fleet(
     """
     from verifai_jax import mtl
 
-    if Path(formula).suffix.lower() in (".toml", ".csv", ".yaml", ".yml"):
+    if _is_file(formula):
         requirements = mtl.read_requirements(formula, constants, definitions)
     else:
         requirements = [mtl.Requirement("formula", mtl.parse(formula, constants, definitions))]
@@ -84,3 +83,8 @@ def monitor_fleet(
     if len(found.without_verdict) == len(found.rows):
         raise CommandError("no requirement had a verdict on any recording", BROKEN)
     return found
+
+
+def _is_file(formula: str) -> bool:
+    """Return whether a word names a file of requirements, also one of a form that is refused."""
+    return Path(formula).suffix.lower() in (".toml", ".csv", ".yaml", ".yml")

@@ -290,8 +290,9 @@ class Transfer(InNotebook):
         worst = apart.loc[apart["gap"].idxmax()]
         lines.append(
             f"  traces part in {len(apart):,} of {len(sampled) + len(found):,} pairs, by up to "
-            f"{format_percent(worst['gap'])} of the range of {worst['signal']}; the first after "
-            f"{apart['parted'].min():z.3g} s, half of them by {apart['parted'].median():z.3g} s"
+            f"{format_percent(worst['gap'])} of the usual range of {worst['signal']}; the first "
+            f"after {apart['parted'].min():z.3g} s, half of them by "
+            f"{apart['parted'].median():z.3g} s"
         )
         named = [f"{n} ({format_percent(s)})" for n, s in self.influence.items() if s > 0.05][:3]
         if named:

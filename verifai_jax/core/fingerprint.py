@@ -18,6 +18,7 @@ What JAX has traced, and single steps of it, are functions again:
 
 import enum
 import hashlib
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -34,6 +35,10 @@ _CUSTOM = ("custom_jvp_call", "custom_vjp_call")
 """Primitives of functions that bring their own derivative."""
 _NAMED = ("UnspecifiedValue", "PRNGImpl", "Mesh", "AbstractMesh", "PyTreeDef", "Device", "FTTuple")
 """Classes of JAX whose text says all of them; the last one groups the operands of a loop (0.12)."""
+
+
+_ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")
+"""Addresses in memory, which differ between processes."""
 
 
 class _Unknown(Exception):
@@ -360,3 +365,10 @@ _RUN_AS_THEY_ARE = frozenset({*_CUSTOM_CALLS, *_CALLS, "cond", "scan", "while"})
 """Steps whose programs are in a batch if they are."""
 _CALLBACKS = frozenset({"pure_callback", "io_callback"})
 """Calls of Python, which have a rule that refuses some of them."""
+
+
+def stable_text(value: object) -> str:
+    """Return the `repr` of a value without addresses in memory; of an array all of its numbers."""
+    if isinstance(value, np.ndarray | jax.Array):
+        return repr(np.asarray(value).tolist())
+    return _ADDRESS.sub("", repr(value))

@@ -24,6 +24,7 @@ from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.run import Run
 from verifai_jax.problem.problem import Problem, ProblemError
+from verifai_jax.statistics.binomial import exact_interval
 
 Handover = Mapping[str, str]
 """Features of a part, with the signals, or features, of the part before that they come from."""
@@ -280,16 +281,15 @@ def _estimate(
     name: str, failures: int, without: int, count: int, effective: float, confidence: float
 ) -> PartEstimate:
     """Return a part with the interval of Clopper and Pearson, of so many effective samples."""
-    from scipy.special import betaincinv
-
-    tail, known = (1 - confidence) / 2, count - without
-    failing, n = effective * failures / count, effective
-    worst = effective * (failures + without) / count
+    known, share = count - without, effective / count
+    low, high = exact_interval(
+        share * failures, share * (failures + without), effective, confidence
+    )
     return PartEstimate(
         name=name,
         probability=failures / known if known else float("nan"),
-        low=float(betaincinv(failing, n - failing + 1, tail)) if failures else 0.0,
-        high=float(betaincinv(worst + 1, n - worst, 1 - tail)) if worst < n else 1.0,
+        low=low,
+        high=high,
         samples=count,
         without=without,
         effective=effective,

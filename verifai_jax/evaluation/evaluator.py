@@ -126,6 +126,7 @@ class Evaluator:
         self.simulations = 0
         self._mode = (precision, gradient, clauses, given, seed)
         self._kept: Part | None = None
+        self._keeps_traces = keep_traces is not False
 
     @property
     def compile_seconds(self) -> float:
@@ -228,9 +229,9 @@ class Evaluator:
         simulate: Callable[[], Verdicts],
     ) -> Verdicts:
         """Return the verdicts of work that goes on where an earlier process was killed."""
-        work = present()
+        work = None if self._keeps_traces else present()
         if work is None:
-            return simulate()
+            return simulate()  # Traces are not stored.
         if self._kept is None or self._kept.of is not work:
             self._kept = work.part(self.problem, *self._mode)
         if self._host is not None and not self._host.system.can_simulate_batch:

@@ -16,8 +16,9 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -29,6 +30,7 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.store.cache import Cache, CacheError, locked_cache
 from verifai_jax.store.log import Arrays
 
+Form: TypeAlias = jax.tree_util.PyTreeDef  # pyright: ignore[reportInvalidTypeForm]
 KIND = "unfinished"
 """Kind of the cache."""
 _PRESENT: ContextVar["Unfinished | None"] = ContextVar("unfinished", default=None)
@@ -80,7 +82,7 @@ class Unfinished:
         if known is None:
             with self.writing():
                 self.cache.note(name, {"about": about, "sources": sources.to_json()})
-        return Part(self, number)
+        return Part(self, number, jax.tree.structure(problem.space.feature_form))
 
     def settle(self, number: int) -> None:
         """Note which files a part has read by now, and which ones it has written."""
@@ -108,10 +110,13 @@ class Unfinished:
 
 
 class Part:
-    """The finished simulations of one evaluator."""
+    """The finished simulations of one evaluator.
 
-    def __init__(self, of: Unfinished, number: int) -> None:
-        self.of, self.number = of, number
+    - `form`: structure of the features of its problem.
+    """
+
+    def __init__(self, of: Unfinished, number: int, form: Form) -> None:
+        self.of, self.number, self._form = of, number, form
         self.journal = _Rows(of, number)
         self._known = {
             key: (arrays, i)
@@ -141,8 +146,10 @@ class Part:
         if self._known:
             found = [self._known.get(key) for key in _keys(asked)]
             if all(found):
-                return Verdicts.concatenate([_verdict(*one) for one in found if one is not None])
-        verdicts = simulate()._replace(features=None)
+                return Verdicts.concatenate(
+                    [_verdict(*one, self._form) for one in found if one is not None]
+                )
+        verdicts = simulate()
         self.of.put(self.number, {f"{self.number}/{numbers[0]}": {**asked, **_arrays(verdicts)}})
         self.settle()
         return verdicts
@@ -168,7 +175,7 @@ class _Rows(Journal):
 
 
 def present() -> Unfinished | None:
-    """Return the work whose simulations are kept now; None where nobody wants that."""
+    """Return the work whose simulations are kept now, or None if there is none."""
     return _PRESENT.get()
 
 
@@ -204,19 +211,26 @@ def _keys(asked: Arrays) -> Iterator[bytes]:
 _FIELDS = ("rho", "status", "violated", "gradient", "clauses", "clause_gradients", "coverage_ids",
            "guidance")  # fmt: skip
 """Fields of verdicts that are kept."""
+FEATURE = "feature."
+"""Beginning of the names of the arrays of features."""
 
 
 def _arrays(verdicts: Verdicts) -> dict[str, np.ndarray]:
     kept = {name: getattr(verdicts, name) for name in _FIELDS}
     arrays = {name: np.asarray(value) for name, value in kept.items() if value is not None}
+    for i, leaf in enumerate(jax.tree.leaves(verdicts.features)):
+        arrays[f"{FEATURE}{i}"] = np.asarray(leaf)
     if verdicts.messages is not None:
         arrays["messages"] = np.array([text or "" for text in verdicts.messages], dtype="U")
     return arrays
 
 
-def _verdict(arrays: Arrays, row: int) -> Verdicts:
+def _verdict(arrays: Arrays, row: int, form: Form) -> Verdicts:
     fields: dict[str, Any] = {
         name: arrays[name][row : row + 1] for name in _FIELDS if name in arrays
     }
+    if f"{FEATURE}0" in arrays:
+        leaves = [arrays[f"{FEATURE}{i}"][row : row + 1] for i in range(form.num_leaves)]
+        fields["features"] = jax.tree.unflatten(form, leaves)
     messages = [str(arrays["messages"][row])] if "messages" in arrays else None
     return Verdicts(**fields, messages=messages)

@@ -11,9 +11,8 @@ from jaxtyping import PyTree
 from verifai_jax.faults.chance import normal
 from verifai_jax.faults.fault import Fault, Moment, Number, Ranges, Vector, ends, within
 from verifai_jax.faults.smoothing import straight
+from verifai_jax.systems.delays import entry, line_of, moved_up
 
-FEW = 16
-"""Values of a line up to which each is an array of its own."""
 POSITIVE = (0.0, math.inf)
 ANY = (-math.inf, math.inf)
 
@@ -254,41 +253,24 @@ KINDS: tuple[type[Fault], ...] = (
 
 
 def _line(zero: Vector, periods: float) -> Any:
-    """Return the last values of something at first, the newest at index 0.
-
-    A few are arrays of their own: they move up without a copy, where an array of them all is
-    written anew at each step.
-    """
-    count = math.ceil(periods - 1e-6) + 1
-    if count <= FEW:
-        return (zero,) * count
-    return zero[None] * np.zeros((count, 1), zero.dtype)
+    return line_of(zero, math.ceil(periods - 1e-6) + 1)
 
 
 def _late(good: Vector, line: Any, seconds: Any, at: Moment) -> tuple[Vector, Any]:
     """Return the value of some seconds ago, in whole periods, and the line with the newest."""
-    xp, few = at.xp, isinstance(line, tuple)
-    line = (good, *line[:-1]) if few else xp.concatenate([good[None], line[:-1]])
+    xp, line = at.xp, moved_up(line, good, at.xp)
     if not at.acts:
         # Before the first observation there was none other; before the first action, no action.
         line = jax.tree.map(lambda values: xp.where(at.first, good, values), line)
     latest = len(line) - 1
-
-    def value(index: Any) -> Any:
-        if not few:
-            return line[index]
-        chosen = line[0]
-        for i, earlier in enumerate(line[1:], 1):
-            chosen = xp.where(index == i, earlier, chosen)
-        return chosen
-
     periods = xp.clip(seconds / at.period, 0, latest)
-    whole = value(xp.round(periods).astype(np.int32))
+    whole = entry(line, xp.round(periods).astype(np.int32), xp)
     if xp is np or good.dtype.kind != "f" or not latest:
         return whole, line
     left = xp.clip(xp.floor(periods).astype(np.int32), 0, latest - 1)
     share = periods - left
-    return straight(whole, value(left) * (1 - share) + value(left + 1) * share), line
+    smooth = entry(line, left, xp) * (1 - share) + entry(line, left + 1, xp) * share
+    return straight(whole, smooth), line
 
 
 def _still(value: Any) -> Any:

@@ -9,7 +9,6 @@ Sources: Pinto, Davidson, Sukthankar and Gupta, Robust adversarial reinforcement
 randomization for transferring deep neural networks, IROS 2017 (the baseline).
 """
 
-import re
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from verifai_jax.certification import Certificates, certify
 from verifai_jax.comparison import Comparison, compare
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.fingerprint import stable_text
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import reproducible_settings
 from verifai_jax.core.progress import say_done, shows_progress
@@ -38,6 +38,7 @@ from verifai_jax.rl import Algorithm, Task, evaluate
 from verifai_jax.search import Search
 from verifai_jax.statistics.confidence_sequences import safe_at
 from verifai_jax.store.cache import Cache, locked_cache
+from verifai_jax.sweeps.fingerprint import describe
 from verifai_jax.sweeps.study import Study
 from verifai_jax.sweeps.trainer import FunctionTrainer, Trainer
 
@@ -342,7 +343,7 @@ class Work:
             stopped=stopped,
             seconds=time.perf_counter() - began,
             options={name: getattr(plan, name) for name in Plan.__dataclass_fields__}
-            | {"attack": _text(plan.attack)},
+            | {"attack": stable_text(plan.attack)},
             notes=tuple(notes),
             version=__version__,
         )
@@ -384,15 +385,11 @@ def _fingerprint(
     """Describe what decides the numbers of every round; code by its name only."""
     return {
         "study": study.name,
-        "task": _text(study.trainer.task),
-        "algorithms": {name: _text(each) for name, each in study.trainer.by_name.items()},
-        "hyperparameters": {name: _text(value) for name, value in values.items()},
-        "space": {name: _text(domain) for name, domain in problem.space.domains.items()},
+        "task": describe(study.trainer.task),
+        "algorithms": {name: describe(each) for name, each in study.trainer.by_name.items()},
+        "hyperparameters": {name: stable_text(value) for name, value in values.items()},
+        "space": {name: stable_text(domain) for name, domain in problem.space.domains.items()},
         "formulas": {name: str(formula) for name, formula in problem.formulas.items()},
-        "options": {name: _text(getattr(plan, name)) for name in Plan.__dataclass_fields__},
+        "options": {name: stable_text(getattr(plan, name)) for name in Plan.__dataclass_fields__},
         "version": __version__,
     }
-
-
-def _text(value: object) -> str:
-    return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(value))

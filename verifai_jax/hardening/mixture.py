@@ -45,7 +45,7 @@ class MixtureTask:
 
     - `shares`: of episodes that are the task's own, from the prior, and from neighbourhoods.
     - `low`, `high`: `[neighbourhoods, d]`, boxes of the unit cube; the first `count` of them count.
-    - `own`: the point of the unit cube of the task's own episodes; None where they are its `reset`.
+    - `own`: the point of the unit cube of the task's own episodes; None if `reset` starts them.
     """
 
     # JAX rebuilds the class with stacked arrays and placeholders, which have other shapes.

@@ -43,7 +43,7 @@ class Hardening(Drawn, InNotebook):
     - `policies`: of each arm and round; `chosen`: the round of each arm.
     - `certificates`: of the policies before, after, and of the baseline's, if there is one, from
       samples that nothing was trained on or chosen by. Their intervals hold together.
-    - `comparison`: of before and after in pairs; None where the first policy is returned.
+    - `comparison`: of before and after in pairs; None if the first policy is returned.
     - `returns`: of `"start"` and the arms' chosen policies, episode by episode in pairs.
     - `stopped`: `"certified"`, `"budget"` or `"max_seconds"`.
     - `options`: numbers that it was called with; `notes` for people; `seconds`; `version`.

@@ -19,6 +19,7 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl import windows
 from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
 from verifai_jax.mtl.formula import Formula, Interval, Term
+from verifai_jax.mtl.semantics import compared
 from verifai_jax.mtl.tree import missing_case
 
 End = Literal["hold", "truncate", "strict"]
@@ -158,32 +159,16 @@ class Evaluator:
 
     def _leaf(self, f: Formula, first: int, last: int) -> Array:
         start, stop = min(first, self._last), min(last, self._last)
+        boolean = self.kind == "boolean"
         match f:
             case ast.Predicate(comparison, left, right):
                 a, b = (self.expression(e, start, stop) for e in (left, right))
-                value = self._compared(comparison, a, b)
+                value = compared(comparison, a, b, boolean, jnp)
             case ast.Atom(e):
-                value = self._compared(">", self.expression(e, start, stop), 0.0)
+                value = compared(">", self.expression(e, start, stop), 0.0, boolean, jnp)
         if f in self.nudges:
             value = value + self.nudges[f][start : stop + 1]
         return self._extended(value, last - first + 1)
-
-    def _compared(self, comparison: str, a: Array | float, b: Array | float) -> Array:
-        match comparison:
-            case ">" | ">=":
-                margin = a - b
-            case "<" | "<=":
-                margin = b - a
-            case "==":
-                margin = -jnp.abs(a - b)
-            case _:
-                margin = jnp.abs(a - b)
-        margin = jnp.asarray(margin)
-        if self.kind != "boolean":
-            return margin
-        holds = margin >= 0 if comparison in (">=", "<=", "==") else margin > 0
-        verdict = jnp.where(holds, 1.0, -1.0).astype(margin.dtype)
-        return jnp.where(jnp.isnan(margin), margin, verdict)
 
     def expression(self, e: Term, start: int, stop: int) -> Array | float:
         """Compute an expression at the samples `start` to `stop` (a float, if it is constant)."""

@@ -21,6 +21,7 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.evaluate import End, samples
 from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
 from verifai_jax.mtl.formula import Formula, Interval, Term
+from verifai_jax.mtl.semantics import compared
 from verifai_jax.mtl.setting import check_trace, period
 from verifai_jax.mtl.tree import missing_case, postorder
 
@@ -161,19 +162,7 @@ class HostValues:
         self, comparison: str, left: Term, right: Term, boolean: bool, pad: int
     ) -> Values:
         a, b = (self._expression(e, pad) for e in (left, right))
-        match comparison:
-            case ">" | ">=":
-                margin = a - b
-            case "<" | "<=":
-                margin = b - a
-            case "==":
-                margin = -np.abs(a - b)
-            case _:
-                margin = np.abs(a - b)
-        if not boolean:
-            return margin
-        holds = margin >= 0 if comparison in (">=", "<=", "==") else margin > 0
-        return np.where(np.isnan(margin), np.nan, np.where(holds, 1.0, -1.0))
+        return compared(comparison, a, b, boolean, np)
 
     def _expression(self, e: Term, pad: int) -> Values:
         values: dict[int, Values] = {}

@@ -88,7 +88,7 @@ class Judgement(InNotebook):
         """The row of the requirement that is nearest to its limit, or farthest beyond it.
 
         Requirements have different units, so the robustness of each is divided by the median of
-        its absolute values over the fleet. None where nothing has a finite robustness.
+        its absolute values over the fleet. None if nothing has a finite robustness.
         """
         best, lowest = None, math.inf
         for each in self.requirements:

@@ -215,7 +215,7 @@ class _Axis:
     sampled: bool
 
     def tightest(self, holds: Callable[[float], bool], first: int = 0) -> int | None:
-        """Return the number of the tightest value that holds; None where the loosest does not."""
+        """Return the number of the tightest value that holds, or None if the loosest does not."""
         if first > self.last or not holds(self.value(first)):
             return None
         low, high = first, self.last + 1

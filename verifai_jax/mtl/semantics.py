@@ -10,7 +10,8 @@ A `Semantics` is a pytree whose only leaf is the temperature, so annealing does 
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from types import ModuleType
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -74,3 +75,31 @@ def smooth(
         if concrete and not bool(np.all(np.asarray(value) > 0)):
             raise ValueError(f"{name} must be positive; got {value}")
     return Semantics("smooth", tau=tau, error=error, bound=bound)
+
+
+def compared(comparison: str, left: Any, right: Any, boolean: bool, xp: ModuleType) -> Any:
+    """Compute the value of a comparison between arrays.
+
+    **Arguments:**
+
+    - `left`, `right`: arrays that broadcast, or numbers.
+    - `boolean`: whether the value is +1 where it holds and -1 where not, or else the margin.
+    - `xp`: `jax.numpy`, or `numpy` on the host.
+
+    **Returns:** the value, NaN where the margin is.
+    """
+    match comparison:
+        case ">" | ">=":
+            margin = left - right
+        case "<" | "<=":
+            margin = right - left
+        case "==":
+            margin = -xp.abs(left - right)
+        case _:
+            margin = xp.abs(left - right)
+    margin = xp.asarray(margin)
+    if not boolean:
+        return margin
+    holds = margin >= 0 if comparison in (">=", "<=", "==") else margin > 0
+    verdict = xp.where(holds, 1.0, -1.0).astype(margin.dtype)
+    return xp.where(xp.isnan(margin), margin, verdict)

@@ -2,7 +2,6 @@
 
 simulated(problem)                                  # 64 traces from the prior
 mine_by_search(read_parametric("always x > ?d"), problem)
-distinguish_by_search(a, b, problem)                # a trace on which they differ, or None
 """
 
 from dataclasses import replace

@@ -75,13 +75,28 @@ def clopper_pearson(
     """
     check_counts(failures, simulations, undecided)
     check_fraction("confidence", confidence)
+    low, high = exact_interval(failures, failures + undecided, simulations, confidence)
+    return Rate(failures, simulations, low, high, confidence, undecided=undecided)
+
+
+def exact_interval(
+    low_count: float, high_count: float, samples: float, confidence: float
+) -> tuple[float, float]:
+    """Compute the ends of the interval of Clopper and Pearson; counts may be effective ones.
+
+    **Arguments:**
+
+    - `low_count`, `high_count`: failures at least and at most, of which the ends take one each.
+    - `samples`: samples in all, or as many as weighted ones are worth.
+    - `confidence`: probability with which the interval is to hold.
+    """
     from scipy.special import betaincinv
 
     tail = (1 - confidence) / 2
-    k, maximum, n = failures, failures + undecided, simulations
-    low = 0.0 if k == 0 else float(betaincinv(k, n - k + 1, tail))
-    high = 1.0 if maximum == n else float(betaincinv(maximum + 1, n - maximum, 1 - tail))
-    return Rate(k, n, low, high, confidence, undecided=undecided)
+    low = 0.0 if low_count == 0 else float(betaincinv(low_count, samples - low_count + 1, tail))
+    if high_count >= samples:
+        return low, 1.0
+    return low, float(betaincinv(high_count + 1, samples - high_count, 1 - tail))
 
 
 def upper_bound(failures: int, simulations: int, confidence: float = 0.95) -> float:

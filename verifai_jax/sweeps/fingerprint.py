@@ -7,19 +7,13 @@ digest({"learning_rate": 1e-3})                     # 20 hexadecimal digits
 import dataclasses
 import hashlib
 import json
-import re
 from collections.abc import Mapping
 from typing import Any
 
-import jax
-import numpy as np
-
 from verifai_jax._version import __version__
+from verifai_jax.core.fingerprint import stable_text
 from verifai_jax.features import FeatureSpace
 from verifai_jax.sweeps.study import Study
-
-_ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")
-"""Addresses in memory, which differ between processes."""
 
 
 def fingerprint(study: Study, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -39,10 +33,10 @@ def fingerprint(study: Study, options: Mapping[str, Any]) -> dict[str, Any]:
         "study": study.name,
         "space": _features(study.space),
         "constrained": study.space.where is not None,
-        "task": _describe(study.trainer.task),
-        "nominal": _describe(study.trainer.evaluation_task),
+        "task": describe(study.trainer.task),
+        "nominal": describe(study.trainer.evaluation_task),
         "algorithms": {
-            name: _describe(algorithm) for name, algorithm in study.trainer.by_name.items()
+            name: describe(algorithm) for name, algorithm in study.trainer.by_name.items()
         },
         "steps": study.trainer.steps,
         "snapshots": list(study.checkpoints),
@@ -65,18 +59,12 @@ def digest(value: Mapping[str, Any]) -> str:
 
 
 def _features(space: FeatureSpace) -> dict[str, str]:
-    return {name: _text(domain) for name, domain in space.domains.items()}
+    return {name: stable_text(domain) for name, domain in space.domains.items()}
 
 
-def _describe(value: object) -> dict[str, str]:
+def describe(value: object) -> dict[str, str]:
     """Describe a dataclass by its fields, anything else by its `repr`."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {f.name: _text(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        fields = {f.name: stable_text(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return {"kind": type(value).__qualname__, **fields}
-    return {"kind": type(value).__qualname__, "is": _text(value)}
-
-
-def _text(value: object) -> str:
-    if isinstance(value, np.ndarray | jax.Array):
-        return repr(np.asarray(value).tolist())
-    return _ADDRESS.sub("", repr(value))
+    return {"kind": type(value).__qualname__, "is": stable_text(value)}

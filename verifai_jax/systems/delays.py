@@ -10,7 +10,8 @@ system gets zeros (an environment the first of its choices).
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from types import ModuleType
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -20,9 +21,12 @@ from jaxtyping import Array, Key, PyTree
 from verifai_jax.systems.channels import Instant, Link, Side
 
 Features: TypeAlias = PyTree
+Value: TypeAlias = Array | np.ndarray
 
 DelayOption: TypeAlias = int | Mapping[str, int]
 """The option of a delay: a number of steps, or `{feature: greatest number of steps}`."""
+FEW = 16
+"""Values of a line up to which each is an array of its own."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +52,20 @@ class Delay(Link):
         return (steps >= 0) & (steps <= self.max_steps) & (steps % 1 == 0)
 
     def begin(self, value: PyTree, now: Instant, key: Key[Array, ""] | int | None) -> PyTree:
-        return Line.of(value, self.max_steps)
+        # Without a delay nothing is remembered, which costs nothing.
+        leaves = jax.tree.leaves(value) if self.max_steps else []
+        return [line_of(jnp.asarray(leaf), self.max_steps + 1) for leaf in leaves]
 
     def through(self, state: PyTree, value: PyTree, now: Instant) -> tuple[PyTree, PyTree]:
-        return through(state, value, self.steps(now.features))
+        if not self.max_steps:
+            return value, state
+        leaves, form = jax.tree.flatten(value)
+        lines = [moved_up(line, leaf) for line, leaf in zip(state, leaves, strict=True)]
+        steps: Any = self.max_steps
+        if self.feature is not None:
+            wanted = jnp.asarray(self.steps(now.features)).astype(jnp.int32)
+            steps = jnp.clip(wanted, 0, self.max_steps)
+        return jax.tree.unflatten(form, [entry(line, steps) for line in lines]), lines
 
     def refusal(self, features: Features, owner: str) -> str | None:
         """Return what is wrong with the feature's value; None for a delay that `owner` can have."""
@@ -112,32 +126,31 @@ def as_delay(option: DelayOption, name: str) -> Delay:
     return delay
 
 
-class Line(NamedTuple):
-    """The last values of something, the newest first: `[most + 1, ...]` in each leaf."""
+def line_of(first: Value, count: int) -> Any:
+    """Return a line: the last `count` values of an array, the newest first, all of them `first`.
 
-    values: PyTree
-
-    @classmethod
-    def of(cls, first: PyTree, maximum: int) -> "Line | None":
-        """Return a line that holds `first` everywhere; None for no delay, which costs nothing."""
-        if not maximum:
-            return None
-        repeat = lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], maximum + 1, axis=0)  # noqa: E731
-        return cls(jax.tree.map(repeat, first))
+    A few are arrays of their own: they move up without a copy, where an array of them all is
+    written anew at each step.
+    """
+    return (first,) * count if count <= FEW else first[None].repeat(count, axis=0)
 
 
-def through(line: Line | None, value: PyTree, steps: Any) -> tuple[PyTree, Line | None]:
-    """Put a value into a line; return the one of `steps` steps ago, and the line after it."""
-    if line is None:
-        return value, None
+def moved_up(line: Any, new: Value, xp: ModuleType = jnp) -> Any:
+    """Return a line with a new value at its beginning, without the oldest one."""
+    new = xp.asarray(new, line[0].dtype)
+    if isinstance(line, tuple):
+        return (new, *line[:-1])
+    return xp.concatenate([new[None], line[:-1]])
 
-    def push(values: Array, new: Array) -> Array:
-        return jnp.concatenate([jnp.asarray(new, values.dtype)[None], values[:-1]])
 
-    values = jax.tree.map(push, line.values, value)
-    length = jax.tree.leaves(values)[0].shape[0]
-    index = jnp.clip(jnp.asarray(steps).astype(jnp.int32), 0, length - 1)
-    return jax.tree.map(lambda leaf: leaf[index], values), Line(values)
+def entry(line: Any, index: Any, xp: ModuleType = jnp) -> Any:
+    """Return the value of a line at an index, 0 for the newest."""
+    if isinstance(index, int) or not isinstance(line, tuple):
+        return line[index]
+    chosen = line[0]
+    for i, earlier in enumerate(line[1:], 1):
+        chosen = xp.where(index == i, earlier, chosen)
+    return chosen
 
 
 def links_of(*delays: Delay) -> tuple[Delay, ...]:

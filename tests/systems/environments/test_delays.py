@@ -9,7 +9,8 @@ from checked_types import unchecked
 
 import verifai_jax as vj
 from verifai_jax.core.trace import Status
-from verifai_jax.systems.delays import Delay, Line, as_delay, through
+from verifai_jax.systems.channels import Instant
+from verifai_jax.systems.delays import Delay, as_delay
 from verifai_jax.systems.environments._gymnasium import gymnasium
 
 STEPS = 40
@@ -127,13 +128,16 @@ def test_a_run_says_which_delay_is_too_long():
 
 
 def test_lines():
-    line = Line.of({"a": jnp.zeros(2)}, 2)
+    link, now = Delay(2), Instant(0.0, 0.1, {})
+    line = link.begin({"a": jnp.zeros(2)}, now, None)
     got = []
     for k in range(5):
-        value, line = through(line, {"a": jnp.full(2, float(k))}, 2)
+        value, line = link.through(line, {"a": jnp.full(2, float(k))}, now)
         got.append(float(value["a"][0]))
     assert got == [0, 0, 0, 1, 2]
-    assert through(None, 7, 0) == (7, None)
+    nothing = Delay(0).begin(7, now, None)
+    assert nothing == []
+    assert Delay(0).through(nothing, 7, now) == (7, nothing)
 
 
 @pytest.mark.parametrize("option", [-1, True, 1.5, {"a": 1, "b": 2}, {"a": -1}, {}, "late"])
