@@ -1,14 +1,20 @@
 """Problems of choices, flags, numbers and plateaus, on which slopes say little or nothing.
 
-    python benchmarks/search_quality.py mixed
+    python benchmarks/paired_searches.py mixed
 
-`SHARES` has the share of samples that fail. Where the robustness leads nowhere, no search can do
+The last five came after the default search was chosen, and no number of it was. `SHARES` has the share of samples that fail. Where the robustness leads nowhere, no search can do
 better than samples of the prior; where many coordinates are choices, descents move only the others.
 """
 
 import jax.numpy as jnp
+import numpy as np
 
 import verifai_jax as vj
+
+
+DOORS, RECIPE_LIMIT, CAPPED, QUEUE = 0.938, 3.3, 0.2, 27.86
+SINGLE = np.random.default_rng(47).normal(size=(5, 4))
+PAIRED = 0.6 * np.random.default_rng(48).normal(size=(4, 4, 4))
 
 
 def _steps(values):
@@ -82,6 +88,48 @@ def misled(features, key):
     return _steps(jnp.where(away < 0.1337, 1.0, -1.0 + away))
 
 
+def doors(features, key):
+    """Five flags of which one combination opens; elsewhere all values are the same."""
+    flags = jnp.stack([features[f"on{i}"] for i in range(5)])
+    opened = jnp.all(flags == jnp.array([1, 0, 1, 1, 0]))
+    far = features["a"] + features["b"] * features["c"] - DOORS
+    return _steps(jnp.where(opened, far, -1.0))
+
+
+def recipe(features, key):
+    """Five choices of four that pay singly and in pairs, and five numbers."""
+    chosen = [features[f"part{i}"] for i in range(5)]
+    worth = sum(jnp.asarray(SINGLE)[i, part] for i, part in enumerate(chosen))
+    worth += sum(jnp.asarray(PAIRED)[i, chosen[i], chosen[i + 1]] for i in range(4))
+    best = jnp.array([0.2, 0.7, 0.5, 0.9, 0.35])
+    u = jnp.stack([features[f"u{i}"] for i in range(5)])
+    return _steps(worth - 3 * jnp.sum((u - best) ** 2) - RECIPE_LIMIT)
+
+
+def capped(features, key):
+    """A bowl whose rim is flat: it covers all but a part of the space, for the right two flags."""
+    u = jnp.stack([features[f"u{i}"] for i in range(4)])
+    bowl = jnp.linalg.norm(u - jnp.array([0.7, 0.3, 0.6, 0.2]) + 1e-9)
+    wrong = 0.3 * (features["on0"] != 1) + 0.2 * (features["on1"] != 0)
+    return _steps(-jnp.clip(bowl + wrong - CAPPED, -1.0, 0.15))
+
+
+def queue(features, key):
+    """Whole numbers, a rate and a flag that multiply."""
+    load = features["jobs"] * features["size"] * (1 + features["rate"])
+    servers = features["servers"] * (2.0 - features["slow"]) * (1 + 0.5 * features["speed"])
+    return _steps(load / servers - QUEUE)
+
+
+def lanes(features, key):
+    """A choice, a flag and a whole number that guard a number, as signals of their own."""
+    speed = features["v"] * (1 + 0.1 * features["gear"]) - 0.4 * features["load"]
+    return vj.Trace(
+        {"speed": speed[None], "gear": features["gear"][None] * 1.0,
+         "lane": features["lane"][None] * 1.0, "wet": features["wet"][None] * 1.0}, dt=0.1,
+    )  # fmt: skip
+
+
 def _box(count: int) -> dict[str, vj.Box]:
     return {f"u{i}": vj.Box(0, 1) for i in range(count)}
 
@@ -115,6 +163,24 @@ PROBLEMS = {
             counts, "always out < 0",
         ),
         vj.Problem("misled", _box(3), misled, "always out < 0"),
+        vj.Problem("doors", {name: vj.Box(0, 1) for name in "abc"} | _flags(5), doors,
+                   "always out < 0"),
+        vj.Problem("recipe", _box(5) | {f"part{i}": vj.Categorical(0, 1, 2, 3) for i in range(5)},
+                   recipe, "always out < 0"),
+        vj.Problem("capped", _box(4) | _flags(2), capped, "always out < 0"),
+        vj.Problem(
+            "queue",
+            {"jobs": vj.DiscreteBox(1, 20), "servers": vj.DiscreteBox(1, 8),
+             "slow": vj.Categorical(0, 1), "size": vj.Box(0.5, 2), "rate": vj.Box(0, 1),
+             "speed": vj.Box(0, 1)},
+            queue, "always out < 0",
+        ),
+        vj.Problem(
+            "lanes",
+            {"gear": vj.DiscreteBox(1, 6), "lane": vj.Categorical(0, 1, 2),
+             "wet": vj.Categorical(0, 1), "v": vj.Box(0, 1), "load": vj.Box(0, 1)},
+            lanes, "always ((lane > 1.5 and wet > 0.5 and gear < 2.5) -> speed < 0.8)",
+        ),
     )
 }  # fmt: skip
 """By name."""
@@ -129,5 +195,10 @@ SHARES = {
     "votes": 2.65e-3,
     "counts": 1.0e-2,
     "misled": 1.0e-2,
+    "doors": 1.0e-2,
+    "recipe": 3.0e-3,
+    "capped": 2.0e-3,
+    "queue": 1.0e-2,
+    "lanes": 7.5e-3,
 }
 """Of 400 000 samples."""

@@ -2,7 +2,6 @@
 
     python benchmarks/search_quality.py landscapes [--seeds 24] [--searches bayes,bandit]
     python benchmarks/search_quality.py cartpole [--seeds 20] [--problem rare]
-    python benchmarks/search_quality.py mixed [--seeds 30] [--batch 16]
 
 What counts is the number of the simulation that found the first failure. On the landscapes the
 share of failures is known, and with it what uniform sampling needs in the median, log(2) / share;
@@ -20,7 +19,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from landscapes import LANDSCAPES, tell_of
-from mixed_spaces import PROBLEMS, SHARES
 
 import verifai_jax as vj
 from verifai_jax.core.targets import load_target
@@ -169,34 +167,17 @@ def on_cartpole(options):
         )
 
 
-def on_mixed_spaces(options):
-    """Print a line a problem: the median cost of the default search and of its rivals."""
-    rivals = {
-        "portfolio": vj.search.Portfolio(),
-        "without gradients": vj.search.Portfolio(gradients=False),
-        "cross_entropy": vj.search.CrossEntropy(),
-    }
-    print(f"{'':<12}{'log 2 / p':>10}" + "".join(f"{name:>19}" for name in rivals))
-    for name, problem in PROBLEMS.items():
-        options.budget = 1500
-        medians = [median_cost(problem, s, options.batch, options) for s in rivals.values()]
-        cells = "".join(f"{median:>19.0f}" for median in medians)
-        print(f"{name:<12}{math.log(2) / SHARES[name]:>10.0f}{cells}", flush=True)
-
-
 def main():
     """Measure and print one line a search."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("where", choices=["landscapes", "cartpole", "mixed"])
+    parser.add_argument("where", choices=["landscapes", "cartpole"])
     parser.add_argument("--seeds", type=int, default=24)
     parser.add_argument("--searches", default="", help="names, comma-separated")
     parser.add_argument("--landscapes", default="", help="names, comma-separated")
     parser.add_argument("--budget", type=int, default=10_000)
-    parser.add_argument("--batch", type=int, default=ACTIVE_BATCH, help="of mixed spaces")
     parser.add_argument("--problem", default="rare", help="name of a problem in specs/cartpole.py")
     options = parser.parse_args()
-    where = {"landscapes": on_landscapes, "cartpole": on_cartpole, "mixed": on_mixed_spaces}
-    where[options.where](options)
+    {"landscapes": on_landscapes, "cartpole": on_cartpole}[options.where](options)
 
 
 if __name__ == "__main__":
