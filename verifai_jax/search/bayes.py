@@ -14,6 +14,7 @@ All failures are equally good: below zero the target is flat. Above it is logari
 robustness over its lower quartile, and capped, so that huge values do not hide the rest.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
@@ -26,15 +27,16 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Search, Wants, draw_uniform, standard_normal
-from verifai_jax.search.gaussian_process import (
-    Hyper,
-    Posterior,
-)
+from verifai_jax.search.curvature import Curvature, advance, begin
+from verifai_jax.search.gaussian_process import Hyper, Posterior, TrainingData
 from verifai_jax.search.halton import halton_points
 from verifai_jax.search.process_data import (
+    LARGEST,
+    NO_VERDICT,
     encode,
     process_of,
     rows_to_keep,
+    scores,
     snap,
     training_data,
 )
@@ -46,10 +48,13 @@ MAX_PATHS = 32  # functions drawn for a batch; larger batches take several point
 WAVES = 256  # random waves of such a function
 FIT_POINTS, FIT_STEPS = 192, 8
 PARENTS = 8  # best points around which candidates are drawn
-# Correlation with an observation, above which a point need not be simulated: a hundred and
-# more roundings of float32 below one.
-KNOWN = 1 - 1e-5
-LARGEST = 1e30  # robustness above which nothing differs: sums of such stay finite in float32
+APART = (
+    1e-4  # distance from an observation in some coordinate, below which a point says nothing new
+)
+CLIMBS, CLIMB = 24, 0.05  # steps to a maximum of the expected improvement; their first length
+MARGIN = 0.1  # of the box around the best points, on each side
+REFITS = 20
+GREEDY = 0.1
 PATIENCE = 80  # points without progress, after which half of them are those of the prior
 
 
@@ -60,7 +65,7 @@ class BayesState(NamedTuple):
     explored: UInt32[Array, ""]  # points of the prior among them
     results: UInt32[Array, ""]  # rows, in all
     u: Float[Array, "capacity d"]
-    score: Float[Array, " capacity"]  # robustness, 0 for all failures; infinite where no point is
+    score: Float[Array, " capacity"]  # as of `scores`; infinite where no point is
     luck: Float[Array, " capacity"]  # says which points are kept
     verdicts: Int[Array, ""]  # points with a verdict, in all
     fitted: Int[Array, ""]  # of which the last fit knew
@@ -126,7 +131,7 @@ class Bayes(Search[BayesState]):
     ) -> tuple[Float[Array, "batch d"], BayesState]:
         key = jax.random.fold_in(state.key, state.round)
         row = jnp.arange(batch, dtype=jnp.uint32)
-        present = jnp.isfinite(state.score)
+        present = state.score <= LARGEST
         spread = jnp.max(state.score, where=present, initial=0.0) > jnp.min(
             state.score, where=present, initial=jnp.inf
         )
@@ -164,12 +169,15 @@ class Bayes(Search[BayesState]):
         return jnp.where(prior[:, None], fresh, chosen), after
 
     def tell(self, state: BayesState, cube: Cube, observations: Observations) -> BayesState:
-        usable = observations.valid & (observations.rho < jnp.inf)
-        score = jnp.where(usable, jnp.clip(observations.rho, 0.0, LARGEST), jnp.inf)
+        score = scores(observations)
+        usable = jnp.isfinite(score)
         number = state.results + jnp.arange(len(score), dtype=jnp.uint32)
-        progress = jnp.min(score) < 0.99 * jnp.min(state.score)
+        # Where no failure is near, what is left above the lowest counts, not above zero.
+        lowest, ordered = jnp.min(state.score), jnp.sort(state.score)
+        middle = ordered[jnp.sum(ordered <= LARGEST) // 2]
+        progress = jnp.min(score) < lowest - 0.01 * jnp.where(middle <= LARGEST, middle - lowest, 0)
         progress |= jnp.any(score == 0)
-        count = jnp.sum(usable, dtype=jnp.int32)
+        count, verdicts = (jnp.sum(each, dtype=jnp.int32) for each in (usable, score <= LARGEST))
         # A Weyl sequence (in steps of the golden ratio): as good as random for choosing.
         luck = (number * np.uint32(2654435769) >> 8).astype(jnp.float32) / 2**24
         u = jnp.concatenate([jnp.where(usable[:, None], observations.u, 0.5), state.u])
@@ -181,7 +189,7 @@ class Bayes(Search[BayesState]):
             u=u[rows],
             score=score[rows],
             luck=luck[rows],
-            verdicts=state.verdicts + count,
+            verdicts=state.verdicts + verdicts,
             stale=jnp.where(progress, 0, state.stale + count),
         )
         due = (state.verdicts >= self.initial) & (
@@ -206,17 +214,15 @@ class Bayes(Search[BayesState]):
         anywhere: Float[Array, "half d"],
     ) -> Float[Array, "batch d"]:
         """Return the points that the acquisition function ranks first."""
-        posterior = process_of(cube).condition(
-            state.hyper, training_data(state.u, state.score, cube)
-        )
+        process, data = process_of(cube), training_data(state.u, state.score, cube)
+        posterior, risk = process.condition(state.hyper, data), _risk(state, cube)
         drawing, placing = jax.random.split(key)
         half, d = anywhere.shape
-        if self.acquisition == "thompson":
-            paths = min(batch, MAX_PATHS)
-            each = -(-batch // paths)  # points from each path
-            steps = (paths * each, max(self.candidates // (paths * each), 4))
-        else:
-            paths, each, steps = 0, 0, (PARENTS, max(half // PARENTS, 1))
+        paths = min(batch, MAX_PATHS)
+        each = -(-batch // paths)  # points from each path
+        steps = (paths * each, max(self.candidates // (paths * each), 4))
+        if self.acquisition != "thompson":
+            steps = (0, 0)
         # Half of the candidates are anywhere, half of them around the best points, far and near.
         children = steps[0] * steps[1]
         width = 3 + 2 * d
@@ -227,8 +233,64 @@ class Bayes(Search[BayesState]):
         near = _near(state.u[parent], first, cube, jnp.array([0.5, 0.01]))
         shared = jnp.concatenate([anywhere, near])
         if self.acquisition == "thompson":
-            return _minima(drawing, posterior, cube, shared, later, paths)[:batch]
-        return _improving(posterior, cube, shared, later[0], batch)
+            chosen = _minima(drawing, posterior, risk, cube, shared, later, paths)[:batch]
+        else:
+            chosen = _improving(posterior, risk, cube, (0.0, 1.0), 1.0, shared, batch)
+        # Where no failure is known every second point refines the best ones.
+        refined = _refined(state, risk, cube, anywhere, batch)
+        row = jnp.arange(batch, dtype=jnp.uint32)
+        turn = (jnp.min(state.score) > 0) & ((state.proposals + row) % 4 == 0)
+        return jnp.where(turn[:, None], refined, chosen)
+
+
+def _risk(state: BayesState, cube: Cube) -> Callable[[Float[Array, "m d"]], Float[Array, " m"]]:
+    """Return minus the log probability of a verdict as a function of points; zero if all had one.
+
+    By another process, of zero for simulations with a verdict and one for those without.
+    """
+    process, without = process_of(cube), state.score == NO_VERDICT
+    data = TrainingData(encode(state.u, cube), without * 1.0, jnp.isfinite(state.score))
+    posterior = process.condition(process.first(), data)
+
+    def risk(u: Float[Array, "m d"]) -> Float[Array, " m"]:
+        share, std = process.predict(posterior, encode(u, cube))
+        return jnp.where(jnp.any(without), -log_ndtr((0.5 - share) / std), 0.0)
+
+    return risk
+
+
+def _refined(
+    state: BayesState,
+    risk: Callable[[Float[Array, "m d"]], Float[Array, " m"]],
+    cube: Cube,
+    anywhere: Float[Array, "half d"],
+    batch: int,
+) -> Float[Array, "batch d"]:
+    """Return points of the greatest expected improvement by a process of those near the best.
+
+    Over the box around them, which shrinks with them, and by the values in it: so it tells
+    values apart that are the same to the process of all points.
+    """
+    process, count = process_of(cube), min(3 * (cube.dim + 2), len(state.score))
+    away = jnp.sum((state.u - state.u[jnp.argmin(state.score)]) ** 2, axis=1)
+    _, best = jax.lax.top_k(-jnp.where(state.score <= LARGEST, away, jnp.inf), count)
+    there = state.score[best] <= LARGEST
+    points = state.u[best]
+    low = jnp.min(points, axis=0, where=there[:, None], initial=1.0)
+    high = jnp.max(points, axis=0, where=there[:, None], initial=0.0)
+    margin = jnp.maximum(MARGIN * (high - low), APART)
+    low, high = jnp.maximum(low - margin, 0.0), jnp.minimum(high + margin, 1.0)
+    discrete = np.array(cube.levels) > 0
+    low, high = jnp.where(discrete, 0.0, low), jnp.where(discrete, 1.0, high)
+    box = (low, jnp.maximum(high - low, APART))
+    score = jnp.where(there, state.score[best] - jnp.min(state.score), jnp.inf)
+    x = jnp.where(discrete, encode(points, cube), (points - box[0]) / box[1])
+    _, y, mask = training_data(points, score, cube)
+    data = TrainingData(x, y, mask)
+    hyper = process.fit(process.first(), data, REFITS)
+    posterior = process.condition(hyper, data)
+    shared = jnp.concatenate([(points - box[0]) / box[1], anywhere])
+    return _improving(posterior, risk, cube, box, GREEDY, shared, batch)
 
 
 # How far around its best candidate a function's minimum is sought, in two steps: the largest and
@@ -239,6 +301,7 @@ CLOSER = ((0.2, 0.02), (0.04, 0.004))
 def _minima(
     key: Key[Array, ""],
     posterior: Posterior,
+    risk: Callable[[Float[Array, "m d"]], Float[Array, " m"]],
     cube: Cube,
     shared: Float[Array, "m d"],
     random: Float[Array, "2 parents children r"],
@@ -251,9 +314,10 @@ def _minima(
     each = parents // count
 
     def basis(u: Float[Array, "m d"]) -> tuple[Array, Array]:
-        basis = process.basis(posterior, paths, encode(u, cube))
+        x = encode(u, cube)
+        basis = process.basis(posterior, paths, x)
         # Simulated already: to be chosen only if there is nothing else.
-        return basis, 100.0 * _already_simulated(posterior, basis[:, WAVES:])
+        return basis, risk(u) + 100.0 * _already_simulated(x, posterior)
 
     shared = snap(shared, cube)
     terms, penalty = basis(shared)
@@ -283,37 +347,54 @@ def _minima(
 
 def _improving(
     posterior: Posterior,
+    risk: Callable[[Float[Array, "m d"]], Float[Array, " m"]],
     cube: Cube,
+    box: tuple[Array | float, Array | float],
+    doubt: float,
     shared: Float[Array, "m d"],
-    random: Float[Array, "parents children r"],
     batch: int,
 ) -> Float[Array, "batch d"]:
-    """Return points with the largest expected improvement, each away from those before it."""
-    process = process_of(cube)
+    """Return points with the largest expected improvement, each away from those before it.
+
+    - `box`: its lowest corner and its sides; the process and the candidates have coordinates in it.
+    - `doubt`: factor on the standard deviations, which a search for more than improvement needs.
+    """
+    process, discrete = process_of(cube), np.array(cube.levels) > 0
     lowest = jnp.min(posterior.residual, where=posterior.mask, initial=jnp.inf)
 
-    def merit(u: Float[Array, "m d"]) -> tuple[Array, Array, Array]:
-        mean, std = process.predict(posterior, encode(u, cube))
-        z = (lowest - mean) / std
-        density = jnp.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
-        gain = std * (z * ndtr(z) + density)
-        # Far below zero the difference above is rounding errors; order by the distance instead.
-        worth = jnp.where(z > -4, jnp.log(jnp.maximum(gain, 1e-12)), -25 - z**2 / 2)
-        known = _already_simulated(posterior, process.cross(posterior, encode(u, cube)))
+    def seen(v: Float[Array, "m d"]) -> Float[Array, "m d"]:
+        return jnp.where(discrete, encode(v, cube), v)
+
+    def merit(v: Float[Array, "m d"]) -> tuple[Array, Array, Array]:
+        mean, std = process.predict(posterior, seen(v))
+        std = doubt * std
+        worth = jnp.log(std) + _log_gain((lowest - mean) / std) - risk(box[0] + box[1] * v)
+        known = _already_simulated(seen(v), posterior)
         return jnp.where(known, worth - 1e6, worth), mean, std
+
+    def loss(v: Float[Array, "n d"]) -> tuple[Array, Array]:
+        worth = merit(v)[0]
+        return -jnp.sum(worth), -worth
+
+    def climb(carry: tuple[Curvature, Array, Array], _: None) -> tuple:
+        state, v, fresh = carry
+        (_, value), slope = jax.value_and_grad(loss, has_aux=True)(v)
+        ok = jnp.isfinite(value) & jnp.all(jnp.isfinite(slope), axis=1)
+        value, slope = jnp.where(ok, value, 1e9), jnp.where(ok[:, None], slope, 0.0)
+        state, v = advance(state, v, value, slope, fresh, jnp.full(len(v), CLIMB))
+        return (state, v, jnp.zeros_like(fresh)), None
 
     shared = snap(shared, cube)
     worth, mean, std = merit(shared)
-    _, best = jax.lax.top_k(worth, random.shape[0])
-    parent = jnp.repeat(shared[best], random.shape[1], axis=0)
-    near = _near(parent, random.reshape(len(parent), -1), cube, jnp.array(CLOSER[0]))
-    near = snap(near, cube)
-    u = jnp.concatenate([shared, near])
+    _, best = jax.lax.top_k(worth, PARENTS)
+    climbing = (begin(PARENTS, cube.dim), shared[best], jnp.ones(PARENTS, bool))
+    (state, _, _), _ = jax.lax.scan(climb, climbing, None, length=CLIMBS)
+    v = jnp.concatenate([shared, state.point])
     worth, mean, std = (
         jnp.concatenate([one, two])
-        for one, two in zip((worth, mean, std), merit(near), strict=True)
+        for one, two in zip((worth, mean, std), merit(state.point), strict=True)
     )
-    x = encode(u, cube)
+    x = seen(v)
     gradient = jax.grad(lambda x: jnp.sum(process.predict(posterior, x)[0]))(x)
     steepest = jnp.maximum(jnp.sqrt(jnp.max(jnp.sum(gradient**2, axis=1))), 1e-3)
     codes = np.array(process.unordered)
@@ -328,7 +409,16 @@ def _improving(
         return (worth + log_ndtr(z)).at[best].set(-jnp.inf), best
 
     _, chosen = jax.lax.scan(choose, worth, None, length=batch)
-    return u[chosen]
+    return box[0] + box[1] * v[chosen]
+
+
+def _log_gain(z: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Return the logarithm of the expected improvement of a value, in its standard deviations."""
+    near, far = jnp.maximum(z, -4.0), jnp.minimum(z, -4.0)
+    gain = near * ndtr(near) + jnp.exp(-0.5 * near**2) / np.sqrt(2 * np.pi)
+    # Far below zero the sum above is rounding errors; two terms of its series instead.
+    series = -0.5 * far**2 - 0.5 * np.log(2 * np.pi) - jnp.log(far**2 + 3)
+    return jnp.where(z > -4, jnp.log(gain), series)
 
 
 def _near(
@@ -350,5 +440,6 @@ def _near(
     return jnp.where(moves, jnp.where(codes, noise, moved), parent)
 
 
-def _already_simulated(posterior: Posterior, cross: Float[Array, "m n"]) -> Bool[Array, " m"]:
-    return jnp.max(cross, axis=1) > KNOWN * jnp.exp(posterior.hyper.variance)
+def _already_simulated(x: Float[Array, "m d"], posterior: Posterior) -> Bool[Array, " m"]:
+    distance = jnp.max(jnp.abs(x[:, None] - posterior.x[None]), axis=2)
+    return jnp.any((distance < APART) & posterior.mask, axis=1)

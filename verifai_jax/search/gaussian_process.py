@@ -30,7 +30,7 @@ LENGTH = (-4.0, 8.0)
 few hundred points say nothing about what lies between them, to 3000 cubes, where a coordinate is of
 no influence."""
 
-NOISE = (-9.0, 0.0)
+NOISE = (-11.0, 0.0)
 """Range of the logarithm of the noise, which keeps 32-bit factors finite."""
 
 SMALLEST = 2.0**-24

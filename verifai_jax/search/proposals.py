@@ -12,7 +12,6 @@ row with the distribution it would have, given acceptance; rows that stay refuse
 valid in what it learns. A point that was simulated before is not simulated again (`repetition`).
 """
 
-import math
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, NamedTuple, NoReturn
@@ -87,7 +86,6 @@ class Proposals:
         self._rows = np.zeros(0, int)  # and which of them are simulated.
         self._plan: Plan | None = None
         self._barren = 0  # Rounds without any, so far.
-        self._greatest = -math.inf  # Robustness so far, for a search that avoids what has none.
         self._repetition = Repetition(cube, key) if search.learns and cube.dim else None
 
     @property
@@ -159,10 +157,8 @@ class Proposals:
         """
         if not self.search.learns:
             return
-        if self.search.wants.no_verdict_rows and valid.any():
-            self._greatest = float(np.max(rho[valid], initial=self._greatest))
-        if self.search.wants.no_verdict_rows and math.isfinite(self._greatest):
-            rho, valid = np.where(valid, rho, np.float32(self._greatest)), np.ones(len(rho), bool)
+        if self.search.wants.no_verdict_rows:
+            rho, valid = np.where(valid, rho, np.float32(np.nan)), np.ones(len(rho), bool)
         observations = Observations(
             u=self._points,
             rho=self._spread(rho, np.nan),
@@ -275,7 +271,6 @@ class Proposals:
             **{f"search.{i}": leaf for i, leaf in enumerate(leaves)},
             "queue": self._queue,
             "counts": np.array([self.proposed, self.accepted], np.int64),
-            **({"greatest": np.array(self._greatest)} if self.search.wants.no_verdict_rows else {}),
             **({} if self._repetition is None else {"simulated": self._repetition.codes}),
         }
 
@@ -299,7 +294,6 @@ class Proposals:
         self._state = jax.tree.unflatten(form, restored)
         self._queue = np.asarray(checkpoint["queue"])
         self.proposed, self.accepted = (int(count) for count in checkpoint["counts"])
-        self._greatest = float(checkpoint.get("greatest", -math.inf))
         if self._repetition is not None and "simulated" in checkpoint:
             self._repetition.restore(np.asarray(checkpoint["simulated"]))
 
