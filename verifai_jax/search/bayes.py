@@ -250,11 +250,21 @@ def _risk(state: BayesState, cube: Cube) -> Callable[[Float[Array, "m d"]], Floa
     """
     process, without = process_of(cube), state.score == NO_VERDICT
     data = TrainingData(encode(state.u, cube), without * 1.0, jnp.isfinite(state.score))
-    posterior = process.condition(process.first(), data)
+    some, n = jnp.any(without), len(without)
+    nothing = jnp.eye(n, dtype=jnp.float32), jnp.zeros(n, jnp.float32)
+    # Where all simulations had a verdict nothing of this is computed.
+    posterior = jax.lax.cond(
+        some,
+        lambda: process.condition(process.first(), data),
+        lambda: Posterior(process.first(), data.x, data.mask, data.y, *nothing),
+    )
 
     def risk(u: Float[Array, "m d"]) -> Float[Array, " m"]:
-        share, std = process.predict(posterior, encode(u, cube))
-        return jnp.where(jnp.any(without), -log_ndtr((0.5 - share) / std), 0.0)
+        def known() -> Float[Array, " m"]:
+            share, std = process.predict(posterior, encode(u, cube))
+            return -log_ndtr((0.5 - share) / std)
+
+        return jax.lax.cond(some, known, lambda: jnp.zeros(len(u), u.dtype))
 
     return risk
 
@@ -360,13 +370,14 @@ def _improving(
     - `doubt`: factor on the standard deviations, which a search for more than improvement needs.
     """
     process, discrete = process_of(cube), np.array(cube.levels) > 0
+    predict = process.predictor(posterior)
     lowest = jnp.min(posterior.residual, where=posterior.mask, initial=jnp.inf)
 
     def seen(v: Float[Array, "m d"]) -> Float[Array, "m d"]:
         return jnp.where(discrete, encode(v, cube), v)
 
     def merit(v: Float[Array, "m d"]) -> tuple[Array, Array, Array]:
-        mean, std = process.predict(posterior, seen(v))
+        mean, std = predict(seen(v))
         std = doubt * std
         worth = jnp.log(std) + _log_gain((lowest - mean) / std) - risk(box[0] + box[1] * v)
         known = _already_simulated(seen(v), posterior)
@@ -395,7 +406,7 @@ def _improving(
         for one, two in zip((worth, mean, std), merit(state.point), strict=True)
     )
     x = seen(v)
-    gradient = jax.grad(lambda x: jnp.sum(process.predict(posterior, x)[0]))(x)
+    gradient = jax.grad(lambda x: jnp.sum(predict(x)[0]))(x)
     steepest = jnp.maximum(jnp.sqrt(jnp.max(jnp.sum(gradient**2, axis=1))), 1e-3)
     codes = np.array(process.unordered)
 
