@@ -76,7 +76,8 @@ def _legible_figure() -> Any:
     class Legible(_plain_figure()):
         def savefig(self, *arguments: Any, **options: Any) -> None:
             super().savefig(*arguments, **options)
-            found = faults(self) + on_curves(self)
+            with figure.missing_glyphs():
+                found = faults(self) + on_curves(self)
             assert not found, "a picture that cannot be read: " + "; ".join(found)
 
     return Legible

@@ -11,9 +11,10 @@ PACKAGE = ROOT / "verifai_jax"
 
 LAYERS = (
     {"core", "store", "statistics", "_version"},
-    {"features", "mtl", "systems", "search", "clusters", "native_code"},
+    {"features", "mtl", "systems", "search", "clusters", "native_code", "sets"},
     {"rl", "problem", "perception", "events", "scenes", "blocks"},
     {"evaluation", "policies", "faults"},
+    {"verification"},
     {"falsification"},
     {
         "comparison",
@@ -26,11 +27,12 @@ LAYERS = (
         "compositional",
         "requirements",
     },
-    {"failure_modes", "failure_table"},
+    {"failure_modes", "failure_table", "error_budgets", "trials"},
     {"sweeps", "augmentation", "checking"},
     {"hardening"},
     {"plotting"},
     {"reports"},
+    {"traceability", "qualification"},
     {"cli", "testing"},
 )
 """Rooms from the ground up: each may import itself and the layers below its own."""

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from verifai_jax import policies as policies
     from verifai_jax import rl as rl
     from verifai_jax import search as search
+    from verifai_jax.analysis import boundary as boundary
     from verifai_jax.augmentation import Augmentation as Augmentation
     from verifai_jax.augmentation import SupervisedTask as SupervisedTask
     from verifai_jax.augmentation import augment as augment
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
     from verifai_jax.counterexamples import explain as explain
     from verifai_jax.counterexamples import replay_counterexamples as replay_counterexamples
     from verifai_jax.counterexamples import shrink as shrink
+    from verifai_jax.error_budgets import ErrorBudget as ErrorBudget
+    from verifai_jax.error_budgets import error_budget as error_budget
     from verifai_jax.estimation import Estimate as Estimate
     from verifai_jax.estimation import SequenceEstimate as SequenceEstimate
     from verifai_jax.estimation import estimate as estimate
@@ -97,6 +100,7 @@ if TYPE_CHECKING:
     from verifai_jax.problem import Problem as Problem
     from verifai_jax.problem import ProblemError as ProblemError
     from verifai_jax.problem import Rulebook as Rulebook
+    from verifai_jax.qualification import qualify as qualify
     from verifai_jax.scenes import ProgramError as ProgramError
     from verifai_jax.scenes import ScenicProgram as ScenicProgram
     from verifai_jax.scenes import scenic as scenic
@@ -127,6 +131,9 @@ if TYPE_CHECKING:
     from verifai_jax.systems.environments import gymnasium as gymnasium
     from verifai_jax.systems.environments import gymnax as gymnax
     from verifai_jax.systems.environments import playground as playground
+    from verifai_jax.systems.fmu import fmu as fmu
+    from verifai_jax.systems.fmu import fmu_ranges as fmu_ranges
+    from verifai_jax.systems.fmu import fmu_variables as fmu_variables
     from verifai_jax.systems.mujoco import Scaled as Scaled
     from verifai_jax.systems.mujoco import mjx as mjx
     from verifai_jax.systems.mujoco import mujoco as mujoco
@@ -134,6 +141,16 @@ if TYPE_CHECKING:
     from verifai_jax.systems.ode import ode as ode
     from verifai_jax.systems.ode import sin_cos as sin_cos
     from verifai_jax.systems.remote import remote as remote
+    from verifai_jax.traceability import TraceMatrix as TraceMatrix
+    from verifai_jax.traceability import trace_matrix as trace_matrix
+    from verifai_jax.trials import RealTrials as RealTrials
+    from verifai_jax.trials import calibrate as calibrate
+    from verifai_jax.trials import compare_trials as compare_trials
+    from verifai_jax.trials import real_trials as real_trials
+    from verifai_jax.trials import trial_protocol as trial_protocol
+    from verifai_jax.verification import Verification as Verification
+    from verifai_jax.verification import load_verification as load_verification
+    from verifai_jax.verification import verify as verify
 
 # Imported when first used (PEP 562), so that importing this package takes milliseconds.
 __getattr__, __dir__, __all__ = _attach(__name__, "__version__")

@@ -405,6 +405,24 @@ def test_the_help_may_be_cut_off_too():
     assert done.stderr == b""
 
 
+@pytest.mark.parametrize("words", [["--help"], ["monitor", "always x > 0", "log.csv"]])
+def test_an_output_that_cannot_be_written_is_one_line(tmp_path, words):
+    if not Path("/dev/full").exists():
+        pytest.skip("no /dev/full here")
+    (tmp_path / "log.csv").write_text("time,x\n0,1\n1,2\n")
+    command = [sys.executable, "-c", "from verifai_jax.cli.main import main; main()", *words]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run(
+            command, stdout=full, stderr=subprocess.PIPE, timeout=60, cwd=tmp_path, env=environment
+        )
+    assert done.returncode == 3
+    assert done.stderr.decode() == (
+        "Error: the output cannot be written (No space left on device); send it to a file on "
+        "another disk\n"
+    )
+
+
 @pytest.mark.parametrize(
     ("text", "match"),
     [

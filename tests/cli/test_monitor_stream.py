@@ -87,3 +87,18 @@ def test_options_that_need_the_whole_recording_are_refused():
     result = CliRunner().invoke(main, ["monitor", "always x > 0", "-", "--explain"], input="x\n")
     assert result.exit_code == 2
     assert "other options need the whole recording" in result.output
+
+
+def test_a_formula_becomes_a_monitor_in_c(tmp_path):
+    file = tmp_path / "keep-gap.h"
+    result = CliRunner().invoke(
+        main,
+        ["monitor", "always gap > near", "--const", "near=2", "--dt", "0.1", "--export-c", file],
+    )
+    assert result.exit_code == 0, result.output
+    assert "static inline void keep_gap_step(keep_gap *m, const double x[1])" in file.read_text()
+    for options in (["--dt", "0.1", "log.csv"], []):
+        result = CliRunner().invoke(main, ["monitor", "x > 0", "--export-c", file, *options])
+        assert "--export-c goes with --dt SECONDS, and with no RECORDING" in result.output
+    result = CliRunner().invoke(main, ["monitor", "x > 0"])
+    assert "give a RECORDING to judge, or --export-c FILE.h" in result.output

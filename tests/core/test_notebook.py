@@ -56,13 +56,24 @@ def test_results_show_themselves(problem, run):
 
 
 def test_results_of_every_verb_show_themselves():
-    from verifai_jax import compositional, counterexamples, failure_modes, synthesis
+    from verifai_jax import analysis, compositional, counterexamples, failure_modes, synthesis
+    from verifai_jax.certification.result import Certificate
+    from verifai_jax.checking.check import CheckOutcome
+    from verifai_jax.comparison.result import Transfer
     from verifai_jax.core.notebook import InNotebook
+    from verifai_jax.estimation.sequence_result import SequenceEstimate
+    from verifai_jax.failure_table.result import FailureTable
+    from verifai_jax.hardening.result import Hardening
+    from verifai_jax.perception.training import Score
+    from verifai_jax.sweeps.importance import HyperparameterImportance
 
     verbs = [vj.Estimate, vj.Modes, vj.Comparison, vj.Trials, vj.Certificates, vj.Augmentation]
     verbs += [vj.Synthesis, vj.Repair, vj.Confirmation, vj.Confirmations, vj.FuzzRun]
     verbs += [counterexamples.Explained, counterexamples.Shrunk, failure_modes.Mode]
-    verbs += [compositional.Compositional, synthesis.Repair, vj.mtl.Explanation]
+    verbs += [compositional.Compositional, synthesis.Repair, vj.mtl.Explanation, vj.mtl.Mined]
+    verbs += [vj.mtl.Judgement, Transfer, Hardening, vj.Study, Certificate]
+    verbs += [analysis.Clusters, analysis.Diverse, analysis.FrequentPatterns, analysis.Neighbours]
+    verbs += [CheckOutcome, SequenceEstimate, HyperparameterImportance, Score, FailureTable]
     assert [kind for kind in verbs if not issubclass(kind, InNotebook)] == []
 
 
@@ -114,3 +125,26 @@ def test_no_zero_has_a_sign(problem):
     texts = [str(run), str(run.replay(0)), run._repr_html_(), str(run.replay(0).trace)]
     texts += [str(vj.Box(-0.0, 1)), str(vj.parse("x > -0.0"))]
     assert not [text for text in texts if re.search(r"-0(?![.\d])|-0\.0+(?!\d)", text)]
+
+
+@pytest.mark.thorough
+def test_names_of_others_steer_no_terminal_and_draw_no_warnings(tmp_path):
+    # Right-to-left writing, a clear screen, a character that the font lacks; a long name.
+    name, signal = "a\u202eb \N{SLIGHTLY SMILING FACE} " + "long" * 80, "x\x1b[2J"
+
+    def system(features, key):
+        return vj.Trace({signal: features[name] * jnp.ones(4)}, dt=0.5)
+
+    formula = vj.always(vj.signal(signal) < 0.5)
+    odd = vj.Problem(name, {name: vj.Box(-1, 1)}, system, {name: formula}, nominal={name: -1})
+    run = vj.falsify(odd, "uniform", budget=16, batch=16, progress=False)
+    replay = run.replay(run.best)
+    judged = vj.mtl.judge(formula, replay.trace, progress=False)
+    results = [odd, run, replay, replay.trace, judged, vj.confirm(run, progress=False)]
+    results += [vj.shrink(run, progress=False), vj.mtl.explain(formula, replay.trace)]
+    for text in [*map(str, results), *map(repr, results), run.summary(), judged.summary()]:
+        assert not re.search("[\u202e\x1b]", text)
+    assert vj.parse(str(formula)) == formula  # A formula is what a parser reads.
+    replay.plot(tmp_path / "replay.png")
+    [saved] = run.save_counterexamples(tmp_path, max_count=1)
+    assert len(saved.name) < 100

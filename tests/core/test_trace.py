@@ -66,6 +66,20 @@ def test_bad_traces_are_refused(arguments, message):
         Trace(**arguments)
 
 
+@pytest.mark.parametrize(
+    ("notes", "message"),
+    [
+        (["fell back"], "notes must be counts by text.*got list"),
+        ({5: 1}, "got the text 5"),
+        ({"fell back": "often"}, "count of note 'fell back' must be an integer.*'often'"),
+        ({"fell back": -1}, "count of note 'fell back' must be an integer of at least 0"),
+    ],
+)
+def test_notes_are_counts_by_text(notes, message):
+    with unchecked(), pytest.raises((TypeError, ValueError), match=message):
+        Trace({"x": np.zeros(3)}, dt=1.0, notes=notes)
+
+
 def test_status_codes_are_stable():
     # They are stored in tables on disk.
     assert [(s.name, s.value) for s in Status] == [

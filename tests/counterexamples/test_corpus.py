@@ -146,6 +146,28 @@ def test_bad_files_are_named_and_do_not_stop_the_others(tmp_path):
         never.save_counterexamples(tmp_path)
 
 
+@pytest.mark.thorough
+def test_an_edited_file_is_read_and_said_to_be_edited(corpus, tmp_path):
+    path = sorted(corpus.iterdir())[0]
+    content = json.loads(path.read_text())
+    # As editors of Windows save it.
+    (tmp_path / path.name).write_text(json.dumps(content), encoding="utf-8-sig")
+    assert vj.replay_counterexamples(problem(), tmp_path).replayed[0].note == ""
+    content["features"]["a"] = 2.0
+    content["features"]["wind[0]"] = 1.0
+    (tmp_path / path.name).write_text(json.dumps(content))
+    [one] = vj.replay_counterexamples(problem(), tmp_path).replayed
+    assert one.state == "failing"
+    assert one.note == "it does not give its number again: the file was edited or renamed since"
+    content["features"]["a"], content["robustness"] = 2**70, {}
+    (tmp_path / path.name).write_text(json.dumps(content))
+    [one] = vj.replay_counterexamples(problem(), tmp_path).replayed
+    assert one.note.startswith("a = 1180591620717411303424 is not in the space any more")
+    content["features"]["a"], content["robustness"] = 2.0, {"spec": -(2**70)}
+    (tmp_path / path.name).write_text(json.dumps(content))
+    assert vj.replay_counterexamples(problem(), tmp_path).replayed[0].before == -(2.0**70)
+
+
 @pytest.mark.slow
 def test_a_full_disk_is_one_error_that_names_the_file_and_hides_no_failure(
     run, tmp_path, monkeypatch

@@ -81,6 +81,15 @@ def test_frequent_failures_are_counted_in_fresh_samples():
     assert answer.low < 0.05 < answer.high
 
 
+@pytest.mark.parametrize("method", [estimate_by_splitting, estimate_automatically])
+def test_what_always_fails_gets_the_interval_of_counting(method):
+    answer, _ = answered(lambda z: -1.0 - z[:, 0] ** 2, 1, 800, method=method)
+    assert answer.method == "monte_carlo"
+    assert answer.probability == 1
+    assert 0.98 < answer.low < answer.high == 1
+    assert method is estimate_automatically or "its samples are counted" in answer.notes[0]
+
+
 def test_splitting_alone_gives_the_order_of_magnitude_from_several_runs():
     answer, _ = answered(
         half_space(5, 1e-5), 5, 50_000, method=estimate_by_splitting, share=SHARE_OF_REPLICATE

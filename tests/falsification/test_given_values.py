@@ -10,6 +10,7 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax import search
+from verifai_jax.features.given import given_features
 
 SPACE = {
     "wind": vj.Normal(0, 1),
@@ -219,3 +220,49 @@ def test_a_frame_without_rows_is_as_a_list_without():
         assert run.failure_rate is not None
     with pytest.raises(ValueError, match="unknown column 'size'"):
         vj.simulate(BLACK_BOX, frame.drop(columns="size"))
+
+
+ODD = {
+    "wind": vj.Normal(5e9, 1e9),
+    "count": vj.DiscreteBox(0, 9),
+    "size": vj.Categorical(2, 1, 0, "auto"),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("wind", [1.0], "wind must be one (number|value in each row); got"),
+        ("count", [1], "count must be one (integer|value in each row); got"),
+        ("count", (1, 2), "count must be one (integer|value in each row); got"),
+        ("count", range(2), "count must be one (integer|value in each row); got"),
+        ("count", {"a": 1}, "count must be (a number|one value in each row); got {'a': 1}"),
+        ("size", [2], "size must be one "),
+        ("size", {2}, "size must be one "),
+        ("wind", np.complex64(1), r"wind must be a number; got .*1\+0j"),
+        ("wind", np.datetime64(1, "s"), "wind must be a number; got"),
+        ("wind", np.timedelta64(1, "s"), "wind must be a number; got"),
+    ],
+)
+@pytest.mark.parametrize("form", ["dictionary", "frame", "row"])
+def test_what_is_no_single_number_is_named_in_every_form(form, name, value, message):
+    row = {"wind": 5e9, "count": 3, "size": 2, name: value}
+    rows = row
+    if form != "dictionary":
+        rows = pd.DataFrame({key: pd.Series([each], dtype=object) for key, each in row.items()})
+        rows = rows.iloc[0] if form == "row" else rows
+    with pytest.raises(ValueError, match=message):
+        given_features(vj.FeatureSpace(ODD), rows)
+
+
+@pytest.mark.parametrize(
+    ("value", "wanted"),
+    [(5_000_000_000, 5e9), (2**70, 2.0**70), (np.longdouble(7e9), 7e9), (np.array(6e9), 6e9)],
+)
+@pytest.mark.parametrize("framed", [False, True])
+def test_numbers_of_every_type_and_size_are_taken(framed, value, wanted):
+    row = {"wind": value, "count": np.array(3), "size": 2}
+    rows = pd.DataFrame({k: pd.Series([v], dtype=object) for k, v in row.items()})
+    found = given_features(vj.FeatureSpace(ODD), rows if framed else row)
+    assert found["wind"].tolist() == [np.float32(wanted)]
+    assert found["count"].tolist() == [3]

@@ -174,6 +174,17 @@ class TestRuns:
         again = vj.resume(found, budget=48)
         assert again.notes[0].startswith(note)
 
+    @pytest.mark.thorough
+    @pytest.mark.parametrize("precision", ["float32", "float64"])
+    def test_the_nominal_features_fail_before_rows_that_somebody_gives(self, precision):
+        # The engine takes rows with given features then, which are longer than points.
+        nominal = {"a": 0.5, "b": 0.5}
+        problem = vj.Problem("p", SPACE, both, "always (x < 0.25 & y < 2)", nominal=nominal)
+        first = [{"a": 0.125, "b": 0.75}]
+        run = vj.falsify(problem, "uniform", 8, batch=8, first=first, precision=precision)
+        assert run.notes[0].startswith("the nominal features fail themselves, with robustness -0.2")
+        assert run.table.all["a"][0] == 0.125
+
     def test_what_may_take_long_is_not_simulated_for_it(self, monkeypatch):
         monkeypatch.setattr("verifai_jax.falsification.silent_mistakes.MAX_SAMPLES", 100)
         nominal = {"a": 0.5, "b": 0.5}

@@ -134,3 +134,20 @@ def test_an_operator_made_of_others_needs_a_meaning():
 
     with pytest.raises(TypeError, match=r"abstract class Empty .*meaning"):
         Empty()
+
+
+def test_a_rise_and_a_fall_are_at_the_samples_where_truth_changes():
+    trace = Trace({"x": np.array([1.0, 2.0, -3.0, 4.0])}, dt=1.0)
+    up, down = mtl.robustness_signal("rise x", trace), mtl.robustness_signal("fall x", trace)
+    np.testing.assert_array_equal(up, [-np.inf, -1, -3, 3])
+    np.testing.assert_array_equal(down, [-np.inf, -2, 2, -4])
+    assert mtl.parse("fall (x > 0)") == mtl.fall(mtl.signal("x") > 0)
+    assert str(mtl.rise(mtl.signal("x") > 0)) == "rise (x > 0)"
+
+
+def test_exponentials_and_powers_are_read():
+    trace = Trace({"x": np.array([2.0, 1.0])}, dt=1.0)
+    assert mtl.parse("pow(x, 3) < exp(x)") == mtl.parse("x**3 < exp(x)")
+    np.testing.assert_allclose(mtl.robustness("exp(x) > 1", trace), np.exp(2.0) - 1, rtol=1e-6)
+    assert r"\exp\left(\mathit{x}\right)" in mtl.latex(mtl.parse("exp(x) > 1"))
+    assert mtl.mine("always exp(x) < ?top", [trace]).values["top"] == np.exp(2.0)

@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from verifai_jax.native_code.library import COMPILERS
+from verifai_jax.core.machine_code import COMPILERS
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
+from verifai_jax.core import machine_code
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.core.keys import run_keys
 from verifai_jax.evaluation import native_engine
 from verifai_jax.evaluation.engine import engine_for
 from verifai_jax.evaluation.native_engine import FIRST, NativeEngine
-from verifai_jax.native_code import library
 
 pytestmark = pytest.mark.thorough
 
@@ -213,7 +213,7 @@ def test_with_a_broken_compiler(ending, monkeypatch, tmp_path, script, words):
     compiler.write_text(f"#!/bin/sh\n{script}\n")
     compiler.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    monkeypatch.setattr(library, "MAX_SECONDS", 1.0)
+    monkeypatch.setattr(machine_code, "MAX_SECONDS", 1.0)
     ending.programs.clear()
     assert words in fallback_note(ending)
 

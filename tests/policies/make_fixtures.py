@@ -194,3 +194,9 @@ for name, kind in (("lstm", nn.LSTM), ("gru", nn.GRU)):
 
 save_file(mlp.state_dict(), HERE / "mlp.safetensors")
 torch.save(mlp.state_dict(), HERE / "mlp.pt")
+
+# Observations and actions that are matrices.
+matrix = spaces.Box(np.full((2, 2), -2, np.float32), np.array([[1, 2], [3, 4]], np.float32))
+square = spaces.Box(-1.0, 1.0, (2, 3), np.float32)
+square.seed(0)
+of_sb3("td3_matrix", sb3.TD3, (square, matrix), **off)

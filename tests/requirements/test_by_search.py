@@ -25,3 +25,22 @@ def test_the_tightest_bound_that_no_search_breaks(problem):
     assert mined.values["d"] == pytest.approx(2.0, abs=0.02)
     assert mined.searched > 0
     assert "found by search, no proof" in mined.summary()
+
+
+def test_a_simulation_that_tells_two_readings_apart(problem):
+    found = mtl.distinguish("always x > 3", "eventually[0, 0.5] x < 4.5", problem, budget=500)
+    assert found.holds in [(True, False), (False, True)]
+    assert found.source == "a simulation of falls"
+    rare = mtl.distinguish("always x > 2.02", "always x > 2", problem, budget=1500)
+    assert rare.tried > 64
+    assert rare.holds == (False, True)
+
+
+def test_mutants_and_findings_of_simulations(problem):
+    found = mtl.lint("always (x > 9 -> eventually t > 3)", problem)
+    assert {finding.kind for finding in found} == {"vacuous", "never holds"}
+    assert found.recordings == 64
+    assert any(
+        mutant.killed_by.startswith("simulation ")
+        for mutant in mtl.mutants("always x > 3", problem)
+    )

@@ -1,5 +1,6 @@
 """Analyses of error tables: components, neighbours, patterns, clusters, rules, coverage."""
 
+from verifai_jax.analysis._boundary import Boundary, boundary
 from verifai_jax.analysis._coverage import Coverage, coverage
 from verifai_jax.analysis._diverse import Diverse, diverse
 from verifai_jax.analysis._frequent_patterns import FrequentPatterns, frequent_patterns
@@ -17,10 +18,11 @@ from verifai_jax.analysis.sensitivity.sensitivity import Sensitivity
 from verifai_jax.analysis.sensitivity.sobol import sobol_indices
 
 __all__ = [
-    "Analysis", "Clusters", "Column", "Components", "Coverage", "Diverse", "FrequentPatterns",
-    "Importance", "Neighbours", "Rule", "Rules", "Samples", "Sensitivity", "analyze", "clusters",
-    "coverage", "diverse", "frequent_patterns", "gradient_sensitivity", "importance", "k_closest",
-    "morris", "nearest", "pca", "random_rows", "rules", "sobol_indices",
+    "Analysis", "Boundary", "Clusters", "Column", "Components", "Coverage", "Diverse",
+    "FrequentPatterns", "Importance", "Neighbours", "Rule", "Rules", "Samples", "Sensitivity",
+    "analyze", "boundary", "clusters", "coverage", "diverse", "frequent_patterns",
+    "gradient_sensitivity", "importance", "k_closest", "morris", "nearest", "pca", "random_rows",
+    "rules", "sobol_indices",
 ]  # fmt: skip
 
 

@@ -43,8 +43,10 @@ class Coverage(Drawn, InNotebook):
 
     **Fields:** `table`: one row a feature, with the number of its `cells`, the share of them
     `occupied`, the share of pairs of cells with other features (`pairs`), and the share that as
-    many uniform samples would occupy (`expected`, `expected_pairs`); `untried`: the discrete values
-    and pairs of values that no row has, at most 1000 of `untried_count`; `discrepancy`: squared
+    many uniform samples would occupy (`expected`, `expected_pairs`), the shares of the prior
+    (`mass`) and of the range (`volume`) that the occupied cells take, and of pairs of cells
+    (`pairs_mass`, `pairs_volume`); `untried`: the discrete values and pairs of values that no row
+    has, at most 1000 of `untried_count`; `discrepancy`: squared
     centred L2 discrepancy over that expected of as many uniform samples: 1 for those, less where
     the rows are more even, much more where they crowd; `dispersion`: radius of the largest empty
     ball of the ordered features, in unit coordinates, and `uniform_dispersion` that of as many
@@ -82,6 +84,13 @@ class Coverage(Drawn, InNotebook):
             f"of all {what} ({format_percent(uniform)} if they were uniform), "
             + _describe_evenness(self.discrepancy)
         ]
+        pairs = "pairs_" * (len(self.table) > 1)
+        mass, volume = (np.nanmean(self.table[f"{pairs}{n}"]) for n in ("mass", "volume"))
+        if min(mass, volume) < 1:
+            lines.append(
+                f"these take {format_percent(float(mass))} of the prior and "
+                f"{format_percent(float(volume))} of the volume"
+            )
         if self.hole is not None:
             where = format_features(dict(list(self.hole.items())[:MAX_NAMED]))
             lines.append(
@@ -113,7 +122,7 @@ def coverage(source: Source, *, cells: int = 10, seed: int = 0) -> Coverage:
       verdict.
     - `cells`: into how many equal parts the range of a feature is cut, fewer where rows are too few
       to fill them; a discrete feature of up to 20 values has a cell for each.
-    - `seed`: of what is drawn at random.
+    - `seed`: the seed of everything that is drawn at random.
 
     **Returns:** a `Coverage`.
 

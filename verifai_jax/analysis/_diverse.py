@@ -27,12 +27,13 @@ from verifai_jax.analysis.data.samples import (
 )
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.figure import Drawn
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)
-class Diverse(Drawn):
+class Diverse(Drawn, InNotebook):
     """Rows chosen from `samples`, in the order in which they were added.
 
     **Fields:** `rows` `[k]`: row numbers of the table; `distances` `[k]`: how far each was from the

@@ -26,6 +26,7 @@ from verifai_jax.analysis.data.columns import Column
 from verifai_jax.analysis.data.samples import Samples, Source, Which
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.figure import Drawn
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import counted, format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
@@ -44,7 +45,7 @@ class Item:
 
 
 @dataclass(frozen=True, eq=False)
-class FrequentPatterns(Drawn):
+class FrequentPatterns(Drawn, InNotebook):
     """Frequent combinations of values among `samples`.
 
     **Fields:** `items`: the single values, also those that never occur; `combinations`: each a

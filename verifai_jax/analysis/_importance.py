@@ -104,7 +104,7 @@ def importance(
     - `source`: a run, its table, a DataFrame, or `Samples`; of the first three all rows with a
       verdict.
     - `repeats`: how often each feature is shuffled.
-    - `seed`: of all that is drawn at random.
+    - `seed`: the seed of everything that is drawn at random.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     **Returns:** an `Importance`.

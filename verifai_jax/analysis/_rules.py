@@ -185,7 +185,7 @@ def rules(
     - `cover`: share of the failures to cover; `max_rules` rules at most.
     - `held_out`: share of the rows that are kept aside to measure coverage and precision, drawn by
       `seed` among failing and safe rows alike.
-    - `seed`: of the rows kept aside.
+    - `seed`: the seed of the rows kept aside.
 
     **Returns:** `Rules`; with fewer than 10 failing or safe rows there is none, and the result says
     so. Nor does it have a box in which fewer than 3 of the failing rows kept aside lie, or failures

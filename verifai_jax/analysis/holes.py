@@ -36,7 +36,7 @@ def largest_hole(
 
     - `points`: in the unit cube.
     - `parts`: the prior distributions of their columns.
-    - `seed`: of the probes.
+    - `seed`: the seed of the probes.
     - `among`: the only points that may be probes, where not all of the cube is allowed.
     """
     from scipy.spatial import KDTree

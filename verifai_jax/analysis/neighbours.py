@@ -30,12 +30,13 @@ from verifai_jax.analysis.tightest import tightest
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.figure import Drawn
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)
-class Neighbours(Drawn):
+class Neighbours(Drawn, InNotebook):
     """Rows chosen from `samples`.
 
     **Fields:** `rows` `[k]`: row numbers of the table; `distances` `[k]` of each from the centre,

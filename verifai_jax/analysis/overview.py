@@ -106,10 +106,10 @@ class Analysis(Drawn):
     def save(self, folder: str | Path) -> Path:
         """Write `report.md` and pictures to a folder; return the path of the report.
 
-        **Raises:** `FileExistsError` where the folder's name is that of a file.
+        **Raises:** `OSError` for what the file system refuses, such as a folder whose name is
+        that of a file.
         """
         path = Path(folder)
-        path.mkdir(parents=True, exist_ok=True)
         lines = [f"# {html.escape(one_line(self.name))}", ""]
         if self.samples is not None:
             self.plot(path / "overview.png")
@@ -156,7 +156,7 @@ def analyze(
     **Arguments:**
 
     - `source`: a run, its table, or a DataFrame with feature columns.
-    - `seed`: of all that is drawn at random.
+    - `seed`: the seed of everything that is drawn at random.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     **Returns:** an `Analysis`.

@@ -83,14 +83,14 @@ def augment(
     - `initial`: inputs of the initial set.
     - `added`: inputs that an arm adds.
     - `steps`, `further_steps`: training steps of the base, and of each arm after it.
-    - `search`: of the error table: a name, or a search with its options.
+    - `search`: the search of the error table: a name, or a search with its options.
     - `budget`: simulations of the error table; ten times `added` when left out.
     - `seeds`: repetitions, each with data, weights and tests of its own.
-    - `seed`: of all of them.
+    - `seed`: the seed of all repetitions.
     - `test`: inputs of the uniform test.
     - `hard`: inputs of the hard test, on which an independently trained network errs; 0 for none.
       It is the same for all seeds.
-    - `confidence`: of each interval by itself.
+    - `confidence`: the confidence of each interval by itself.
     - `folder`: keeps finished work: the same call goes on where
       it was interrupted, and one with more seeds or arms computes only these.
     - `progress`: show a progress bar; by default on a terminal or in a notebook.
@@ -133,7 +133,8 @@ def augment(
             complete = False
         result = study.result(chosen, confidence, complete)
     if folder is not None:
-        result.save(folder)
+        with cache.writing(folder):
+            result.save(folder)
     return result
 
 

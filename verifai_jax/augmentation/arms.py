@@ -31,11 +31,11 @@ class Base:
     """A trained network, and all that an arm may draw from.
 
     - `task`, `workshop`: the task, and its compiled functions.
-    - `weights`: of the network.
+    - `weights`: the weights of the network.
     - `initial`: the examples that it was trained on.
     - `table`: the error table of the search: features, `rho`, `violated`, `status`.
     - `added`: how many inputs are to be added.
-    - `key`: of random choices.
+    - `key`: the key of random choices.
     """
 
     task: SupervisedTask

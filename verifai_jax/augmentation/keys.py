@@ -16,8 +16,8 @@ def purpose_key(seed: int, number: int, purpose: int) -> Key[Array, ""]:
 
     **Arguments:**
 
-    - `seed`: of the augmentation.
-    - `number`: of the repetition.
+    - `seed`: the seed of the augmentation.
+    - `number`: the number of the repetition.
     - `purpose`: one of the constants of this file.
     """
     repetition = jax.random.fold_in(run_keys(seed)[0], number)

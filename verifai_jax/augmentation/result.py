@@ -19,13 +19,13 @@ from verifai_jax.augmentation.keys import choice_key
 from verifai_jax.augmentation.outcome import Outcome
 from verifai_jax.augmentation.summary import summarize
 from verifai_jax.augmentation.task import SupervisedTask, Weights
-from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.precision import reproducible_settings
 from verifai_jax.statistics.paired import PairedDifference
+from verifai_jax.store.files import replacing_all
 from verifai_jax.store.locks import write_lock
 
 TABLE, ADDED, SUMMARY = "table.parquet", "added.parquet", "summary.txt"
@@ -45,13 +45,14 @@ class Augmentation(InNotebook):
       `hard_error`, the measures of the task, and `why` fewer inputs were added than asked for.
     - `added`: features of all inputs that were added, with `arm`, `seed`, and the `wrongness` of
       the base network.
-    - `error_tables`: of each seed, where an arm needs one: features, `rho`, `violated`, `status`.
-    - `weights`: of each arm and seed, and of the base networks; of a resumed study only those in
-      dictionaries, lists and tuples, since others are not stored.
+    - `error_tables`: the error tables of each seed, where an arm needs one: features, `rho`,
+      `violated`, `status`.
+    - `weights`: the weights of each arm and seed, and of the base networks; of a resumed study only
+      those in dictionaries, lists and tuples, since others are not stored.
     - `options`: numbers and search that it was called with; `hard` is the size of the hard test.
-    - `confidence`: of each interval by itself.
+    - `confidence`: the confidence of each interval by itself.
     - `complete`: False where it was interrupted.
-    - `version`: of verifai_jax.
+    - `version`: the version of verifai_jax.
     """
 
     task: SupervisedTask
@@ -186,17 +187,15 @@ class Augmentation(InNotebook):
     def save(self, folder: str | Path) -> Path:
         """Write table, added inputs and summary to a folder.
 
-        **Raises:** `FolderInUse` where another process writes it.
+        **Raises:** `FolderInUse` where another process writes it; `OSError` for what the file
+        system refuses, which leaves what was there.
         """
         path = Path(folder)
-        with write_lock(path):
-            with replacing(path / TABLE) as partial:
-                self.table.to_parquet(partial)
+        with write_lock(path), replacing_all(path, (ADDED, SUMMARY, TABLE)) as made:
+            self.table.to_parquet(made / TABLE)
             mixed = [n for n in self.added.columns if self.added[n].dtype == object]
-            with replacing(path / ADDED) as partial:
-                self.added.astype(dict.fromkeys(mixed, str)).to_parquet(partial)
-            with replacing(path / SUMMARY) as partial:
-                partial.write_text(f"{self.summary()}\n")
+            self.added.astype(dict.fromkeys(mixed, str)).to_parquet(made / ADDED)
+            (made / SUMMARY).write_text(f"{self.summary()}\n", encoding="utf-8")
         return path
 
     def __str__(self) -> str:

@@ -169,7 +169,7 @@ class SupervisedTask:
 
         **Arguments:**
 
-        - `weights`: of the network.
+        - `weights`: the weights of the network.
         """
         if self.black_box:
             system: Any = _HostNetwork(self, weights)

@@ -43,7 +43,7 @@ def flip(share: float = 0.5) -> Transformation:
 
     **Arguments:**
 
-    - `share`: of images that are mirrored.
+    - `share`: the share of images that are mirrored.
 
     **Raises:** `ValueError` for a share out of range.
     """

@@ -73,8 +73,8 @@ def certify(
     - `confidence`: with which all intervals hold at once.
     - `samples`: of each policy at least, rounded up to whole blocks of 64 (of fewer for fewer than
       64 samples). For the name of the safest alone, 32 are enough.
-    - `seed`: of samples and search. The samples are the same for all policies, and from another
-      stream than a training with this seed.
+    - `seed`: the seed of samples and search. The samples are the same for all policies, and from
+      another stream than a training with this seed.
     - `budget`: samples of all policies together; four times the least number when left out. What
       is beyond the least goes to policies whose verdict is open, and to the possibly safest.
     - `attack`: the search that looks for failures first; the failures that it finds enter no rate.

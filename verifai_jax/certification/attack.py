@@ -28,7 +28,7 @@ class PolicyRecord:
     """The simulations of one policy: points, verdicts and counts.
 
     - `points`, `verdicts`, `first`: of each block, with the number of its first simulation.
-    - `simulations`: of all blocks.
+    - `simulations`: the simulations of all blocks.
     - `failures`: simulations that violate the property.
     - `not_finite`: simulations without a verdict.
     """

@@ -72,7 +72,7 @@ class Blocks:
 
     - `problem_of`: a policy's problem; JAX traces it where it can.
     - `policies`: any pytrees of numbers, or other objects, which are then simulated one by one.
-    - `seed`: of the samples and of the random keys of simulations.
+    - `seed`: the seed of the samples and of the random keys of simulations.
     - `lanes`: samples in a block.
     - `devices`: JAX devices to use; all of this process when left out.
     - `executor`: whose workers simulate; this process when left out.
@@ -198,8 +198,8 @@ class Blocks:
         **Arguments:**
 
         - `policy`: its number.
-        - `points`: of the rows.
-        - `numbers`: of the simulations, which their random keys come from.
+        - `points`: the points of the rows.
+        - `numbers`: the numbers of the simulations, which their random keys come from.
         - `of_attack`: whether they are simulations of the attack, or samples.
         - `attempt`: number of the repetition.
 

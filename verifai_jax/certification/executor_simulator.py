@@ -51,7 +51,8 @@ class ExecutorSimulator:
 
     - `shipment`: with `problem_of`.
     - `policies`: as a worker simulates them, those of one structure already padded.
-    - `structure`: of the policies that share a program; None for those simulated by themselves.
+    - `structure`: the structure of the policies that share a program; None for those simulated by
+      themselves.
     - `lanes`: samples in a block.
     - `dim`: coordinates of a sample.
     - `executor`: with `submit`.

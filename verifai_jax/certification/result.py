@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Certificate:
+class Certificate(InNotebook):
     """The certificate of one policy.
 
     - `simulations`: independent samples of the prior; `failures` and `not_finite` among them.

@@ -53,7 +53,7 @@ class Simulator(Protocol):
         - `members`: of each block the policy, by its index in the group.
         - `points`: the samples of each block.
         - `first`: of each block the number of its first sample, which its random keys come from.
-        - `key`: of all simulations.
+        - `key`: the key of all simulations.
         """
         ...
 

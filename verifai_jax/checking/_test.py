@@ -24,6 +24,9 @@ from verifai_jax.search import Search
 MARK = "verifai_jax_check"
 """Attribute of a test function by which the pytest plugin knows it."""
 
+TESTED = "verifai_jax_problem"
+"""Attribute of a test function with its problem, or the name of it."""
+
 
 @suggests_options
 def test(
@@ -48,9 +51,9 @@ def test(
     - `budget`: simulations at most.
     - `max_failure_probability`: accept failures that are as rare, or rarer; the test passes only
       where independent samples show it. No counterexample is accepted when left out.
-    - `seed`: of the search and the samples.
+    - `seed`: the seed of the search and the samples.
     - `search`: for counterexamples.
-    - `confidence`: of what is said of the failure probability.
+    - `confidence`: the confidence of statements about the failure probability.
     - `corpus`: folder of saved counterexamples, from the root of the project; by default
       `counterexamples`, or pytest's setting `vj_corpus`.
     - `rename`: new names of features that older files of the corpus have.
@@ -85,6 +88,7 @@ def test(
         others = [p for name, p in signature.parameters.items() if name != "run"]
         setattr(run_test, "__signature__", signature.replace(parameters=others))  # noqa: B010
         setattr(run_test, MARK, check)
+        setattr(run_test, TESTED, problem)
         return run_test
 
     return decorate
@@ -111,6 +115,12 @@ def run_check(
         print(outcome.replayed)
     print(outcome)
     return outcome
+
+
+def tested_problem(function: object) -> Problem | None:
+    """Return the problem that a test function tests; None for any other object."""
+    problem = getattr(function, TESTED, None)
+    return load(problem) if isinstance(problem, str) else problem
 
 
 @functools.cache

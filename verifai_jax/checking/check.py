@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from verifai_jax.core.checks import check_count, check_fraction
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_features, format_percent, printable
 from verifai_jax.counterexamples import SavedCounterexample, save_counterexamples
 from verifai_jax.counterexamples import replay_counterexamples as replay
@@ -44,9 +45,9 @@ class Check:
     - `budget`: simulations at most.
     - `max_failure_probability`: failure probability that is still accepted; None accepts no
       counterexample at all.
-    - `seed`: of the search and the samples.
-    - `search`: of counterexamples, where none is accepted.
-    - `confidence`: of what is said of the failure probability.
+    - `seed`: the seed of the search and the samples.
+    - `search`: the search of counterexamples, where none is accepted.
+    - `confidence`: the confidence of statements about the failure probability.
     - `rename`: new names of features, for older files of the corpus.
 
     **Raises:** `ValueError` for numbers out of range, and for a budget with which no test could
@@ -123,7 +124,7 @@ class Check:
 
 
 @dataclass(frozen=True, eq=False)
-class CheckOutcome:
+class CheckOutcome(InNotebook):
     """The outcome of testing a problem.
 
     - `problem`: its name.

@@ -12,10 +12,27 @@ from verifai_jax.cli.json_output import command, give_result
 @RUN
 @PROBLEM
 @FOLDER
-def analyze(folder: Path, target: str | None, into: Path | None) -> None:
+@click.option(
+    "--boundary",
+    type=click.IntRange(1),
+    metavar="POINTS",
+    help="Learn where the boundary runs, and say so many points to simulate next.",
+)
+def analyze(folder: Path, target: str | None, into: Path | None, boundary: int | None) -> None:
     """Report rules, importance, kinds of failures and coverage of the run in RUN."""
-    analysis = load_judged_run(folder, target).analyze()
+    from verifai_jax.core.text import printable
+
+    run = load_judged_run(folder, target)
+    analysis = run.analyze()
     click.echo(str(analysis))
     path = analysis.save((into or folder) / "analysis")
     click.echo(f"  written      {path}")
+    if boundary is not None:
+        from verifai_jax.analysis import boundary as learn
+
+        found = learn(run)
+        click.echo(printable(str(found)))
+        points = found.next_points(boundary)
+        click.echo(printable(points.to_string(index=False)))
+        give_result(boundary=found.calibration, brier=found.brier, next_points=points)
     give_result(text=str(analysis), report=path)

@@ -131,6 +131,14 @@ REPORT = click.option(
 )
 """File of the evidence report on a result."""
 
+ERRORS = click.option(
+    "--errors",
+    type=click.IntRange(1),
+    metavar="PAIRS",
+    help="Say how wrong the number can be, by so many pairs of simulations for each part.",
+)
+"""Simulations by which the parts of an error are measured."""
+
 EVEN_IF_CHANGED = click.option(
     "--even-if-changed",
     is_flag=True,
@@ -187,6 +195,26 @@ PARAMETER_CHOICE = all_of(
     BACKEND,
 )
 """Options of `synthesize` and `repair`: keywords of both functions."""
+
+
+NAMES = all_of(
+    click.option("--const", "constants", multiple=True, metavar="NAME=NUMBER"),
+    click.option("--define", "definitions", multiple=True, metavar="NAME=FORMULA"),
+)
+"""Names that a formula may use."""
+
+
+def read_names(
+    constants: tuple[str, ...], definitions: tuple[str, ...]
+) -> tuple[dict[str, float], dict[str, str]]:
+    """Return the constants and the definitions of `NAMES`; a usage error names what is none."""
+    numbers = {}
+    for name, value in split_pairs("--const", constants):
+        try:
+            numbers[name] = float(value)
+        except ValueError:
+            raise click.UsageError(f"--const {name} must be a number; got {value!r}") from None
+    return numbers, dict(split_pairs("--define", definitions))
 
 
 @contextlib.contextmanager

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from verifai_jax.cli.arguments import CLUSTER, MAX_SECONDS, REPORT, SEED, TARGET, on_cluster
+from verifai_jax.cli.arguments import CLUSTER, ERRORS, MAX_SECONDS, REPORT, SEED, TARGET, on_cluster
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.going_on import kept_until_done
 from verifai_jax.cli.json_output import as_plain, command, give_result
@@ -29,12 +29,14 @@ from verifai_jax.cli.json_output import as_plain, command, give_result
 @MAX_SECONDS
 @CLUSTER
 @REPORT
+@ERRORS
 @fail_on(regression="if a candidate fails more often, by more than the margin")
 def compare(
     target: str,
     candidates: tuple[str, ...],
     cluster: str | None,
     report: Path | None,
+    errors: int | None,
     fail_on: Gate | None,
     **options: Any,
 ) -> None:
@@ -53,6 +55,15 @@ def compare(
         result = run_compare(target, named, executor=executor, **options)
         click.echo(printable(str(result)))
         kept.stopped(result.stopped)
+    if errors is not None:
+        from verifai_jax.error_budgets import error_budget
+
+        with load_at_revision(target, Problem) as baseline:
+            for one in result.candidates:
+                with load_at_revision(one.name, Problem) as candidate:
+                    found = error_budget(candidate, one, baseline=baseline, pairs=errors)
+                click.echo(printable(str(found)))
+                give_result(**{f"errors of {one.name}": found.table})
     if report is not None:
         with load_at_revision(target, Problem) as baseline:
             path = result.report(report, problem=baseline)

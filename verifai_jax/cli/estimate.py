@@ -9,7 +9,7 @@ from verifai_jax.cli import arguments
 from verifai_jax.cli.exit_codes import BROKEN, INTERRUPTED, CommandError
 from verifai_jax.cli.gates import RATE, Gate, check_gate, fail_on
 from verifai_jax.cli.going_on import kept_until_done
-from verifai_jax.cli.json_output import command, show_result
+from verifai_jax.cli.json_output import command, give_result, show_result
 
 if TYPE_CHECKING:
     from verifai_jax.estimation import Estimate
@@ -17,9 +17,17 @@ if TYPE_CHECKING:
 
 @command()
 @arguments.TARGET
-@click.option("--method", help="monte_carlo, importance or splitting  [default: chosen]")
+@click.option("--method", help="monte_carlo, importance, splitting or surrogate  [default: chosen]")
 @click.option("--budget", type=int, default=50_000, show_default=True, help="Simulations at most.")
 @click.option("--p0", type=float, help="Probability that it should be below.")
+@click.option(
+    "--simulations-are",
+    type=click.Choice(["auto", "slow", "fast"]),
+    default="auto",
+    show_default=True,
+    help="slow: a surrogate proposes, for a few hundred simulations.",
+)
+@click.option("--within", type=float, help="Slow simulations end at this factor to the ends.")
 @click.option("--confidence", type=float, default=0.95, show_default=True)
 @arguments.SEED
 @arguments.ONLY
@@ -30,6 +38,7 @@ if TYPE_CHECKING:
 @arguments.CLUSTER
 @arguments.PLOT
 @arguments.REPORT
+@arguments.ERRORS
 @fail_on(
     p0="unless the probability is shown to be below --p0",
     rate="unless it is shown to be at most P",
@@ -42,10 +51,12 @@ def estimate(
     cluster: str | None,
     plot: Path | None,
     report: Path | None,
+    errors: int | None,
     fail_on: Gate | None,
     **options: Any,
 ) -> None:
     """Estimate the probability that TARGET (FILE.py:NAME) fails, with an interval and a bound."""
+    from verifai_jax.core.text import printable
     from verifai_jax.estimation import estimate as run
 
     if fail_on is not None and fail_on.name == "p0" and p0 is None:
@@ -57,8 +68,15 @@ def estimate(
         found = run(problem, p0=p0, executor=executor, **options)
         show_result(found, plot)
         kept.stopped(found.stopped)
+    budget = None
+    if errors is not None:
+        from verifai_jax.error_budgets import error_budget
+
+        budget = error_budget(problem, found, pairs=errors)
+        click.echo(printable(str(budget)))
+        give_result(errors=budget.table, error_low=budget.low, error_high=budget.high)
     if report is not None:
-        path = found.report(report, problem=problem)
+        path = found.report(report, problem=problem, errors=budget)
         click.echo(f"  report       {path}")
     if not found.simulations:
         raise CommandError("interrupted before a batch was finished", INTERRUPTED)

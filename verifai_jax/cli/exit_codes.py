@@ -102,6 +102,12 @@ def _message_and_code(error: BaseException) -> tuple[str, int]:
     if isinstance(error, USAGE_ERRORS):
         return str(error), WRONG_USAGE
     foreseen = isinstance(error, RuntimeError) and type(error).__module__.startswith("verifai_jax.")
+    if isinstance(error, OSError) and error.strerror and error.filename is None:
+        # Files are named where they are written; what has no name is the standard output.
+        return (
+            f"the output cannot be written ({error.strerror}); send it to a file on another disk",
+            BROKEN,
+        )
     if foreseen or isinstance(error, OSError):
         return str(error), BROKEN
     if isinstance(error, MemoryError):

@@ -72,6 +72,13 @@ _PARTS = (
     type=click.Choice(["inputs", "behaviour"]),
     help="Of kinds that differ in this  [default: inputs]",
 )
+@click.option(
+    "--objective",
+    type=click.Choice(["robustness", "likelihood"]),
+    default="robustness",
+    show_default=True,
+    help="Failures that break the property by most, or the likeliest.",
+)
 @arguments.RUN_FOLDER
 @arguments.KEEP_GOING
 @arguments.PICTURES
@@ -230,7 +237,8 @@ def print_run(
 
     **Arguments:**
 
-    - `options`: of the command, which the record does not hold and whoever resumes it gives again.
+    - `options`: the options of the command, which the record does not hold and whoever resumes it
+      gives again.
 
     **Raises:** `CommandError` where no simulation has a verdict.
     """

@@ -26,7 +26,7 @@ RATE = "rate"
 class Gate(NamedTuple):
     """A gate that was asked for.
 
-    - `name`: of the gate.
+    - `name`: the name of the gate.
     - `bound`: greatest failure rate that passes; None for other gates.
     """
 

@@ -62,7 +62,7 @@ def give_result(**values: object) -> None:
 
     **Arguments:**
 
-    - `values`: of anything that `as_plain` knows.
+    - `values`: anything that `as_plain` knows.
     """
     context = click.get_current_context(silent=True)
     if context is not None:
@@ -88,7 +88,6 @@ def show_result(found: Any, plot: Path | None, *names: str) -> None:
 
 def draw(found: Any, path: Path) -> None:
     """Draw a result into a file, whose folder is made, and say where it is."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     found.plot(path)
     click.echo(f"  picture      {path}")
 

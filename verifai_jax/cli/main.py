@@ -34,6 +34,7 @@ from verifai_jax.cli.exit_codes import (
 from verifai_jax.cli.explain import explain
 from verifai_jax.cli.falsify import falsify
 from verifai_jax.cli.fmea import fmea
+from verifai_jax.cli.formula import formula
 from verifai_jax.cli.fuzz import fuzz
 from verifai_jax.cli.going_on import WORDS
 from verifai_jax.cli.list import list_targets
@@ -41,12 +42,16 @@ from verifai_jax.cli.merge import merge
 from verifai_jax.cli.modes import modes
 from verifai_jax.cli.monitor import monitor
 from verifai_jax.cli.new import new
+from verifai_jax.cli.qualify import qualify
 from verifai_jax.cli.repair import repair
 from verifai_jax.cli.replay import replay
 from verifai_jax.cli.report import report
 from verifai_jax.cli.shrink import shrink
 from verifai_jax.cli.sweep import sweep
 from verifai_jax.cli.synthesize import synthesize
+from verifai_jax.cli.trace import trace
+from verifai_jax.cli.trials import trials
+from verifai_jax.cli.verify import verify
 from verifai_jax.core.errors import unknown_name
 
 COMMANDS = (
@@ -57,9 +62,11 @@ COMMANDS = (
     replay,
     analyze,
     monitor,
+    formula,
     doctor,
     confirm,
     estimate,
+    verify,
     modes,
     fmea,
     explain,
@@ -71,6 +78,9 @@ COMMANDS = (
     replay_counterexamples,
     compare,
     report,
+    trace,
+    qualify,
+    trials,
     new,
 )
 """The sub-commands. Their files import nothing heavy until a command runs."""
@@ -124,6 +134,8 @@ class _Group(click.Group):
             return context
         except BrokenPipeError:  # Of what --help and --version print.
             raise _closed_pipe() from None
+        except OSError as error:
+            raise command_error(error) from error
 
     def invoke(self, ctx: click.Context) -> Any:
         # A command imports and traces millions of objects that stay: looking at all of them as

@@ -4,18 +4,20 @@
 """
 
 import math
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import click
 
-from verifai_jax.cli.arguments import PLOT, split_pairs
+from verifai_jax.cli.arguments import NAMES, PLOT, read_names
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result
 from verifai_jax.cli.monitor_fleet import fleet_options, is_fleet, monitor_fleet
 from verifai_jax.cli.monitor_stream import monitor_stream
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.errors import UnknownNameError, missing_name, nearest_names
 from verifai_jax.core.text import printable
 
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
 
 @command()
 @click.argument("formula")
-@click.argument("recording", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("recording", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--dt", type=float, help="Sampling period in seconds, instead of a column of times.")
 @click.option("--time", default="time", show_default=True, help="Column of sample times.")
 @click.option("--resample", "period", type=float, help="Period in seconds to resample to.")
@@ -39,8 +41,14 @@ if TYPE_CHECKING:
     help="Semantics after the last sample.",
 )
 @click.option("--compat", type=click.Choice(["pymtl"]), help="Right-open windows, as in py-mtl.")
-@click.option("--const", "constants", multiple=True, metavar="NAME=NUMBER")
-@click.option("--define", "definitions", multiple=True, metavar="NAME=FORMULA")
+@NAMES
+@click.option(
+    "--export-c",
+    "header",
+    type=click.Path(path_type=Path),
+    metavar="FILE.h",
+    help="Write FORMULA as a monitor in C instead, for samples --dt seconds apart.",
+)
 @click.option("--explain", is_flag=True, help="Say which predicate decides, and when.")
 @PLOT
 @fleet_options
@@ -56,6 +64,7 @@ def monitor(
     compat: Literal["pymtl"] | None,
     constants: tuple[str, ...],
     definitions: tuple[str, ...],
+    header: Path | None,
     explain: bool,
     plot: Path | None,
     report: Path | None,
@@ -65,11 +74,13 @@ def monitor(
 ) -> None:
     """Compute the robustness of FORMULA on a recorded trace, RECORDING.csv or .parquet.
 
-    FORMULA may also be a file of requirements (.toml or .csv), and RECORDING a folder, or several:
-    every requirement is judged on every recording.
+    FORMULA may also be a file of requirements (.toml, .yaml, .csv or .reqif), and RECORDING a
+    folder, or several: every requirement is judged on every recording.
 
     With - as RECORDING, lines of CSV are read from the standard input as they come, until the
     verdict is certain whatever follows: tail -f log.csv | verifai-jax monitor FORMULA -
+
+    With --export-c FILE.h nothing is judged: FORMULA becomes a monitor in C.
     """
     import jax
 
@@ -78,8 +89,19 @@ def monitor(
 
     if (explain or plot is not None) and compat is not None:
         raise click.UsageError("--explain and --plot do not go with --compat")
-    numbers = {name: _number(name, value) for name, value in split_pairs("--const", constants)}
-    named = dict(split_pairs("--define", definitions))
+    numbers, named = read_names(constants, definitions)
+    if header is not None:
+        if recording or dt is None:
+            raise click.UsageError("--export-c goes with --dt SECONDS, and with no RECORDING")
+        name = re.sub(r"\W", "_", header.stem)
+        text = mtl.export_c(mtl.parse(formula, numbers, named), dt, name)
+        with replacing(header) as partial:
+            partial.write_text(text, encoding="utf-8")
+        click.echo(f"monitor {header}")
+        give_result(formula=formula, header=str(header))
+        return
+    if not recording:
+        raise click.UsageError("give a RECORDING to judge, or --export-c FILE.h")
     if is_fleet(formula, recording, report, junit):
         if plot is not None or compat is not None:
             raise click.UsageError("--plot and --compat go with one formula on one recording")
@@ -165,10 +187,3 @@ def _check_signals(formula: "Formula", trace: "Trace", recording: Path) -> None:
             mtl.read(recording, dt=1.0, columns=[name])
         except UnknownNameError:
             raise missing_name(str(recording), "signal", name, trace.signals) from None
-
-
-def _number(name: str, value: str) -> float:
-    try:
-        return float(value)
-    except ValueError:
-        raise click.UsageError(f"--const {name} must be a number; got {value!r}") from None

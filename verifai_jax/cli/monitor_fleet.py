@@ -14,7 +14,7 @@ from verifai_jax.cli.json_output import give_result
 from verifai_jax.core.text import printable
 
 if TYPE_CHECKING:
-    from verifai_jax.mtl import Judgement
+    from verifai_jax.mtl import Judgement, Requirement
 
 Command = TypeVar("Command", bound=Callable[..., object])
 
@@ -54,16 +54,13 @@ def monitor_fleet(
     **Arguments:**
 
     - `jobs`: processes that judge; more than one are started for it.
-    - `options`: of `judge`: how recordings are read.
+    - `options`: the options of `judge`: how recordings are read.
 
     **Raises:** `CommandError` where nothing has a verdict.
     """
     from verifai_jax import mtl
 
-    if _is_file(formula):
-        requirements = mtl.read_requirements(formula, constants, definitions)
-    else:
-        requirements = [mtl.Requirement("formula", mtl.parse(formula, constants, definitions))]
+    requirements = load_requirements(formula, constants, definitions)
     with contextlib.ExitStack() as stack:
         executor = None
         if jobs > 1:
@@ -85,6 +82,17 @@ def monitor_fleet(
     return found
 
 
+def load_requirements(
+    formula: str, constants: Mapping[str, float], definitions: Mapping[str, str]
+) -> "Sequence[Requirement]":
+    """Return the requirements of a file, or one formula as a requirement."""
+    from verifai_jax import mtl
+
+    if _is_file(formula):
+        return mtl.read_requirements(formula, constants, definitions)
+    return [mtl.Requirement("formula", mtl.parse(formula, constants, definitions))]
+
+
 def _is_file(formula: str) -> bool:
     """Return whether a word names a file of requirements, also one of a form that is refused."""
-    return Path(formula).suffix.lower() in (".toml", ".csv", ".yaml", ".yml")
+    return Path(formula).suffix.lower() in (".toml", ".csv", ".yaml", ".yml", ".reqif")

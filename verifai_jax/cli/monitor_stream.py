@@ -3,6 +3,7 @@
 import csv
 import datetime
 import functools
+import itertools
 import math
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -36,7 +37,7 @@ def monitor_stream(
 
     **Arguments:**
 
-    - `lines`: of CSV; the first has the names.
+    - `lines`: the lines of CSV; the first has the names.
     - `time`: the column of sample times in seconds, or of dates (ISO 8601).
     - `dt`: the sampling period in seconds, instead of a column of times.
     - `show`: what prints a line.
@@ -45,67 +46,50 @@ def monitor_stream(
 
     **Raises:** `ValueError` for lines that are no evenly spaced samples; `CommandError` for a NaN.
     """
-    import jax
-
-    samples = _samples(lines, formula, None if dt is not None else time)
-    samples, period = _period(samples, dt)
-    with jax.enable_x64(True):
-        step, state, finish = _monitor(formula, period)
-        count, begin = 0, None
-        for count, sample in enumerate(samples, 1):
-            begin = sample.time if begin is None else begin
-            due = (count - 1) * period + (begin or 0.0)
-            now = due if sample.time is None else sample.time
-            if not abs(now - due) <= EVEN * period + math.ulp(now):
-                raise ValueError(
-                    f"line {sample.line} of {SOURCE} is at {format_time(now)} s, where "
-                    f"{format_time(due)} s is due: samples of a stream are evenly "
-                    "spaced; if its times are rounded, give the period, --dt SECONDS; otherwise "
-                    "record it, and use --resample"
-                )
-            _refuse_nan(sample, now)
-            state, bounds = step(state, sample.signals)
-            low, high, lowest, maximum = (float(bound) for bound in bounds)
-            if lowest > 0 or maximum < 0:
-                verdict = f"holds, with robustness at least {low:z.10g}"
-                if maximum < 0:
-                    verdict = f"fails, with robustness at most {high:z.10g}"
-                show(f"whatever follows {format_time(now, 10)} s, it {verdict}")
-                return lowest > 0
-        rho, holds = (float(value) for value in finish(state))
-    show(
-        f"undecided at the end: with the last of {count} sample{'s' * (count != 1)} held, it "
-        f"{'holds' if holds > 0 else 'fails'} with robustness {rho:z.10g}"
-    )
-    return holds > 0
-
-
-def _monitor(formula: "Formula", dt: float) -> tuple[Any, Any, Any]:
-    """Return a compiled step, its first state, and what a state means if nothing follows."""
-    import jax
-    import jax.numpy as jnp
-
     from verifai_jax import mtl
 
-    monitors = [mtl.online(formula, dt, semantics) for semantics in (mtl.hard, mtl.boolean)]
-
-    @jax.jit
-    def step(states: Any, sample: dict[str, Any]) -> Any:
-        states = [m.step(s, sample) for m, s in zip(monitors, states, strict=True)]
-        bounds = [m.interval(s) for m, s in zip(monitors, states, strict=True)]
-        return states, jnp.concatenate([jnp.stack(pair) for pair in bounds])
-
-    @jax.jit
-    def finish(states: Any) -> Any:
-        return jnp.stack([m.finish(s) for m, s in zip(monitors, states, strict=True)])
-
-    return step, [monitor.init() for monitor in monitors], finish
+    vectors: dict[str, int] = {}
+    samples = _samples(lines, formula, None if dt is not None else time, vectors)
+    samples, period = _period(samples, dt)
+    first = next(samples, None)  # After it the sizes of vectors are known.
+    samples = samples if first is None else itertools.chain([first], samples)
+    robustness, truth = (
+        mtl.watch(formula, period, semantics=semantics, sizes=vectors)
+        for semantics in (mtl.hard, mtl.boolean)
+    )
+    count, begin = 0, None
+    for count, sample in enumerate(samples, 1):
+        begin = sample.time if begin is None else begin
+        due = (count - 1) * period + (begin or 0.0)
+        now = due if sample.time is None else sample.time
+        if not abs(now - due) <= EVEN * period + math.ulp(now):
+            raise ValueError(
+                f"line {sample.line} of {SOURCE} is at {format_time(now)} s, where "
+                f"{format_time(due)} s is due: samples of a stream are evenly "
+                "spaced; if its times are rounded, give the period, --dt SECONDS; otherwise "
+                "record it, and use --resample"
+            )
+        _refuse_nan(sample, now)
+        robustness.step(sample.signals)
+        truth.step(sample.signals)
+        lowest, highest = truth.interval()
+        if lowest > 0 or highest < 0:
+            low, high = robustness.interval()
+            verdict = f"holds, with robustness at least {low:z.10g}"
+            if highest < 0:
+                verdict = f"fails, with robustness at most {high:z.10g}"
+            show(f"whatever follows {format_time(now, 10)} s, it {verdict}")
+            return lowest > 0
+    rho, holds = robustness.finish(), truth.finish() > 0
+    show(
+        f"undecided at the end: with the last of {count} sample{'s' * (count != 1)} held, it "
+        f"{'holds' if holds else 'fails'} with robustness {rho:z.10g}"
+    )
+    return holds
 
 
 def _period(samples: Iterator[Sample], dt: float | None) -> tuple[Iterator[Sample], float]:
     """Return the samples and their period, which is the first step where it is not given."""
-    import itertools
-
     from verifai_jax.mtl.setting import plain_period
 
     if dt is not None:
@@ -128,8 +112,10 @@ def _period(samples: Iterator[Sample], dt: float | None) -> tuple[Iterator[Sampl
     return itertools.chain(first, samples), plain_period(after - before, math.ulp(after))
 
 
-def _samples(lines: Iterable[str], formula: "Formula", time: str | None) -> Iterator[Sample]:
-    """Read samples one by one, no line before it is needed."""
+def _samples(
+    lines: Iterable[str], formula: "Formula", time: str | None, vectors: dict[str, int]
+) -> Iterator[Sample]:
+    """Read samples one by one, no line before it is needed, and note the sizes of `vectors`."""
     lines = iter(lines)
     header = next(lines, "")
     if not header.strip():
@@ -142,6 +128,7 @@ def _samples(lines: Iterable[str], formula: "Formula", time: str | None) -> Iter
             f"SECONDS, or the name of the column, --time NAME. It has: {', '.join(names)}"
         )
     columns = _columns(names, formula)
+    vectors |= {name: len(parts) for name, parts in columns.items() if isinstance(parts, list)}
     rows = csv.reader(lines, delimiter=separator)
     first: list[datetime.datetime] = []
     for row in rows:

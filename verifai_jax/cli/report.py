@@ -34,6 +34,11 @@ from verifai_jax.cli.json_output import command, give_result
     help="Add all ways of failing of a run and their probabilities, by so many simulations.",
 )
 @click.option(
+    "--assessment",
+    is_flag=True,
+    help="Add the claims as a tree, boxes on credibility, and a page to be signed.",
+)
+@click.option(
     "--without-problem", is_flag=True, help="Simulate nothing: report what the folder says."
 )
 def report(
@@ -45,6 +50,7 @@ def report(
     traces: int | None,
     studies: bool | None,
     modes: int | None,
+    assessment: bool,
     without_problem: bool,
 ) -> None:
     """Write the evidence report on a run or a sweep: one HTML file, and its claims as JSON.
@@ -76,6 +82,7 @@ def report(
         traces=traces,
         studies=studies,
         modes=modes,
+        assessment=assessment,
         problem=problem,
     )
     give_result(report=path, claims=claims_path(path))

@@ -17,10 +17,10 @@ from verifai_jax.cli.json_output import command, give_result, show_result
 @arguments.PROBLEM
 @click.option(
     "--by",
-    type=click.Choice(["count", "distance"]),
+    type=click.Choice(["count", "distance", "likelihood"]),
     default="count",
     show_default=True,
-    help="Fewest features first, or least distance first.",
+    help="Fewest features first, least distance first, or the likeliest failure.",
 )
 @click.option("--budget", type=int, default=2000, show_default=True, help="Simulations at most.")
 @arguments.SEED

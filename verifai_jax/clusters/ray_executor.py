@@ -47,8 +47,8 @@ class RayExecutor:
 
     **Arguments:**
 
-    - `address`: of the cluster, as of `ray.init`; the one that Ray is connected to already, or else
-      a new one on this machine, when left out.
+    - `address`: the address of the cluster, as of `ray.init`; the one that Ray is connected to
+      already, or else a new one on this machine, when left out.
     - `cpus`: cores that a block takes.
     - `gpus`: GPUs that a block takes.
 

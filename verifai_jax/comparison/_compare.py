@@ -73,7 +73,7 @@ def compare(
     - `margin`: difference of failure probabilities that does not matter, from 0 on.
     - `confidence`: probability with which all verdicts hold.
     - `budget`: simulations at most, of all problems together.
-    - `seed`: of the samples; the same seed gives the same pairs.
+    - `seed`: the seed of the samples; the same seed gives the same pairs.
     - `max_seconds`: wall-clock seconds after which finished pairs give the verdict.
     - `precision`: as in `falsify`.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.

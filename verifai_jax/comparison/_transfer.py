@@ -82,9 +82,9 @@ def transfer(
     - `search`: the search that does, without gradients.
     - `tolerance`: gap that does not count, in units of a signal's range; above the tolerance of the
       engines' solvers.
-    - `seed`: of samples, search and random keys.
+    - `seed`: the seed of samples, search and random keys.
     - `batch`: pairs at once.
-    - `precision`: of the simulations.
+    - `precision`: the precision of the simulations.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     **Returns:** a `Transfer` with the table of all pairs.

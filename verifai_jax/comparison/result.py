@@ -27,7 +27,7 @@ WORSE, BETTER, SAME, UNDECIDED = "worse", "better", "the same", "undecided"
 class Compared:
     """One candidate against the baseline.
 
-    - `name`: of the candidate.
+    - `name`: the name of the candidate.
     - `rates`: the difference of their failure rates, candidate minus baseline.
     - `both`: pairs in which both fail.
     - `margin`: difference that does not matter.
@@ -128,8 +128,8 @@ class Comparison(InNotebook):
 
         **Arguments:**
 
-        - `path`: of the HTML file.
-        - `options`: of `reports.write_report`: `problem`, `units`, `reasons`.
+        - `path`: the path of the HTML file.
+        - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`, `errors`.
 
         **Returns:** the path.
         """
@@ -174,13 +174,14 @@ def judge(rates: PairedRates, margin: float) -> str:
 class Transfer(InNotebook):
     """The same policy in two engines, `a` and `b`, as `transfer` returns it.
 
-    - `names`: of the two problems.
+    - `names`: the names of the two problems.
     - `table`: a row for each pair: its features; `robustness_a`, `violated_a` and those of b; the
       greatest `gap` of the traces in units of the range of a `signal`; `rounding`, the gap that
       rounding can make; `parted`, the seconds at which they part beyond it; `differs`, whether they
       do; `searched`, whether the search chose it; `proper`, whether both ended.
-    - `space`: of the common features.
-    - `influence`: of each coordinate the share of the gap's variance among samples, from 0 to 1.
+    - `space`: the space of the common features.
+    - `influence`: each coordinate's share of the gap's variance among samples,
+      from 0 to 1.
     - `worst`: the row that parts most, with its traces in a and in b; None if none parts.
     - `tolerance`, `seed`: as given.
     - `stopped`: `"budget"` or `"interrupted"`.
@@ -230,8 +231,8 @@ class Transfer(InNotebook):
 
         **Arguments:**
 
-        - `path`: of the HTML file.
-        - `options`: of `reports.write_report`: `units`, `reasons`.
+        - `path`: the path of the HTML file.
+        - `options`: the options of `reports.write_report`: `units`, `reasons`.
 
         **Returns:** the path.
         """
@@ -242,7 +243,7 @@ class Transfer(InNotebook):
 
         **Arguments:**
 
-        - `path`: of a picture to write; none when left out.
+        - `path`: the picture that is written; none when left out.
 
         **Returns:** the figure.
         """

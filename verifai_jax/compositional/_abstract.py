@@ -82,7 +82,7 @@ def abstract(
     - `error`: a condition on the signals of one instant, of both the abstraction and `frame`: the
       perception errs. The search for images raises its robustness, so continuous signals
       (a logit, a distance) help it more than a decision.
-    - `search`: of images: a name, or a search with its options.
+    - `search`: the search of images: a name, or a search with its options.
     - `budget`: rendered images, at most.
     - `stop_after`: confirmed failures after which it ends.
     - `samples`: of the prior, to sample the region of uncertainty.

@@ -73,7 +73,7 @@ class AbstractLoop:
     - `problem`: the loop with the network; its formulas decide.
     - `abstraction`: `severity -> system`, without images.
     - `error`: a condition on the signals of one instant: the perception errs.
-    - `seed`: of the random key of all abstract simulations.
+    - `seed`: the seed of the random key of all abstract simulations.
     """
 
     def __init__(

@@ -30,7 +30,7 @@ FOUND, BUDGET, NOTHING, INTERRUPTED = "found", "budget", "nothing uncertain", "i
 class Compositional(InNotebook):
     """The result of `vj.perception.abstract`.
 
-    - `name`: of the problem.
+    - `name`: the name of the problem.
     - `error`: the condition under which the perception errs.
     - `region`: a row for each sample of the prior: its features; `kind` (`"uncertain"`, `"safe"`
       with the worst perception too, `"fails anyway"`, `"no verdict"`); `best` and `worst`, the
@@ -46,7 +46,7 @@ class Compositional(InNotebook):
     - `budget`, `search`, `seed`: as it was called.
     - `ended`: `"found"`, `"budget"`, `"nothing uncertain"`, `"interrupted"`, or what else ended the
       search for images.
-    - `version`: of verifai_jax.
+    - `version`: the version of verifai_jax.
     """
 
     name: str

@@ -2,33 +2,114 @@
 
 with replacing("report.html") as partial:
 partial.write_text(page)                    # takes the place of report.html at the end
+
+All files of results are written by it: tables, records, pictures, films, policies, reports.
 """
 
 import contextlib
+import errno
+import io
 import os
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+_REMEDIES = {
+    errno.ENOSPC: "make room on its disk, or give another path",
+    errno.EDQUOT: "make room on its disk, or give another path",
+    errno.EROFS: "give a path on a disk that may be written",
+    errno.EACCES: "give a path that you may write",
+    errno.EPERM: "give a path that you may write",
+    errno.ENOENT: "its folder is gone; make it again, or give another path",
+    errno.EISDIR: "it is a folder; give the path of a file",
+    errno.ENAMETOOLONG: "give a shorter name",
+}
+"""Advice for a file that cannot be written, by the reason of the file system."""
+_ELSE = "give another path"
+
 
 @contextlib.contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
+def replacing(path: str | Path, *, locked: bool = False) -> Iterator[Path]:
     """Yield the path of a file to write, which replaces the one at `path` once it is whole.
 
-    Its ending is that of `path`, which tells some libraries the format. Folders that it needs are
-    made. Where writing fails, the file that was at `path` stays.
+    Its ending is that of `path`, which tells some libraries the format. Where writing fails, the
+    file that was at `path` stays, and nothing is left of the new one. Folders that it needs are
+    made.
 
-    **Raises:** `OSError` that names `path`, for whatever the file system refuses.
+    **Arguments:**
+
+    - `path`: the path of the file.
+    - `locked`: whether its folder is there and has no other writer. Then the file that a killed
+      process leaves has a name that does not change, and the next writer takes it.
+
+    **Raises:** `OSError` that names `path`, the reason and a remedy, for whatever the file system
+    refuses.
     """
     path = Path(path)
-    # Several processes may write it at once, such as tests of one problem.
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    # Several processes and threads may write it at once, such as tests of one problem.
+    writer = f"{os.getpid()}-{threading.get_ident()}"
+    name = f".{path.name}.part" if locked else f".{path.stem}.{writer}.part{path.suffix}"
+    partial = path.with_name(name)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        if not locked:
+            path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
         partial.replace(path)
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise type(error)(f"{path} cannot be written ({reason}); give another path") from error
+        raise unwritable(path, error) from error
     finally:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
+
+
+def append(path: Path, content: bytes) -> None:
+    """Append bytes to a file, all or none of them; folders that it needs are made.
+
+    **Raises:** `OSError` as `replacing`.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(path, "ab", buffering=0) as file:
+            append_to(file, content)
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
+def append_to(file: io.FileIO | io.BytesIO, content: bytes) -> int:
+    """Append bytes to an open file without a buffer, all or none; return where they begin.
+
+    **Raises:** `OSError` of the file system.
+    """
+    begin, rest = file.seek(0, os.SEEK_END), memoryview(content)
+    try:
+        while rest:
+            rest = rest[file.write(rest) :]
+    except OSError:
+        with contextlib.suppress(OSError):  # What little room there is, others need.
+            file.truncate(begin)
+        raise
+    return begin
+
+
+def unwritable(path: str | Path, error: OSError, more: str = "") -> OSError:
+    """Return the error for a file or folder that cannot be written.
+
+    **Arguments:**
+
+    - `path`: the path of the file or folder.
+    - `error`: the error of the file system; one of this function will do.
+    - `more`: what becomes of the results, as a sentence.
+
+    **Returns:** an error of the same kind and `errno`, whose message names the path, the reason
+    and a remedy.
+    """
+    rest = f"{_REMEDIES.get(error.errno or 0, _ELSE)}{f'. {more}' if more else ''}"
+    kind = type(error) if type(error).__module__ == "builtins" else OSError
+    made = kind(f"{path} cannot be written ({reason(error)}); {rest}")
+    made.errno = error.errno
+    return made
+
+
+def reason(error: OSError) -> str:
+    """Return the reason of the file system alone, such as `No space left on device`."""
+    return os.strerror(error.errno) if error.errno else error.strerror or str(error)

@@ -59,7 +59,7 @@ def split_budget(
     - `spent()`: simulations so far.
     - `budget`: simulations of the search at most.
     - `started`: a time of `time.perf_counter` in seconds.
-    - `max_seconds`: of search and check together, or None.
+    - `max_seconds`: the maximum number of seconds of search and check together, or None.
     """
     if max_seconds is None:
         return Budget(spent, budget), Budget(lambda: 0, 1)

@@ -55,7 +55,7 @@ _meanwhile: dict[Callable[[], object], float] = {}
 class Compilation:
     """A program that is being compiled, or is already; calling it waits until it is.
 
-    - `name`: of the program, for people.
+    - `name`: the name of the program, for people.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ def compile_soon(
 
     **Arguments:**
 
-    - `name`: of the program, for people: "the search".
+    - `name`: the name of the program, for people: "the search".
     - `lowered`: the program, lowered by JAX.
     - `effort`: how much XLA does to make it fast; accelerators always do the most.
     """
@@ -145,7 +145,8 @@ def tracing(name: str = "") -> Iterator[None]:
 
     **Arguments:**
 
-    - `name`: of the program, which `describe_compilation` then says already; none by default.
+    - `name`: the name of the program, which `describe_compilation` then says already; none by
+      default.
     """
     with _said(name) if name else nullcontext():
         if not gc.isenabled():

@@ -98,19 +98,31 @@ class Cube:
             ),
         )
 
-    def cells(self, u: Float[Array | np.ndarray, "*n d"]) -> Int[Array, "*n k"]:
-        """Return the cell of each discrete coordinate of these points."""
-        points = jnp.asarray(u)[..., self.discrete]
+    def cells(self, u: Float[Array | np.ndarray, "*n d"]) -> Int[Array | np.ndarray, "*n k"]:
+        """Return the cell of each discrete coordinate of these points; of NumPy's in NumPy."""
         counts = np.array([self.levels[i] for i in self.discrete], np.int32)
+        if isinstance(u, np.ndarray):
+            # JAX would compile a program for each number of points.
+            points = np.asarray(u, np.float32)[..., self.discrete]
+            cells = np.clip((points * counts).astype(np.int32), 0, counts - 1)
+            for j, edges in self._edges:
+                cells[..., j] = np.searchsorted(edges[1:-1], points[..., j], side="right")
+            return cells
+        points = u[..., self.discrete]
         found = jnp.clip((points * counts).astype(jnp.int32), 0, counts - 1)
         for j, edges in self._edges:
             index = jnp.searchsorted(edges[1:-1], points[..., j], side="right")
             found = found.at[..., j].set(index.astype(jnp.int32))
         return found
 
-    def centres(self, cells: Int[Array | np.ndarray, "*n k"]) -> Float[Array, "*n k"]:
-        """Return the middles of these cells, as coordinates."""
+    def centres(self, cells: Int[Array | np.ndarray, "*n k"]) -> Float[Array | np.ndarray, "*n k"]:
+        """Return the middles of these cells, as coordinates; of NumPy's in NumPy."""
         counts = np.array([self.levels[i] for i in self.discrete], np.float32)
+        if isinstance(cells, np.ndarray):
+            centres = ((cells + np.float32(0.5)) / counts).astype(np.float32)
+            for j, edges in self._edges:
+                centres[..., j] = ((edges[1:] + edges[:-1]) / 2)[cells[..., j]]
+            return centres
         middles = ((jnp.asarray(cells) + 0.5) / counts).astype(jnp.float32)
         for j, edges in self._edges:
             centre = (edges[1:] + edges[:-1]) / 2

@@ -29,7 +29,7 @@ def spread_over_devices(
 
     **Arguments:**
 
-    - `function`: of arrays whose leading axes are a device's share.
+    - `function`: the function of arrays whose leading axes are a device's share.
     - `split`: for each argument whether its leading axis is split; the others are given whole.
     - `devices`: JAX devices; all of this process when left out. Leading axes must be multiples of
       their number.

@@ -33,7 +33,7 @@ class Events:
     - `kinds`: `[slots]`, the index of each event's name in `names`; -1 where there is none.
     - `waits`: `[slots]`, seconds since the event before, or the start; 0 where there is none.
     - `parameters`: `[slots, ...]` by name; the middle of a domain where an event has none.
-    - `names`: of the kinds of events.
+    - `names`: the names of the kinds of events.
     """
 
     # JAX rebuilds the class with placeholders and with batches, which have other shapes.

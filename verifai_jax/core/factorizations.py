@@ -30,7 +30,7 @@ _UNCUT = 200_000
 class _Factorization(NamedTuple):
     """What jaxlib takes for the work of a factorization, or a little more.
 
-    - `ranks`: of the operands of one problem.
+    - `ranks`: the ranks of the operands of one problem.
     - `work`: number of operations, from the shapes of these operands.
     """
 

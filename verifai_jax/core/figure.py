@@ -1,7 +1,10 @@
 """Matplotlib figures that belong to no window and show themselves in a notebook."""
 
+import contextlib
 import functools
 import io
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -53,12 +56,24 @@ def load() -> None:
     _figure_class()
 
 
+@contextlib.contextmanager
+def missing_glyphs() -> Iterator[None]:
+    """Draw characters that the font lacks as boxes, without a warning for each."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)
+        yield
+
+
 @functools.cache
 def _figure_class() -> Any:
     # Made on demand: importing matplotlib takes longer than importing everything else here.
     from matplotlib.figure import Figure
 
     class NotebookFigure(Figure):
+        def savefig(self, *arguments: Any, **options: Any) -> None:
+            with missing_glyphs():
+                super().savefig(*arguments, **options)
+
         def _repr_png_(self) -> bytes:
             buffer = io.BytesIO()
             self.savefig(buffer, format="png", dpi=72)

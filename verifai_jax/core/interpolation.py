@@ -27,7 +27,7 @@ def monotone_cubic(knots: Any, gaps: Any, left: Any, share: Any, xp: Any) -> Any
     - `knots`: `[n, ...]`, at least 2.
     - `gaps`: `[n - 1]`, the distances between their positions.
     - `left`: index of the number before the position, from 0 to n - 2.
-    - `share`: of the distance to the next number, from 0 to 1.
+    - `share`: the share of the distance to the next number, from 0 to 1.
     """
     count = knots.shape[0]
     begin, end = knots[left], knots[left + 1]

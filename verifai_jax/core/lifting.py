@@ -85,7 +85,7 @@ def lifted(owner: object, **values: np.ndarray) -> tuple[Any, ...]:
 
     **Arguments:**
 
-    - `owner`: of the numbers, which they are known by, with their names.
+    - `owner`: the owner of the numbers, which they are known by, with their names.
     - `values`: arrays of the precision of the program.
     """
     current = _current.get()

@@ -6,6 +6,7 @@ Both append, so that a computation that is resumed goes on with its file.
 """
 
 import csv
+import io
 import itertools
 import os
 import socket
@@ -14,7 +15,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from verifai_jax.core.atomic_files import replacing
+from verifai_jax.core.atomic_files import append, replacing
 from verifai_jax.core.callbacks import Values
 
 STEP = "step"
@@ -27,7 +28,7 @@ class CSVLogger:
 
     **Arguments:**
 
-    - `path`: of the file; one that is there is continued.
+    - `path`: the path of the file; one that is there is continued.
 
     **Raises:** `ValueError` for a file that is there and has no column `step`.
     """
@@ -50,8 +51,9 @@ class CSVLogger:
         columns = [*self._columns, *(name for name in row if name not in self._columns)]
         if columns != self._columns:
             self._widen(columns)
-        with self.path.open("a", newline="") as file:
-            csv.DictWriter(file, self._columns).writerow(row)
+        line = io.StringIO()
+        csv.DictWriter(line, self._columns).writerow(row)
+        append(self.path, line.getvalue().encode())
 
     def _widen(self, columns: list[str]) -> None:
         """Write the file anew with more columns."""
@@ -75,7 +77,7 @@ class TensorBoardLogger:
 
     **Arguments:**
 
-    - `folder`: of the event file; each logger begins a file of its own in it.
+    - `folder`: the folder of the event file; each logger begins a file of its own in it.
     - `prefix`: before the names of values, such as `"falsify/"`.
     """
 
@@ -87,7 +89,6 @@ class TensorBoardLogger:
     def __call__(self, step: int, values: Values) -> None:
         """Append an event with the values."""
         if not self.path.exists():
-            self.folder.mkdir(parents=True, exist_ok=True)
             self._append(_double(1, time.time()) + _bytes(3, b"brain.Event:2"))
         summary = b"".join(
             _bytes(1, _bytes(1, f"{self.prefix}{name}".encode()) + _float(2, value))
@@ -97,8 +98,7 @@ class TensorBoardLogger:
 
     def _append(self, event: bytes) -> None:
         length = struct.pack("<Q", len(event))
-        with self.path.open("ab") as file:
-            file.write(length + _checksum(length) + event + _checksum(event))
+        append(self.path, length + _checksum(length) + event + _checksum(event))
 
 
 def _varint(value: int) -> Iterator[int]:

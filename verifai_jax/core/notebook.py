@@ -5,10 +5,11 @@ class Replay(InNotebook): ...       # ... and what `_notebook_parts` returns, su
 """
 
 import base64
+import functools
 import html
 import io
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.text import printable
@@ -16,6 +17,7 @@ from verifai_jax.core.text import printable
 if TYPE_CHECKING:
     import pandas as pd
 
+T = TypeVar("T")
 MAX_ROWS = 10
 """Rows of a table that are shown."""
 
@@ -34,7 +36,15 @@ class ForUsers:
 
 
 class InNotebook(ForUsers):
-    """A result that a notebook shows as its text, and with tables and pictures where it has any."""
+    """A result that a notebook shows as its text, and with tables and pictures where it has any.
+
+    Its texts steer no terminal, whatever is in the names of systems and files that they quote.
+    """
+
+    def __init_subclass__(cls, **options: object) -> None:
+        super().__init_subclass__(**options)
+        for name in {"__str__", "__repr__", "summary"} & vars(cls).keys():
+            setattr(cls, name, _in_printable_characters(vars(cls)[name]))
 
     def _notebook_parts(self) -> Iterable[str]:
         """Return the HTML that follows the text."""
@@ -42,6 +52,14 @@ class InNotebook(ForUsers):
 
     def _repr_html_(self) -> str:
         return "\n".join([text_html(str(self)), *self._notebook_parts()])
+
+
+def _in_printable_characters(write: Callable[[T], str]) -> Callable[[T], str]:
+    @functools.wraps(write)
+    def written(result: T) -> str:
+        return printable(write(result))
+
+    return written
 
 
 def text_html(text: str) -> str:

@@ -248,7 +248,7 @@ def _compiling() -> str:
 
 
 def shows_progress(
-    doing: str, unit: str = "simulations"
+    doing: str, unit: str = "simulations", *, of_budget: bool = True
 ) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Let a verb say what it is doing while it runs, in one line.
 
@@ -260,6 +260,7 @@ def shows_progress(
 
     - `doing`: a word for the verb, before the name of its first argument: "comparing".
     - `unit`: name of what is counted.
+    - `of_budget`: whether its option `budget` is the total, and not that of a part.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
@@ -281,7 +282,7 @@ def shows_progress(
                 bound[first] if isinstance(bound[first], str) else getattr(bound[first], "name", "")
             )
             with ProgressBar(False if callable(show) else show) as bar:
-                total = budget if isinstance(budget, int) else None
+                total = budget if of_budget and isinstance(budget, int) else None
                 bar.begin(f"{doing} {subject}".rstrip(), total, unit)
                 token = _ongoing.set(bar)
                 try:

@@ -26,7 +26,7 @@ class Reaction:
     - `parameters`: weights and biases, layer after layer, `[size]`.
     - `inputs`: name, low and high of each signal; it is scaled to -1 to 1 over that range.
     - `hidden`: number of hidden units; 0 for an affine function.
-    - `bounds`: of the output, which a hyperbolic tangent keeps inside.
+    - `bounds`: the bounds of the output, which a hyperbolic tangent keeps inside.
     """
 
     # JAX rebuilds the class with placeholders and with batches, which have other shapes.

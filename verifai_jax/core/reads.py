@@ -33,6 +33,8 @@ _OPENS = ("open", "sqlite3.connect", "ctypes.dlopen")
 _read: dict[str, set[str]] = {}
 _loaded: dict[str, set[str]] = {}
 _watching = False
+documents: set[str] = set()
+"""Files of requirements, whose entries are recorded one by one: no part of a model."""
 
 
 def watch() -> None:
@@ -86,6 +88,7 @@ def _note_open(event: str, path: object, mode: object = None, flags: object = 0)
     absolute = os.path.abspath(text)
     # What lies in a folder with a dot is a cache, or settings.
     hidden = f"{os.sep}." in absolute or absolute.startswith(_OF_THE_MACHINE)
+    hidden |= absolute in documents
     if not hidden and os.path.isfile(absolute) and is_user_file(absolute):
         files = _read.setdefault(module, set())
         if len(files) < MAX_FILES:

@@ -12,8 +12,6 @@ version of JAX or of this package is one that does not exist.
 
 import contextlib
 import hashlib
-import os
-import tempfile
 from collections.abc import Callable
 from functools import cache
 from importlib.metadata import version
@@ -25,6 +23,7 @@ import jax.export
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.devices import cache_folder
 from verifai_jax.core.fingerprint import identity
 
@@ -79,8 +78,8 @@ def lower_or_recall(
 
     **Arguments:**
 
-    - `name`: of `remembered_as`; None for a program that is not kept.
-    - `function`: of pytrees; is traced where there is no file.
+    - `name`: the name of `remembered_as`; None for a program that is not kept.
+    - `function`: the function of pytrees; is traced where there is no file.
     - `arguments`: their shapes and types.
     - `form`: the structure of what it returns; left out for tuples, lists and dictionaries of
       arrays.
@@ -144,12 +143,8 @@ def _read(path: Path) -> "jax.export.Exported | None":
 
 
 def _write(path: Path, data: bytes) -> None:
-    with contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-            file.write(hashlib.sha256(data).digest() + data)
-        # At once, or not at all: another process may be reading.
-        os.replace(file.name, path)
+    with contextlib.suppress(OSError), replacing(path) as partial:
+        partial.write_bytes(hashlib.sha256(data).digest() + data)
 
 
 @cache

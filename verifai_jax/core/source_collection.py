@@ -15,7 +15,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from verifai_jax.core.reads import files_read_by, modules_loaded_by
+from verifai_jax.core.reads import documents, files_read_by, modules_loaded_by
 from verifai_jax.core.source_objects import (
     Function,
     Module,
@@ -134,7 +134,8 @@ class _Collector:
             self.modules[file] = Source(shown_path(file), role, sha256)
 
     def add_data(self, file: str, role: str, sha256: str | None = None) -> None:
-        if file in self.data or file in self.modules or len(self.data) >= MAX_FILES:
+        known = file in self.data or file in self.modules
+        if known or os.path.abspath(file) in documents or len(self.data) >= MAX_FILES:
             return
         try:
             self.data[file] = Source(shown_path(file), role, sha256 or file_hash(Path(file)))

@@ -86,12 +86,13 @@ class Change(NamedTuple):
 class Sources:
     """The files and versions that a result was made of, as they were then.
 
-    - `files`: of the model, with their hashes.
+    - `files`: the files of the model, with their hashes.
     - `versions`: by the name of the package.
     - `without_file`: what of the model is in no file, such as cells of a notebook.
     - `root`: the working directory, from which names of files go out.
     - `first`: the row of a table from which on this is what it was made of.
-    - `commit`: of git, at which the files were taken; empty for those of the working directory.
+    - `commit`: the commit of git, at which the files were taken; empty for those of the working
+      directory.
     """
 
     files: tuple[Source, ...]

@@ -22,7 +22,7 @@ class Stopwatch:
 
     **Arguments:**
 
-    - `name`: of what they are spent on until `on` says otherwise.
+    - `name`: what they are spent on until `on` says otherwise.
     - `began`: when it began, as `time.perf_counter` had it; now by default.
     - `earlier`: seconds by name that are spent already, as by an earlier part of a run.
     """

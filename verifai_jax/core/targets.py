@@ -55,6 +55,14 @@ def definitions(location: str, *kinds: type[Kind]) -> dict[str, Kind]:
     return _by_name(_variables(location, *kinds))
 
 
+def values_in(location: str) -> tuple[object, ...]:
+    """Return all values that a file or module defines; it is run.
+
+    **Raises:** `TargetError` where there is no such file or module, or it cannot be run.
+    """
+    return tuple(vars(_import(location)).values())
+
+
 def _variables(location: str, *kinds: type[Kind]) -> dict[str, Kind]:
     """Return the objects of some classes that a file or module defines, by their variables."""
     variables = {

@@ -32,6 +32,14 @@ def format_percent(share: float) -> str:
     return f"{percent:z.3g} %"
 
 
+def format_probability(probability: float) -> str:
+    """Write a probability with three digits, or with as many as tell it from 1: `0.99993`."""
+    if 0.999 < probability < 1:
+        digits = -math.floor(math.log10(1 - probability))
+        return f"{probability:z.{digits}f}".rstrip("0")
+    return f"{probability:z.3g}"
+
+
 def format_time(seconds: float, digits: int = 6) -> str:
     """Write an instant in seconds so that it can be told from its neighbours: `1700000003.5`.
 
@@ -59,7 +67,7 @@ def format_seconds(seconds: float, digits: int = 6) -> str:
     **Arguments:**
 
     - `seconds`: instant or duration.
-    - `digits`: of one below ten minutes.
+    - `digits`: the digits of a duration below ten minutes.
     """
     if not LONG <= abs(seconds) < STAMPS:
         return f"{format_time(seconds, digits)} s"

@@ -21,7 +21,7 @@ from jax.core import Tracer
 from jax.errors import TracerArrayConversionError
 from jaxtyping import Array, Bool, Int, Real
 
-from verifai_jax.core.checks import check_name, is_number
+from verifai_jax.core.checks import check_count, check_name, is_number
 from verifai_jax.core.gaps import known_times, with_gaps
 from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook
@@ -71,7 +71,9 @@ class Trace(InNotebook):
       `mtl.resample` keeps there what its clock passes over, and verdicts count it.
     - `notes`: what the producer says of this simulation or recording, with how often it happened,
       `{"the solver fell back to Euler": 3}`. A run adds them up and has them among its notes.
-      They are for the host: JAX's transformations drop them.
+    - `units`: units of signals by name, as their recording has them.
+
+    Notes and units are for the host: JAX's transformations drop them.
 
     A signal with masked or missing samples (`numpy.ma`, `None`, `pandas.NA`) has gaps there: they
     become NaN, and no verdict counts what lies under a mask.
@@ -82,7 +84,7 @@ class Trace(InNotebook):
     **Raises:** `ValueError` for no signals, an empty trace, signals of different lengths, a clock
     that is missing, given twice, not positive or not finite, `valid` below 1 or beyond the samples,
     or a status that is none, and for masked sample times; `TypeError` for signals that hold no
-    real numbers.
+    real numbers, and for notes that are not counts by text.
     """
 
     _internal = frozenset((
@@ -98,6 +100,7 @@ class Trace(InNotebook):
     finite: tuple[str, ...] = ()
     between: "Trace | None" = None
     notes: Mapping[str, int] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not isinstance(self.signals, Mapping):
@@ -108,6 +111,7 @@ class Trace(InNotebook):
             raise ValueError("a trace needs at least one signal; got none")
         for name in self.signals:
             check_name("the name of a signal", name, lines=True)
+        _check_notes(self.notes)
         signals = {name: with_gaps(name, signal) for name, signal in self.signals.items()}
         object.__setattr__(self, "signals", signals)
         lengths = {}
@@ -271,7 +275,9 @@ class Trace(InNotebook):
     def __str__(self) -> str:
         width = max(map(len, self.signals))
         lines = [f"trace of {self._span()}"]
-        lines += [f"  {n:<{width}}  {_range(s, self.valid)}" for n, s in self.signals.items()]
+        for name, signal in self.signals.items():
+            unit = self.units.get(name, "")
+            lines.append(f"  {name:<{width}}  {_range(signal, self.valid)} {unit}".rstrip())
         lines += [f"  note: {note}" for note in self.notes]
         return "\n".join(lines)
 
@@ -295,6 +301,20 @@ class Trace(InNotebook):
             if name == "status" and int(code) != Status.OK:
                 text += f", status {Status(int(code)).name.lower()}"
         return text
+
+
+def _check_notes(notes: object) -> None:
+    """Refuse notes that are not counts by text.
+
+    **Raises:** `TypeError`, and `ValueError` for a count below zero.
+    """
+    wanted = 'notes must be counts by text, such as {"the solver fell back to Euler": 3}'
+    if not isinstance(notes, Mapping):
+        raise TypeError(f"{wanted}; got {type(notes).__name__}")
+    for note, times in notes.items():
+        if not isinstance(note, str):
+            raise TypeError(f"{wanted}; got the text {note!r}")
+        check_count(f"the count of note {note!r}", times, 0)
 
 
 def check_code(name: str, value: Any, wanted: str) -> int | None:
@@ -418,7 +438,7 @@ def _unflatten(static: Any, children: Any) -> Trace:
     names, dt, held, finite = static
     values = tuple(children)
     fields = {"signals": dict(zip(names, values, strict=False))}
-    fields |= {"dt": dt, "held": held, "finite": finite, "notes": {}}
+    fields |= {"dt": dt, "held": held, "finite": finite, "notes": {}, "units": {}}
     fields |= dict(zip(_CHILDREN, values[len(names) :], strict=True))
     for name, value in fields.items():
         object.__setattr__(trace, name, value)

@@ -175,7 +175,8 @@ def source_line(traceback: object) -> str | None:
 
     **Arguments:**
 
-    - `traceback`: of the operation, as JAX keeps it: frames from the innermost one on.
+    - `traceback`: the traceback of the operation, as JAX keeps it: frames from the innermost one
+      on.
     """
     for frame in getattr(traceback, "frames", ()):
         if is_user_file(frame.file_name):

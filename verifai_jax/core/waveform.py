@@ -45,8 +45,9 @@ class Waveform:
       value is 0 for the rest. None may be masked.
     - `duration`: in seconds; None until `over` sets it. Before 0 and after the end the first and
       the last value hold; those of pulses are 0.
-    - `times`: of the control points in seconds, increasing; equal distances when left out.
-    - `width`: of a pulse in seconds; half the shortest distance of two when left out.
+    - `times`: the times of the control points in seconds, increasing; equal distances when left
+      out.
+    - `width`: the width of a pulse in seconds; half the shortest distance of two when left out.
     """
 
     # JAX rebuilds the class with placeholders and with batches, which have other shapes.

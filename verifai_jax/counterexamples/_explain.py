@@ -204,7 +204,7 @@ def slopes_of(
 
     **Arguments:**
 
-    - `space`: of the features.
+    - `space`: the space of the features.
     - `u`: the point at which the gradient was taken.
     - `gradient`: by the coordinates.
     - `precision`: in which it was taken.

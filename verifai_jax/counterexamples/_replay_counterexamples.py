@@ -45,7 +45,7 @@ CLOSE = 1e-4
 class ReplayedCounterexample:
     """One file of a corpus, replayed.
 
-    - `path`: of the file.
+    - `path`: the path of the file.
     - `state`: `"failing"`, `"fixed"`, `"without a verdict"`, `"no longer valid"` or `"of another
       problem"`.
     - `robustness`: the least now; NaN without one.
@@ -120,7 +120,8 @@ class CorpusReplay(InNotebook):
             if one.state == OTHER:
                 continue
             robustness = "" if np.isnan(one.robustness) else f", robustness {one.robustness:z.4g}"
-            before = f" (was {one.before:z.4g})" if robustness else ""
+            was = "unknown" if np.isnan(one.before) else f"{one.before:z.4g}"
+            before = f" (was {was})" if robustness else ""
             note = f": {one.note}" if one.note else ""
             lines.append(f"  {one.path.name}  {one.state}{robustness}{before}{note}")
         if others := len(self.of(OTHER)):
@@ -242,7 +243,7 @@ def _replay_batch(
             robustness = float(np.min(verdicts.rho[i]))
             state = FAILING if bool(verdicts.violated[i]) else FIXED
             if entry.formulas == formulas:
-                notes += _not_again(entry, changes, robustness)
+                notes += _not_again(path, entry, changes, robustness)
             if state == FAILING and again is not None and not bool(again.violated[i]):
                 state = WITHOUT_VERDICT
                 notes.append(
@@ -268,13 +269,15 @@ def _changes(entry: SavedCounterexample, now: Sources) -> tuple[Change, ...] | N
 
 
 def _not_again(
-    entry: SavedCounterexample, changes: tuple[Change, ...] | None, robustness: float
+    path: Path, entry: SavedCounterexample, changes: tuple[Change, ...] | None, robustness: float
 ) -> list[str]:
     """Say that the same model gives another number than when a counterexample was saved."""
     before = _lowest(entry)
     near = abs(robustness - before) <= CLOSE * max(1.0, abs(before))
     if changes is None or changes or near or np.isnan(before):
         return []
+    if path.name != entry.name:  # Its name says by a digest what was saved.
+        return ["it does not give its number again: the file was edited or renamed since"]
     return [
         "it does not give its number again, though no file of its model has changed: the system "
         "has memory, chance or state of its own, or reads what is not recorded"
@@ -283,7 +286,7 @@ def _not_again(
 
 def _lowest(entry: SavedCounterexample) -> float:
     values = [value for value in entry.robustness.values() if isinstance(value, int | float)]
-    return min(values, default=np.nan)
+    return float(min(values, default=np.nan))
 
 
 def _misfit(space: FeatureSpace, columns: Mapping[str, Any]) -> str:
@@ -323,7 +326,7 @@ def _why_not_in(space: FeatureSpace, columns: Mapping[str, Any]) -> str:
         if isinstance(value, str) or isinstance(back, str):
             same = value == back
         else:
-            same = bool(np.isclose(value, back, rtol=CLOSE, atol=CLOSE, equal_nan=True))
+            same = bool(np.isclose(float(value), back, rtol=CLOSE, atol=CLOSE, equal_nan=True))
         if not same:
             return f"{name} = {value} is not in the space any more; the nearest there is {back}"
     if space.constraint is not None and not bool(space.constraint(u[None])[0]):

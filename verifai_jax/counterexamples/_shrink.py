@@ -22,9 +22,10 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.counterexamples.candidates import Candidates
 from verifai_jax.counterexamples.fixed_key import fix_key, note_on_key
+from verifai_jax.counterexamples.likelier import draw_around_elite, exchange_cells, shift_in_time
 from verifai_jax.counterexamples.minimize_count import grow, minimize_count, revert_features
 from verifai_jax.counterexamples.minimize_distance import minimize_distance
-from verifai_jax.counterexamples.nominal import Nominal
+from verifai_jax.counterexamples.nominal import Likeliest, Nominal
 from verifai_jax.counterexamples.remove_items import remove_items
 from verifai_jax.counterexamples.selection import (
     Row,
@@ -33,12 +34,13 @@ from verifai_jax.counterexamples.selection import (
     select_others,
     select_row,
 )
-from verifai_jax.counterexamples.shrunk import Shrunk, Step, _plain
+from verifai_jax.counterexamples.shrunk import LogDensities, Shrunk, Step, _plain
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.run import Run
+from verifai_jax.features.density import log_density
 from verifai_jax.problem.problem import Problem
 
-ORDERS = ("count", "distance")
+ORDERS = ("count", "distance", "likelihood")
 OTHERS = 32
 """Other counterexamples of the run to begin with, at most."""
 FOLLOWED = 5
@@ -56,7 +58,7 @@ def shrink(
     row: Row = None,
     *,
     nominal: Mapping[str, Any] | None = None,
-    by: Literal["count", "distance"] = "count",
+    by: Literal["count", "distance", "likelihood"] = "count",
     budget: int = 2000,
     seed: int = 0,
     others: bool = True,
@@ -68,7 +70,8 @@ def shrink(
     **Arguments:**
 
     - `run`: a run of a problem, with a counterexample.
-    - `row`: the number of one, or a row of the table; the worst when left out.
+    - `row`: the number of one, or a row of the table; the worst when left out, by likelihood the
+      likeliest.
     - `nominal`: features that are ordinary, where the problem does not say or others are meant.
     - `by`: `"count"`: first as many events, and other items of arrays of variable length, as
       nominal has, or the least difference from that; then the fewest coordinates that are not
@@ -77,9 +80,12 @@ def shrink(
       `"distance"`: the least distance, whatever their number. It is Euclidean in unit coordinates,
       of which each is 1 over its whole range (by probability, for a distribution), between two
       choices 1, and by indices in integers. Every control point of a signal and every component of
-      a vector is a coordinate of its own.
+      a vector is a coordinate of its own;
+      `"likelihood"`: the greatest density of the prior, or probability of choices. The likeliest
+      features take the place of nominal ones, and the distance is the number of standard deviations
+      at which a normal distribution is as improbable.
     - `budget`: simulations at most; a gradient counts as one.
-    - `seed`: of the random candidates.
+    - `seed`: the seed of the random candidates.
     - `others`: whether other counterexamples of the run are looked at too.
     - `stay`: whether every real feature stays on the side of nominal on which the row has it, so
       that failures of several kinds are shrunk each by itself.
@@ -97,8 +103,11 @@ def shrink(
     if by not in ORDERS:
         raise unknown_name("order", by, ORDERS)
     check_count("budget", budget)
+    at = _origin(problem, by, nominal)
+    if row is None and isinstance(at, Likeliest) and len(failing := run.table.counterexamples):
+        density = run.improbability(failing)["log_density"].to_numpy(float)
+        row = int(failing.index.to_numpy()[np.argmax(density)])
     number, first = select_row(run, row)
-    at = Nominal.of(problem, nominal)
     about_key = note_on_key(problem, number)
     problem = fix_key(problem, run, number)
     key = run_keys(run.seed)[1]
@@ -120,7 +129,8 @@ def shrink(
         at = at.restrict_to_side(start[0])
     candidates = Candidates(problem, at, int(budget), run.precision)
     search = _Search(candidates, by, np.random.default_rng(seed), start)
-    points = np.concatenate([start, select_others(run, at, number, OTHERS)]) if others else start
+    count = 4 * OTHERS if by == "likelihood" else OTHERS
+    points = np.concatenate([start, select_others(run, at, number, count)]) if others else start
     notes, stopped = [], None
     try:
         search.search(points)
@@ -151,10 +161,20 @@ def shrink(
         duration=original.duration,
         broken=_broken(replayed),
         start_broken=_broken(original),
+        log_densities=_log_densities(at, u, start[0]),
         model_changed=original.changed,
         finding=original.finding,
         stopped=stopped,
     )
+
+
+def _origin(problem: Problem, by: str, nominal: Mapping[str, Any] | None) -> Nominal:
+    """Return the point from which failures depart: the nominal one, or the likeliest."""
+    if by != "likelihood":
+        return Nominal.of(problem, nominal)
+    if nominal is not None:
+        raise ValueError("by='likelihood' departs from the likeliest features; leave out nominal=")
+    return Likeliest.in_space(problem.space)
 
 
 class _Search:
@@ -216,15 +236,33 @@ class _Search:
             own = points[:1][candidates(points[:1])[1]]
             minimize_count(candidates, self.starts(own, alike=False), self.rng)
         else:
-            grow(candidates, failures[:1], 1)
+            if self.by == "distance":
+                grow(candidates, failures[:1], 1)
             revert_features(candidates, failures[0])
+        if self.by == "likelihood":
+            if len(nominal.cube.continuous):
+                # Slopes lead farther than samples do.
+                half, spent = candidates.limit, candidates.simulations
+                if candidates.differentiable:
+                    candidates.limit = min(half, spent + candidates.budget // 8)
+                draw_around_elite(candidates, self.rng)
+                candidates.limit = half
+            if len(nominal.cube.discrete):
+                exchange_cells(candidates, self.rng)
         self.note()
-        self.follow(self.starts())
+        likely = self.by == "likelihood"
+        self.follow(self.starts(), rounds=15 if likely else 60)
         candidates.limit = candidates.budget - 2 * nominal.space.dim
-        self.follow(self.starts()[:1])
+        self.follow(self.starts()[:1], rounds=15 if likely else 60)
         # A boundary of many pieces has a nearest point on each: some of those next to this one.
         search_alongside(candidates, self.failures()[0], self.rng)
-        self.follow(self.starts(self.failures()[:1], cosine=0.97)[1:], rounds=10)
+        for _ in range(8 if likely else 1):
+            before = self.failures()[0]
+            if likely:
+                shift_in_time(candidates, before)
+            self.follow(self.starts(self.failures()[:1], cosine=0.97)[1:], rounds=10)
+            if np.array_equal(self.failures()[0], before):
+                break
         for _ in range(2):
             if candidates.left < candidates.budget // 20:
                 break
@@ -262,7 +300,7 @@ class _Search:
 
         - `first` `[m, d]`: points that are returned at any rate.
         - `alike`: whether only failures with as few departures as the least one count.
-        - `cosine`: of the angle between directions, at most.
+        - `cosine`: the cosine of the angle between directions, at most.
         """
         failures, nominal = self.failures(), self.candidates.nominal
         if self.by == "count" and alike:
@@ -272,8 +310,7 @@ class _Search:
         for u in failures:
             if len(chosen) >= FOLLOWED:
                 break
-            v = u - nominal.u
-            departures = [w - nominal.u for w in chosen]
+            v, *departures = nominal.departure(np.stack([u, *chosen]))
             if all(v @ w < cosine * np.linalg.norm(v) * np.linalg.norm(w) for w in departures):
                 chosen.append(u)
         return np.array(chosen)
@@ -292,13 +329,13 @@ def search_alongside(
 ) -> None:
     """Search failures on the same coordinates, a little farther away in other directions."""
     nominal = candidates.nominal
-    v = u.astype(np.float64) - nominal.u
+    v = nominal.departure(u[None])[0]
     v[np.array(nominal.cube.levels) > 0] = 0
     reach = float(np.linalg.norm(v))
     moved = v * (1 + 0.6 * rng.standard_normal((64, len(v))))
     moved *= reach * rng.uniform(1, 1.2, (64, 1)) / _length(moved)
     points = np.repeat(u[None].astype(np.float64), 64, axis=0)
-    candidates(np.where(v != 0, nominal.u + moved, points))
+    candidates(np.where(v != 0, nominal.point_at(moved), points))
 
 
 def search_elsewhere(
@@ -320,8 +357,9 @@ def search_elsewhere(
     moved = np.zeros((40, nominal.space.dim))
     for row in moved:
         row[rng.permutation(free)[:maximum]] = rng.standard_normal(maximum)
+    moved *= nominal.scale
     moved *= reach * rng.uniform(0.3, 1, (len(moved), 1)) / _length(moved)
-    points = nominal.settle(nominal.u + moved)
+    points = nominal.settle(nominal.point_at(moved))
     rho, failing = candidates(points)
     if failing.any():
         return
@@ -336,12 +374,14 @@ def search_elsewhere(
             noise = rng.standard_normal((5, len(point))) * same
             noise[:, np.array(nominal.cube.levels) > 0] = 0
             steps = 0.3 * 0.6**turn * reach * noise / _length(noise)
-            if tangent is not None and (gradient := tangent.gradient * same).any():
+            slope = nominal.slope(point[None])[0]
+            if tangent is not None and (gradient := tangent.gradient / slope * same).any():
                 # To where the tangent is zero, half and twice as far.
                 full = -max(tangent.value, 1e-9) * gradient / (gradient @ gradient)
                 steps[:3] = np.outer([1.05, 0.5, 2.0], full)
-            away = point + steps - nominal.u
-            children.append(nominal.u + away * np.minimum(1, reach / _length(away)))
+            away = nominal.departure(point[None]) + steps
+            nearer = nominal.point_at(away * np.minimum(1, reach / _length(away)))
+            children.append(np.where(np.array(nominal.cube.levels) > 0, point, nearer))
         points = nominal.settle(np.concatenate(children))
         rho, failing = candidates(points)
         if failing.any():
@@ -366,8 +406,11 @@ def _verified(
     # In float64 other random numbers would be drawn, and a black box does not compute in it.
     exact = not problem.black_box and not problem.draws()
     for u in search.failures()[:20]:
-        farther = nominal.settle(nominal.u + (1 + AWAY) * (u[None].astype(np.float64) - nominal.u))
-        for point in (farther[0], u):
+        farther = nominal.point_at((1 + AWAY) * nominal.departure(u[None]))
+        farther[:, nominal.cube.discrete] = u[nominal.cube.discrete]
+        # By likelihood each bit counts.
+        tried = (u,) if isinstance(nominal, Likeliest) else (nominal.settle(farther)[0], u)
+        for point in tried:
             if not nominal.space.accepts_points(point[None])[0]:
                 continue
             columns = columns_at(problem, point)
@@ -393,6 +436,14 @@ def _changed(nominal: Nominal, u: Float[np.ndarray, " d"]) -> dict[str, tuple[An
         values = (nominal.u[i], u[i]) if column is None else column
         changed[name] = (None if nominal.lacks[i] else _plain(values[0]), _plain(values[1]))
     return changed
+
+
+def _log_densities(at: Nominal, u: np.ndarray, start: np.ndarray) -> LogDensities | None:
+    """Return the logarithms of the density of the result, its start, and the likeliest features."""
+    if not isinstance(at, Likeliest):
+        return None
+    rows = at.space.rows(at.space.features_at(np.stack([u, start, at.u])))
+    return LogDensities(*log_density(at.space, rows).tolist())
 
 
 def _broken(replayed: Replay) -> tuple[str, ...]:

@@ -38,7 +38,7 @@ class Candidates:
     - `problem`: whose system is simulated.
     - `nominal`: the point from which candidates depart.
     - `budget`: simulations at most.
-    - `precision`: of the simulations, `"float32"` or `"float64"`.
+    - `precision`: the precision of the simulations, `"float32"` or `"float64"`.
 
     **Attributes:** `points` `[n, d]`, `rho` `[n]` and `failing` `[n]` of all that were simulated;
     `limit`: simulations after which no more are made for now; `max_items`: points with more items
@@ -62,7 +62,7 @@ class Candidates:
         self.rho = np.zeros(0)
         self.failing = np.zeros(0, bool)
         self.temperature = 1.0
-        self.differentiable = not problem.black_box
+        self.differentiable = not problem.black_box and 0 in nominal.space.levels
         self.note = ""
         self.without_verdict, self.trouble = 0, ""
 

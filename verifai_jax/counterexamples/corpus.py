@@ -23,6 +23,7 @@ import numpy as np
 from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.checks import check_count, is_number
 from verifai_jax.core.keys import run_keys
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.core.text import format_error, one_line
 from verifai_jax.counterexamples._shrink import shrink as shrink_row
 from verifai_jax.counterexamples.selection import columns_at, problem_of
@@ -45,10 +46,11 @@ class SavedCounterexample:
     - `problem`, `target`: names of the problem, in itself and on the command line.
     - `formulas`: their texts by name.
     - `features`: the columns of the feature space.
-    - `robustness`: of each formula, as simulated.
+    - `robustness`: the robustness of each formula, as simulated.
     - `seed`, `row`: of the run and in its table: they decide the random key of the simulation.
     - `precision`, `backend`: that it was simulated with.
-    - `verdict`: of closer replays of the row that it came from; empty if there were none.
+    - `verdict`: the verdict of closer replays of the row that it came from; empty if there were
+      none.
     - `changed`: what departs from nominal, `[nominal, value]` by coordinate, where it was shrunk.
     - `found`: the search, its budget, the number of simulations, the version, and the `sources`:
       what the model was made of, as a run records it.
@@ -72,7 +74,7 @@ class SavedCounterexample:
         """Name of its file: the problem's, and a digest of what decides the simulation."""
         deciding = [self.problem, self.formulas, self.features, self.seed, self.row]
         text = json.dumps(deciding, sort_keys=True)
-        stem = re.sub(r"\W+", "-", self.problem).strip("-") or "counterexample"
+        stem = re.sub(r"\W+", "-", self.problem).strip("-")[:60] or "counterexample"
         return f"{stem}-{hashlib.sha256(text.encode()).hexdigest()[:10]}.json"
 
     def write(self, folder: Path) -> Path:
@@ -86,7 +88,7 @@ class SavedCounterexample:
             words = ["verifai-jax", "replay-counterexamples", self.target, str(path)]
             content["reproduce"] = shlex.join(words)
         with replacing(path) as partial:
-            partial.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+            partial.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", "utf-8")
         return path
 
     @classmethod
@@ -96,7 +98,7 @@ class SavedCounterexample:
         **Raises:** `CorpusError` for anything else.
         """
         try:
-            content = json.loads(path.read_text())
+            content = json.loads(path.read_text(encoding="utf-8-sig"))
         except (OSError, ValueError, RecursionError) as error:
             raise CorpusError(f"{path} cannot be read: {one_line(format_error(error))}") from None
         form = content.get("format") if isinstance(content, dict) else None
@@ -163,6 +165,7 @@ _FORMS: dict[str, tuple[Callable[[Any], bool], str]] = {
 """For each entry of a file whether a value can be it, and what it must be, as text."""
 
 
+@shows_progress("saving counterexamples of", of_budget=False)
 def save_counterexamples(
     run: Run,
     folder: str | Path,
@@ -170,6 +173,7 @@ def save_counterexamples(
     max_count: int = 5,
     shrink: bool = True,
     budget: int = 1000,
+    progress: bool | None = None,
 ) -> list[Path]:
     """Write counterexamples of a run into a folder, one small file each.
 
@@ -184,6 +188,7 @@ def save_counterexamples(
     - `max_count`: counterexamples at most.
     - `shrink`: whether each is first shrunk towards the nominal features, where these are known.
     - `budget`: simulations to shrink one with, at most.
+    - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     **Returns:** the paths of the files, none twice.
 
@@ -200,7 +205,6 @@ def save_counterexamples(
     ordered = claimed.sort_values("rho", kind="stable")
     points = problem.space.points(ordered)
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     paths: dict[Path, None] = {}
     for index in _spread(points, max_count):
         row = int(ordered.index[index])

@@ -49,7 +49,7 @@ def describe(
 
     **Arguments:**
 
-    - `name`: of the problem.
+    - `name`: the name of the problem.
     - `row`: its number in the table.
     - `why`: the predicate that decides, when, and through which sub-formulas.
     - `rho`: robustness of the row.

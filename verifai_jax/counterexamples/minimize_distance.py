@@ -37,6 +37,9 @@ TURNS = (1.0, 0.75, 0.5, 0.3, 0.15, 0.05)
 """Shares of the way to the linearised boundary's nearest point,"""
 STRETCHES = (1.0, 1.003, 1.015, 1.06)
 """and how far beyond it: the boundary is curved."""
+COSTS = (0.0, 3.0, 30.0)
+"""Standard deviations that the whole range of a value costs whose prior is even; one of them, at
+random, in each round."""
 ENOUGH = 5e-4
 """Relative improvement that is not worth a round."""
 
@@ -114,20 +117,24 @@ def propose(candidates: Candidates, track: Track, count: int, rng: np.random.Gen
     nominal = candidates.nominal
     levels = np.array(nominal.cube.levels)
     coordinates = np.flatnonzero(track.free & (levels == 0))
-    u0 = nominal.u.astype(np.float64)
-    v = track.u.astype(np.float64)[coordinates] - u0[coordinates]
+    whole = nominal.departure(track.u[None])
+    v = whole[0, coordinates]
     length = float(np.linalg.norm(v))
     parts = [discrete_steps(candidates, track)]
     if length > 0:
         lines = segment_shares(track)
-        aims = boundary_steps(candidates, track, coordinates, v)
+        costs = rng.choice(COSTS)
+        aims = boundary_steps(candidates, track, coordinates, v, costs)
         left = max(count - len(lines) - len(aims) - len(parts[0]), 6)
         ones = single_coordinates(track, v, left // 3, rng)
-        near = random_directions(track, v, left - len(ones), rng)
+        scale = nominal.scale[coordinates]
+        near = random_directions(track, v, left - len(ones), rng, scale)
         moved = np.concatenate([np.outer(lines, v), aims, ones, near])
         moved = moved[np.linalg.norm(moved, axis=1) < length]
         points = np.repeat(track.u[None].astype(np.float64), len(moved), axis=0)
-        points[:, coordinates] = u0[coordinates] + moved
+        departures = np.repeat(whole, len(moved), axis=0)
+        departures[:, coordinates] = moved
+        points[:, coordinates] = nominal.point_at(departures)[:, coordinates]
         parts.append(points)
     return np.concatenate(parts)
 
@@ -140,32 +147,49 @@ def segment_shares(track: Track) -> Float[np.ndarray, " n"]:
 
 
 def boundary_steps(
-    candidates: Candidates, track: Track, coordinates: Int[np.ndarray, " k"], v: Departure
+    candidates: Candidates,
+    track: Track,
+    coordinates: Int[np.ndarray, " k"],
+    v: Departure,
+    costs: float = 0.0,
 ) -> Departures:
-    """Return departures at, and on the way to, the nearest points of the linearised boundary."""
-    u0 = candidates.nominal.u.astype(np.float64)[coordinates]
-    ends = np.zeros(len(track.u))
-    low, high = (
-        (ends + candidates.nominal.low)[coordinates],
-        (ends + candidates.nominal.high)[coordinates],
-    )
+    """Return departures at, and on the way to, the nearest points of the linearised boundary.
+
+    - `costs`: the costs of a coordinate that departs by next to nothing anywhere, over its whole
+      range; 0 for no more than that. Without it a linear model goes on to an end of the range.
+    """
+    nominal = candidates.nominal
+    ends = np.zeros((2, len(track.u)))
+    ends[0] += nominal.low
+    ends[1] += nominal.high
+    low, high = nominal.departure(ends)[:, coordinates]
     tangents = track.tangents[-1:] or fit_tangent(candidates, track, coordinates)
     targets = []
+    slight = (nominal.scale[coordinates] < 1) & (costs > 0)
+    centre = np.where(slight, v, 0.0)
+    width = np.where(slight, (high - low) / max(costs, 1.0), 1.0)
     for some in (tangents, track.tangents[-6:]) if len(track.tangents) > 1 else (tangents,):
-        rows = np.array([piece.gradient[coordinates] for piece in some])
-        if not len(rows) or not rows.any():
+        if not some:
             continue
-        levels = np.array(
-            [p.gradient[coordinates] @ (p.point[coordinates] - u0) - p.value for p in some]
+        points = np.array([piece.point for piece in some])
+        rows = np.array([piece.gradient for piece in some]) / nominal.slope(points)
+        rows = rows[:, coordinates]
+        if not rows.any():
+            continue
+        values = np.array([piece.value for piece in some])
+        levels = np.sum(rows * nominal.departure(points)[:, coordinates], axis=1) - values
+        nearest = shortest_in_box(
+            rows * width, levels - rows @ centre, (low - centre) / width, (high - centre) / width
         )
-        nearest = shortest_in_box(rows, levels, low - u0, high - u0)
         if nearest is not None:
-            targets.append(nearest)
+            targets.append(centre + width * nearest)
     track.target = None
     if not targets:
         return np.zeros((0, len(v)))
     track.target = track.u.astype(np.float64)
-    track.target[coordinates] = u0 + targets[0]
+    departures = nominal.departure(track.u[None])
+    departures[:, coordinates] = targets[0]
+    track.target[coordinates] = nominal.point_at(departures)[0, coordinates]
     steps = [
         stretch * ((1 - turn) * v + turn * target)
         for target in targets
@@ -219,12 +243,12 @@ def single_coordinates(
 
 
 def random_directions(
-    track: Track, v: Departure, count: int, rng: np.random.Generator
+    track: Track, v: Departure, count: int, rng: np.random.Generator, scale: Departure
 ) -> Departures:
     """Draw departures in random directions near that of `v`, a little shorter."""
     length = np.linalg.norm(v)
     k = len(v)
-    noise = rng.standard_normal((count, k))
+    noise = rng.standard_normal((count, k)) * scale
     # Half of them in keep_nominal coordinates: boundaries are often aligned with some.
     kept = rng.random((count, k)) < min(1.0, 2 / k)
     kept |= (rng.random(count) < 0.5).reshape(-1, 1) | ~kept.any(axis=1, keepdims=True)
@@ -283,8 +307,7 @@ def advance(candidates: Candidates, track: Track, points: Points, failing: np.nd
 
 def share_of_segment(candidates: Candidates, u: Point, other: Point) -> float | None:
     """Return where `other` lies between nominal (0) and `u` (1); None if it lies elsewhere."""
-    u0 = candidates.nominal.u.astype(np.float64)
-    v, w = u - u0, other - u0
+    v, w = candidates.nominal.departure(np.stack([u, other]))
     share = float(w @ v / max(v @ v, 1e-30))
     return share if np.linalg.norm(w - share * v) < 1e-5 * np.linalg.norm(v) + 1e-7 else None
 

@@ -10,7 +10,7 @@ with each of its coordinates, wherever they are, since nothing else says what th
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -21,6 +21,7 @@ from verifai_jax.core.cube import Cube
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.programs import pad_rows
 from verifai_jax.features import FeatureSpace
+from verifai_jax.features.improbability import Improbability
 from verifai_jax.problem.problem import Problem
 
 
@@ -30,7 +31,7 @@ class Nominal:
 
     **Fields:**
 
-    - `space`: of the features.
+    - `space`: the space of the features.
     - `u` `[d]`: the point.
     - `low` and `high` `[d]`: ends of the coordinates within which points may depart.
     """
@@ -131,20 +132,11 @@ class Nominal:
 
     def cells(self, points: Float[np.ndarray, "*n d"]) -> Int[np.ndarray, "*n k"]:
         """Return the cell of each discrete coordinate of points `[*n, d]`."""
-        cube, u = self.cube, np.asarray(points, np.float32)
-        if any(weights is not None for weights in cube.weights):
-            return np.asarray(cube.cells(u))  # pyright: ignore[reportArgumentType]
-        # In NumPy: JAX would compile a program for each number of points.
-        counts = np.array([cube.levels[i] for i in cube.discrete], np.int32)
-        return np.clip((u[..., cube.discrete] * counts).astype(np.int32), 0, counts - 1)
+        return np.asarray(self.cube.cells(np.asarray(points, np.float32)))
 
     def centres(self, cells: Int[np.ndarray, "*n k"]) -> Float[np.ndarray, "*n k"]:
         """Return the middles of cells as coordinates."""
-        cube, numbers = self.cube, np.asarray(cells, np.int32)
-        if any(weights is not None for weights in cube.weights):
-            return np.asarray(cube.centres(numbers))  # pyright: ignore[reportArgumentType]
-        counts = np.array([cube.levels[i] for i in cube.discrete], np.float32)
-        return ((numbers + np.float32(0.5)) / counts).astype(np.float32)
+        return np.asarray(self.cube.centres(np.asarray(cells, np.int32)))
 
     def moved(self, points: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, "n d"]:
         """Return the coordinates of settled points that can be moved back to those of nominal."""
@@ -171,6 +163,23 @@ class Nominal:
             ordered = np.array([self.cube.ordered[i] for i in discrete])
             gap[:, discrete] = np.where(ordered, apart / steps, apart > 0)
         return gap
+
+    def departure(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+        """Return the signed departures, whose length is the distance in continuous coordinates."""
+        return np.asarray(points, np.float64) - self.u
+
+    def point_at(self, departures: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+        """Return the points with these signed departures."""
+        return self.u.astype(np.float64) + departures
+
+    def slope(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+        """Return the derivative of the signed departures by the coordinates."""
+        return np.ones(np.shape(points))
+
+    @cached_property
+    def scale(self) -> Float[np.ndarray, " d"]:
+        """The size of a step in each coordinate, as a departure, of which many are tried."""
+        return np.ones(len(self.u))
 
     def count(self, points: Float[np.ndarray, "n d"]) -> Int[np.ndarray, " n"]:
         """Count the coordinates that depart."""
@@ -207,3 +216,40 @@ class Nominal:
     def distance(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
         """Return the Euclidean length of the departure."""
         return np.sqrt((self.gaps(points) ** 2).sum(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Likeliest(Nominal):
+    """The likeliest features in the place of nominal ones: what departs from them is improbable.
+
+    The distance of a point is the number of standard deviations at which a normal distribution is
+    as improbable: half its square is lost of the logarithm of the density.
+    """
+
+    improbability: Improbability = field(kw_only=True)
+
+    @classmethod
+    def in_space(cls, space: FeatureSpace) -> "Likeliest":
+        """Return the likeliest features of a space.
+
+        **Raises:** `NoDensityError` for a space whose features have no density.
+        """
+        improbability = Improbability(space)
+        u = improbability.likeliest.astype(np.float32)
+        return cls(space, u, improbability=improbability)
+
+    def departure(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+        return self.improbability.departure(points)
+
+    def point_at(self, departures: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+        return self.improbability.point_at(departures)
+
+    def slope(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+        return self.improbability.slope(points)
+
+    @cached_property
+    def scale(self) -> Float[np.ndarray, " d"]:
+        return self.improbability.scale
+
+    def gaps(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+        return np.sqrt(self.improbability.square(points))

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from verifai_jax.counterexamples.nominal import Nominal
+from verifai_jax.counterexamples.nominal import Likeliest, Nominal
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification.run import Run
 from verifai_jax.problem.problem import Problem
@@ -75,7 +75,11 @@ def select_others(
     failing = failing.loc[failing.index != number]
     if not len(failing):
         return np.zeros((0, nominal.space.dim), np.float32)
-    order = np.argsort(_rough_distance(nominal, failing), kind="stable")
+    if isinstance(nominal, Likeliest):
+        away = -run.improbability(failing)["log_density"].to_numpy()
+    else:
+        away = _rough_distance(nominal, failing)
+    order = np.argsort(away, kind="stable")
     if len(order) > maximum:
         half = maximum // 2
         rest = np.linspace(half, len(order) - 1, maximum - half).astype(int)

@@ -25,6 +25,16 @@ class Step(NamedTuple):
     distance: float
 
 
+class LogDensities(NamedTuple):
+    """Natural logarithms of the prior's density: of a failure, of the row at which its search
+    began, and of the likeliest features.
+    """
+
+    failure: float
+    start: float
+    likeliest: float
+
+
 @dataclass(frozen=True, eq=False)
 class Shrunk(Drawn, InNotebook):
     """The least departure from nominal found to fail.
@@ -37,7 +47,9 @@ class Shrunk(Drawn, InNotebook):
     `broken` and `start_broken`: names of the formulas that it breaks, and that the row broke;
     `simulations` spent; `by`: what was made least first; `history`: a `Step` for each improvement;
     `notes` for people; `duration` of the simulation in seconds; `model_changed` and `finding`: what
-    the replay of the row says, as in `Replay`; `stopped`: `"interrupted"` after Ctrl-C.
+    the replay of the row says, as in `Replay`; `stopped`: `"interrupted"` after Ctrl-C;
+    `log_densities`: of what is made likely, else None: then the likeliest features take the place
+    of nominal ones, and distances are numbers of standard deviations.
     """
 
     _picture = "counterexamples", "plot_shrunk"
@@ -65,6 +77,7 @@ class Shrunk(Drawn, InNotebook):
     model_changed: str = ""
     finding: str = ""
     stopped: str | None = None
+    log_densities: LogDensities | None = None
 
     @property
     def count(self) -> int:
@@ -89,7 +102,9 @@ class Shrunk(Drawn, InNotebook):
         # A distribution has no width: what counts is the probability between two values.
         thins_out = any(any(domain.tailed) for domain in domains)
         unit = "prior, in probability" if thins_out else "range"
-        if not self.count:
+        if self.log_densities is not None:
+            lines = [self._likelihood(self.log_densities)]
+        elif not self.count:
             lines = [
                 f"{name}: the nominal features fail themselves, with robustness {self.rho:z.4g}; "
                 "there is nothing to shrink"
@@ -101,6 +116,7 @@ class Shrunk(Drawn, InNotebook):
                 f"{self.distance:z.3g} of {'its' if self.count == 1 else 'their'} {unit} "
                 f"(robustness {self.rho:z.3g})"
             ]
+        if self.count:
             names = self.labels
             width = max(map(len, names))
             lines += [
@@ -114,13 +130,24 @@ class Shrunk(Drawn, InNotebook):
         ]
         if len(self.problem.formulas) > 1:
             lines.append(f"  {self._breaks()}")
-        lines.append(
-            f"  row {self.row} departed in {_of(self.start_count, d)}, by "
-            f"{self.start_distance:z.3g}; {self.simulations} simulations"
-        )
+        began = f"departed in {_of(self.start_count, d)}, by {self.start_distance:z.3g}"
+        if self.log_densities is not None:
+            began = f"has log-likelihood {self.log_densities.start:z.5g}"
+        lines.append(f"  row {self.row} {began}; {self.simulations} simulations")
         lines += [f"  note: {note}" for note in self.notes]
         warnings = [text for text in (self.model_changed, self.finding) if text]
         return "\n".join([*warnings, *lines])
+
+    def _likelihood(self, log: LogDensities) -> str:
+        """Say how likely the failure is, against the likeliest features."""
+        name, lost = self.problem.name, log.likeliest - log.failure
+        if not self.count:
+            return f"{name}: the likeliest features fail, with robustness {self.rho:z.4g}"
+        return (
+            f"{name}: the likeliest failure found has log-likelihood {log.failure:z.5g}, "
+            f"{lost:z.4g} less than the likeliest features: as improbable as {self.distance:z.3g} "
+            f"standard deviations of a normal distribution (robustness {self.rho:z.3g})"
+        )
 
     def _breaks(self) -> str:
         """Say which formulas break, and which of those that the row broke do not any more."""

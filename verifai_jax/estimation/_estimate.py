@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import SimulationProgress, shows_progress
 from verifai_jax.estimation.answers import (
     Answer,
+    Cheap,
     Plan,
     bound_from_pilot,
     chains_for,
@@ -36,8 +37,11 @@ from verifai_jax.estimation.methods import (
 from verifai_jax.estimation.monte_carlo import AT_ONCE
 from verifai_jax.estimation.moved_priors import notice_own_chance
 from verifai_jax.estimation.normal_space import LimitState
-from verifai_jax.estimation.result import METHODS, Estimate
+from verifai_jax.estimation.result import METHODS, WEIGHTED, Estimate
+from verifai_jax.estimation.surrogate import FITTING, estimate_by_surrogate
 from verifai_jax.evaluation.backends import resolved
+from verifai_jax.falsification.cheap import check_same_features
+from verifai_jax.falsification.validation import SLOW, can_be_slow
 from verifai_jax.problem.dependence import depends_on_key, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.binomial import clopper_pearson
@@ -47,6 +51,14 @@ if TYPE_CHECKING:
 
 GRADIENTS_FROM = 3
 """Continuous coordinates from which the searches for failing regions take gradients."""
+
+CHEAP_BATCH = 4096
+"""Simulations of a cheap model at once."""
+WITHIN = 1.5
+"""Factor from the estimate to the ends of the interval, at which an estimate with a cheap model
+ends."""
+SPEEDS = ("auto", "slow", "fast")
+"""Values of `simulations_are`."""
 
 
 @suggests_options
@@ -65,6 +77,9 @@ def estimate(
     max_seconds: float | None = None,
     progress: bool | None = None,
     executor: "Executor | None" = None,
+    simulations_are: Literal["auto", "slow", "fast"] = "auto",
+    within: float | None = None,
+    cheap: Problem | None = None,
 ) -> Estimate:
     """Estimate the probability, under the prior of the features, that a simulation fails.
 
@@ -76,12 +91,12 @@ def estimate(
     **Arguments:**
 
     - `problem`: the system with its feature space and formulas.
-    - `method`: `"monte_carlo"`, `"importance"` or `"splitting"`; the first samples choose when left
-      out.
+    - `method`: `"monte_carlo"`, `"importance"`, `"splitting"` or `"surrogate"`; the first samples
+      choose when left out.
     - `budget`: simulations at most, pilot and fit included.
     - `batch`: simulations at once; by default as many as the method asks for at a time.
     - `seed`: the same seed gives the same estimate on the same machine.
-    - `confidence`: of the interval and of the bound, between 0 and 1.
+    - `confidence`: the confidence of the interval and of the bound, between 0 and 1.
     - `p0`: a wanted upper limit of the probability, between 0 and 1; the result says whether it is
       shown, and how many further simulations without a failure would show it.
     - `precision`, `backend`: as in `falsify`.
@@ -89,6 +104,14 @@ def estimate(
     - `progress`: True draws a progress bar, False none; None draws one on a terminal and in a
       notebook.
     - `executor`: whose workers simulate, as in `falsify`; the estimate is the same.
+    - `simulations_are`: `"slow"` for a few hundred simulations: the method is then `"surrogate"`,
+      which spends arithmetic to save them. `"auto"` takes it for a black box of which a simulation
+      takes half a second or longer, if the budget is 200 or more.
+    - `within`: with slow simulations, the factor from the estimate to the ends of the interval at
+      which they may end before the budget, such as 1.5.
+    - `cheap`: a cheap model of the same features, which says where failures may be. It is simulated
+      some 100 000 times; every claim rests on simulations of `problem` alone. Simulations are
+      `"slow"` then, and end at `within=1.5` where nothing else is said.
 
     **Returns:** the estimate with its interval and a guaranteed bound. Ctrl-C gives the estimate
     from the finished simulations. A simulation without a verdict (not finite, raised, out of time)
@@ -107,6 +130,12 @@ def estimate(
     check_fraction("confidence", confidence)
     if p0 is not None:
         check_fraction("p0", p0)
+    if simulations_are not in SPEEDS:
+        raise unknown_name("simulations_are", simulations_are, SPEEDS)
+    if within is not None and not within > 1:
+        raise ValueError(f"within must be a factor above 1, such as 1.5; got {within}")
+    if cheap is not None:
+        check_same_features(problem, cheap)
     in_precision(precision)
     problem.space.check_where()
     share = SHARE_OF_REPLICATE if method == "splitting" else SHARE_OF_LEVEL
@@ -132,9 +161,18 @@ def estimate(
             draws=depends_on_key(choice.problem),
             one_by_one=choice.problem.black_box and executor is None,
         )
-        plan = Plan(confidence, chains, simulated.clamped)
+        slow = simulations_are == "slow" or cheap is not None
+        plan = Plan(confidence, chains, simulated.clamped, within)
+        if cheap is not None:
+            plan = replace(
+                plan, within=within or WITHIN, cheap=_robustness_of(cheap, precision, seed)
+            )
         if choice.problem.black_box:
             notice_own_chance(limit_state, np.random.default_rng((seed, 1)))
+            if simulations_are == "auto" and can_be_slow(choice.problem, executor):
+                slow = slow or limit_state.seconds >= SLOW
+        if slow and method is None and problem.space.dim:
+            method = "surrogate"
         try:
             answer = _METHODS[method](limit_state, np.random.default_rng(seed), plan)
         except KeyboardInterrupt:
@@ -153,6 +191,7 @@ _METHODS = {
     "monte_carlo": estimate_by_monte_carlo,
     "importance": estimate_by_importance_sampling,
     "splitting": estimate_by_splitting,
+    "surrogate": estimate_by_surrogate,
 }
 
 
@@ -170,11 +209,11 @@ def _result(
     notes = [text for text in (limit_state.own_chance,) if text] + list(answer.notes)
     bound = answer.prior.upper_bound(plan.confidence)
     high = answer.high
-    if answer.prior.no_verdict and answer.method in ("importance", "splitting"):
+    if answer.prior.no_verdict and answer.method in WEIGHTED:
         # The weighted samples near the failures say nothing of missing verdicts elsewhere.
         none = clopper_pearson(answer.prior.no_verdict, answer.prior.simulations, plan.confidence)
         high = min(1.0, high + none.high)
-    elif limit_state.no_verdict and answer.method in ("importance", "splitting"):
+    elif limit_state.no_verdict and answer.method in WEIGHTED:
         notes.append(
             f"{limit_state.no_verdict:,} simulations near the failures gave no verdict; if they "
             "are failures, the probability is higher"
@@ -186,10 +225,13 @@ def _result(
         )
     if limit_state.ended:
         notes.append(f"ended early: {limit_state.ended}")
-    if answer.method in ("importance", "splitting"):
+    if answer.method in WEIGHTED:
+        searches = "splitting and the independent searches"
+        if answer.method == "surrogate":
+            searches = "the surrogate"
         notes.append(
-            "the interval does not account for failures far from all that splitting and the "
-            "independent searches reached; the guaranteed bound does"
+            f"the interval does not account for failures far from all that {searches} reached; the "
+            "guaranteed bound does"
         )
     return Estimate(
         name=problem.name,
@@ -219,6 +261,13 @@ def _result(
         stopped=limit_state.ended,
         drawn=answer.drawn,
     )
+
+
+def _robustness_of(cheap: Problem, precision: str, seed: int) -> Cheap:
+    cheap = resolved(cheap, batch=CHEAP_BATCH, budget=FITTING, precision=precision).problem
+    cheap.check()
+    simulate = DoublePrecisionEvaluator(cheap, CHEAP_BATCH, precision, seed)
+    return lambda u: np.asarray(simulate(u)[0], float)
 
 
 def _differentiates(problem: Problem) -> bool:

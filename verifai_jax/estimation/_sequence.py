@@ -70,8 +70,8 @@ def sequence(
       with (`"x"`, or `"position[1]"`), or the feature of that part that it keeps. One for all
       joints, or one for each.
     - `samples`: of the first part.
-    - `confidence`: of all intervals together.
-    - `seed`: of samples and random keys.
+    - `confidence`: the confidence of all intervals together.
+    - `seed`: the seed of samples and random keys.
     - `batch`: simulations at once.
     - `precision`: `"float32"` or `"float64"`.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.

@@ -1,7 +1,8 @@
 """Answers: what samples, splitting runs and bounds say of a probability, with their notes."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -29,19 +30,27 @@ CHAIN = 10
 UNDERSTATED = 1.6
 """Factor on the relative error of a run: chains start from those of the previous level."""
 
+Cheap: TypeAlias = Callable[[Float[np.ndarray, "n d"]], Float[np.ndarray, " n"]]
+"""From points of the unit cube to the robustness of a cheap model."""
+
 
 @dataclass(frozen=True)
 class Plan:
     """Requirements of an answer.
 
-    - `confidence`: of the interval and the bound.
+    - `confidence`: the confidence of the interval and the bound.
     - `chains`: splitting chains of a level.
     - `clamped`: True at coordinates whose domain ends in an outermost value.
+    - `within`: factor from the estimate to an end of the interval that is short enough; None to
+      spend the budget.
+    - `cheap`: the robustness of a cheap model at points of the unit cube; None without one.
     """
 
     confidence: float
     chains: int
     clamped: Bool[np.ndarray, " d"]
+    within: float | None = None
+    cheap: Cheap | None = None
 
 
 @dataclass
@@ -216,7 +225,18 @@ def splitting_answer(
     runs: list[SplittingRun],
     counts: Counts,
 ) -> Answer:
-    """Answer by the mean of these runs and of as many more as the budget allows."""
+    """Answer by the mean of these runs and of as many more as the budget allows.
+
+    Where the first level of each is that of the failures, it counts samples of the prior: these
+    are counted, since that is more precise, and certain where all of them fail.
+    """
+    if all(run.levels == [-np.inf] for run in runs):
+        counts = counts + monte_carlo.sample_prior(limit_state, rng, limit_state.left)
+        answer = monte_carlo_answer(counts, plan)
+        answer.notes.append(
+            "failures are so probable that splitting would have one level; its samples are counted"
+        )
+        return answer
     size = runs[0].first[0]
     cost = splitting_cost(runs[0], size)
     # Half as large, where that gives two instead of one.

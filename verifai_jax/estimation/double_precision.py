@@ -86,8 +86,8 @@ class DoublePrecisionEvaluator:
 
     - `problem`: a checked one, on the backend that it is to run on.
     - `batch`: simulations at once.
-    - `precision`: of the simulations, `"float32"` or `"float64"`.
-    - `seed`: of the random keys of simulations; as in `falsify`.
+    - `precision`: the precision of the simulations, `"float32"` or `"float64"`.
+    - `seed`: the seed of the random keys of simulations; as in `falsify`.
     - `executor`: whose workers simulate; this process when left out.
     """
 

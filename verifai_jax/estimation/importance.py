@@ -12,7 +12,7 @@ Source: Rubinstein and Kroese, The cross-entropy method (2004), chapter 3; Owen 
 effective importance sampling, JASA 95 (2000).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -66,6 +66,7 @@ class ImportanceSamples:
       reaches.
     - `origin`: the component of the proposal that each sample came from; 0 is the prior.
     - `failing`: True where a simulation breaks a formula.
+    - `points`: the points of the samples.
     - `failures`: the points among them that fail.
     - `keys`: numbers of the random keys with which these do.
     - `proposal`: the mixture that was sampled.
@@ -79,6 +80,7 @@ class ImportanceSamples:
     edge: Float[np.ndarray, " n"]
     origin: Int[np.ndarray, " n"]
     failing: Bool[np.ndarray, " n"]
+    points: Float[np.ndarray, "n d"]
     failures: Float[np.ndarray, "failures d"]
     keys: Int[np.ndarray, " failures"]
     proposal: Mixture
@@ -108,6 +110,13 @@ class ImportanceSamples:
         widened = float(np.exp(2 * error)) * (1 + self.unresolved)
         return low / share / widened, min(high / share * widened, 1.0)
 
+    def join(self, other: "ImportanceSamples") -> "ImportanceSamples":
+        """Return these samples and further ones of the same proposal."""
+        rows = ("x", "without", "edge", "origin", "failing", "points", "failures", "keys")
+        both = {n: np.concatenate([getattr(self, n), getattr(other, n)]) for n in rows}
+        coarse, simulations = (max(self.coarse, other.coarse), self.simulations + other.simulations)
+        return replace(self, **both, coarse=coarse, simulations=simulations)
+
     def _widened(self, x: Float[np.ndarray, " n"], confidence: float) -> tuple[float, float]:
         """Widen the interval where a heavy tail hides a part of the variance of the samples."""
         mean = weighted_mean(x)
@@ -136,7 +145,7 @@ class FittedProposal:
     - `proposal`: the fitted mixture.
     - `effective`: effective failures per simulation.
     - `tail`: tail index of their weights.
-    - `probability`: of a failure, by these samples.
+    - `probability`: the probability of a failure, by these samples.
     """
 
     proposal: Mixture
@@ -263,7 +272,7 @@ def sample_proposal(
     outside = np.any((np.abs(z) > OUTERMOST) & clamped, axis=1)
     edge = np.where(outside, HIDDEN * x, 0.0)
     return ImportanceSamples(
-        x, without, edge, origin, scores.failing, z[scores.failing], numbers[scores.failing],
+        x, without, edge, origin, scores.failing, z, z[scores.failing], numbers[scores.failing],
         proposal, _coarse(z, x), acceptance, limit_state.simulations - started,
     )  # fmt: skip
 

@@ -132,6 +132,10 @@ class LimitState:
         """Simulations, failures and missing verdicts of the first samples of the prior."""
         self.own_chance = ""
         """A sentence on memory or chance that does not come from the random key; empty if none."""
+        self.rows: list[tuple[np.ndarray, np.ndarray]] | None = None
+        """Points and robustness of all simulations, where a method wants them; NaN for none."""
+        self.seconds = 0.0
+        """Seconds of one of the simulations that were asked for last."""
         self.lowest = np.inf
         self.ended: str | None = None
         self.strict = False
@@ -216,9 +220,11 @@ class LimitState:
             except KeyboardInterrupt:
                 self.ended = "interrupted"
                 raise Ended from None
+            took = time.perf_counter() - began
+            self.seconds = took / min(self.step, len(z) - start)
             start = stop
             if self.one_by_one:
-                quick = time.perf_counter() - began < SECONDS
+                quick = took < SECONDS
                 self.step = min(2 * self.step, self.max_step) if quick else max(1, self.step // 2)
         return [np.concatenate(column) for column in zip(*parts, strict=True)]
 
@@ -249,6 +255,8 @@ class LimitState:
         known = proper & np.isfinite(rho)
         score = np.where(known, np.maximum(rho, 0.0), np.inf).astype(np.float64)
         score[failing] = -np.inf
+        if self.rows is not None:
+            self.rows.append((z, np.where(known, rho, np.nan)))
         self.simulations += len(z)
         self.evaluated += len(z)
         self.failures += int(failing.sum())

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from verifai_jax.core.figure import Drawn
 from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.text import format_percent, format_probability
 from verifai_jax.statistics.binomial import simulations_until
 
 if TYPE_CHECKING:
@@ -26,7 +26,10 @@ METHODS = {
     "monte_carlo": "Monte Carlo",
     "importance": "importance sampling",
     "splitting": "multilevel splitting",
+    "surrogate": "importance sampling by a surrogate",
 }
+WEIGHTED = ("importance", "splitting", "surrogate")
+"""Methods that reach failures by a search, so that they may miss some."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +37,11 @@ class Estimate(Drawn, InNotebook):
     """A failure probability, as `estimate` returns it.
 
     - `name`: name of the problem.
-    - `probability`: of a failure, under the prior of the feature space; None if none is claimed.
+    - `probability`: the probability of a failure, under the prior of the feature space; None if
+      none is claimed.
     - `low`, `high`: the interval, at `confidence`; without an estimate 0 and `upper_bound`.
-    - `confidence`: of the interval and of the bound.
-    - `method`: `"monte_carlo"`, `"importance"` or `"splitting"`; None without an estimate.
+    - `confidence`: the confidence of the interval and of the bound.
+    - `method`: a name of `METHODS`; None without an estimate.
     - `simulations`: number of all simulations; one with its gradient counts 2.
     - `budget`: simulations that were allowed.
     - `failures`, `no_verdict`: simulations among them that failed, and without a verdict.
@@ -105,7 +109,7 @@ class Estimate(Drawn, InNotebook):
         **Arguments:**
 
         - `p0`: failure probability to be shown, between 0 and 1.
-        - `confidence`: of the bound; that of the estimate when left out.
+        - `confidence`: the confidence of the bound; that of the estimate when left out.
 
         **Returns:** the number of samples in addition to those that `upper_bound` rests on; 0 if
         these show it already.
@@ -127,9 +131,10 @@ class Estimate(Drawn, InNotebook):
                 f"{self.upper_bound:z.2g} ({sure} bound)"
             ]
         else:
+            ends = (format_probability(end) for end in (self.low, self.high))
             lines = [
-                f"{self.name}: fails with probability {self.probability:z.3g} "
-                f"({sure} interval {self.low:z.3g} to {self.high:z.3g}), by {METHODS[self.method]}"
+                f"{self.name}: fails with probability {format_probability(self.probability)} "
+                f"({sure} interval {' to '.join(ends)}), by {METHODS[self.method]}"
             ]
         without = f", {self.no_verdict:,} without a verdict" if self.no_verdict else ""
         lines.append(
@@ -176,8 +181,8 @@ class Estimate(Drawn, InNotebook):
 
         **Arguments:**
 
-        - `path`: of the HTML file.
-        - `options`: of `reports.write_report`: `problem`, `units`, `reasons`.
+        - `path`: the path of the HTML file.
+        - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`, `errors`.
 
         **Returns:** the path.
         """

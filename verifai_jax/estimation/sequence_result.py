@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 
 if TYPE_CHECKING:
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
 class PartEstimate:
     """One part of a sequence, given that the parts before it have not failed.
 
-    - `name`: of its problem.
+    - `name`: the name of its problem.
     - `probability`: share that fails; NaN if no simulation has a verdict.
     - `low`, `high`: ends of its interval.
     - `samples`: simulations, or rows of a run, that it rests on.
@@ -42,7 +43,7 @@ class PartEstimate:
 
 
 @dataclass(frozen=True, eq=False)
-class SequenceEstimate:
+class SequenceEstimate(InNotebook):
     """The failure probability of a sequence of scenarios, as `sequence` returns it.
 
     - `parts`: an estimate of each part that was reached.
@@ -51,7 +52,7 @@ class SequenceEstimate:
     - `counterexamples`: a row for each failure: the `part` that fails, and the features of it and
       of all parts before it as columns `PART.FEATURE`.
     - `simulations`: made for it.
-    - `seed`: of the samples; part i has the random keys of seed + i.
+    - `seed`: the seed of the samples; part i has the random keys of seed + i.
     - `notes`: what the intervals rest on.
     """
 

@@ -99,14 +99,14 @@ class Confirmation(InNotebook):
 
     **Fields:**
 
-    - `name`: of the problem.
+    - `name`: the name of the problem.
     - `row`: its number in the table; None for features without one.
     - `verdict`: `"confirmed"`, `"refuted"`, `"fragile"` or `"raised"`.
     - `rho`: robustness `as_run`, NaN if it is unknown, and of each check by name.
     - `band`: how far the robustness moved between the replays.
     - `why`: the reason of the verdict, as a sentence.
     - `notes`: checks that could not be made, and why.
-    - `precision`: of the run.
+    - `precision`: the precision of the run.
     - `changed`, `finding`: as in `Replay`, of the row simulated again in the run's precision; the
       second is looked for if the model has changed or the verdict is not `"confirmed"`.
     """
@@ -147,7 +147,7 @@ class Confirmations(InNotebook):
 
     **Fields:**
 
-    - `name`: of the problem.
+    - `name`: the name of the problem.
     - `numbers`: `[n]`, of the rows in the table.
     - `run_rho`: `[n]`, the robustness as the run computed it; NaN if it is unknown.
     - `verdict`: `[n]`: `confirmed`: it fails in every check, and by more than replays move it (if

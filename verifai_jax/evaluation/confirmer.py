@@ -91,8 +91,8 @@ class Confirmer:
     **Arguments:**
 
     - `problem`: on the backend that it ran on.
-    - `precision`: of the run.
-    - `seed`: of the run; a simulation gets the random key that it had.
+    - `precision`: the precision of the run.
+    - `seed`: the seed of the run; a simulation gets the random key that it had.
     - `simulator`: another system for the same features and signals, or a problem with one, that
       has to agree.
     - `max_rows`: how many rows are examined whatever comes; by default 256, and more where a row
@@ -205,7 +205,7 @@ class Confirmer:
 
         **Arguments:**
 
-        - `columns`: of all new rows, as the table will have them.
+        - `columns`: the columns of all new rows, as the table will have them.
         - `first`: number of the first one in the run.
 
         **Returns:** which of the new rows violate the property, and what came of these.

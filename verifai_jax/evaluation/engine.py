@@ -151,8 +151,8 @@ class Engine:
         - `key`: the run's key; row `first + i` is simulated with `simulation_key(key, first + i)`.
           With `own_keys` the keys `[n]` of the simulations.
         - `first`: number of the first row.
-        - `temperature`: of the smooth robustness that is differentiated, one for all rows or one
-          each; unused without gradient. Clause by clause it has no unit.
+        - `temperature`: the temperature of the smooth robustness that is differentiated, one for
+          all rows or one each; unused without gradient. Clause by clause it has no unit.
         - `shared`: what all rows share, for inputs that have such.
         """
         rho, status, features, more = self._run("evaluate", rows, key, first, temperature, shared)

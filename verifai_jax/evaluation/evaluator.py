@@ -50,8 +50,8 @@ class Evaluator:
     - `gradient`: whether the smooth robustness is differentiated too.
     - `clauses`: whether clauses are evaluated, and differentiated, instead.
     - `precision`: `"float32"` or `"float64"`.
-    - `seed`: of the random keys of simulations; as in `falsify`.
-    - `journal`: of rows in flight, for a problem on the host.
+    - `seed`: the seed of the random keys of simulations; as in `falsify`.
+    - `journal`: the journal of rows in flight, for a problem on the host.
     - `executor`: with `concurrent.futures`' `submit`, whose workers simulate; this process when
       left out.
     - `guidance`: what is computed for a search in addition to the robustness.
@@ -173,14 +173,15 @@ class Evaluator:
         **Arguments:**
 
         - `u`: points of the unit cube, or rows of given features.
-        - `temperature`: of the smooth robustness that is differentiated, one for all or one each.
+        - `temperature`: the temperature of the smooth robustness that is differentiated, one for
+          all or one each.
         - `first`: number of the first simulation; numbers go on from those before when left out.
         - `padded_to`, `keep_traces`, `journals`: as of `HostEngine.evaluate`, for a black box.
 
         **Raises:** `AlwaysRaises` where it was asked for.
         """
         start = self.simulations if first is None else first
-        u = self._with_values(u)
+        u = self.rows_of(u)
         count, parts = len(u), []
         if self._sender is not None and count:
             self.simulations = start + count
@@ -201,8 +202,6 @@ class Evaluator:
             block = slice(begin, begin + size)
             some = temperature[block] if isinstance(temperature, np.ndarray) else temperature
             points = u if block.stop - block.start >= count else u[block]
-            if points.dtype != self._dtype:
-                points = np.asarray(points, self._dtype)
             first_row = start + begin
             if self._host is not None:
                 simulate = partial(
@@ -251,7 +250,13 @@ class Evaluator:
         """
         if self._sender is None:
             raise TypeError("points are sent to workers only by an evaluator with an executor")
-        return self._sender.submit(self._with_values(u), self.key, first)
+        return self._sender.submit(self.rows_of(u), self.key, first)
+
+    def rows_of(self, u: Float[Any, "n d"]) -> Float[Any, "n row"]:
+        """Return points as rows of the engine, which takes others where features may be given."""
+        if self.given and u.shape[1] == self.problem.space.dim:
+            u = np.pad(u, ((0, 0), (0, self.problem.space.width)), constant_values=np.nan)
+        return u if u.dtype == self._dtype else np.asarray(u, self._dtype)
 
     @property
     def _looks_often(self) -> bool:
@@ -264,9 +269,3 @@ class Evaluator:
         if self._raising is not None:
             self._raising.add(verdicts.status, verdicts.messages)
             self._raising.check(self.problem.name)
-
-    def _with_values(self, u: Float[Any, "n d"]) -> Float[Any, "n row"]:
-        """Return points as rows without given numbers, where the engine takes such rows."""
-        if not self.given or u.shape[1] != self.problem.space.dim:
-            return u
-        return np.pad(u, ((0, 0), (0, self.problem.space.width)), constant_values=np.nan)

@@ -69,7 +69,7 @@ class ExecutorEngine:
     - `executor`: with `submit`.
     - `gradient`, `clauses`, `precision`, `guidance`: as of `engine.Engine`.
     - `given`: whether points are rows of given features, as of `CubePoints`.
-    - `journal`: of rows in flight, for a problem on the host.
+    - `journal`: the journal of rows in flight, for a problem on the host.
     - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
 
     **Raises:** `TypeError` for anything that is not an executor; `ValueError` for one that cannot

@@ -17,23 +17,21 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Integer, Key, PyTree
+from jaxtyping import Array, Float, Integer, Key, PyTree
 
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.precision import in_precision
-from verifai_jax.core.programs import Slot, pad_rows, power_of_two
+from verifai_jax.core.programs import pad_rows, power_of_two
 from verifai_jax.core.text import storable
 from verifai_jax.core.trace import Status, Trace, without_wrapping
 from verifai_jax.core.user_errors import format_user_error
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
+from verifai_jax.evaluation.host_monitor import MONITORS, HostMonitor
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.remarks import Remarks
 from verifai_jax.evaluation.verdicts import (
     RowVerdict,
     Verdicts,
-    boolean_semantics,
-    trace_coverage_ids,
-    trace_verdict,
     violations,
 )
 from verifai_jax.mtl.setting import period
@@ -47,50 +45,6 @@ shape for all."""
 PATIENCE = 0.5
 """Seconds after which traces are evaluated in smaller blocks, so that they are safe on disk: at
 most so much work is lost with the process."""
-
-
-class HostMonitor:
-    """The compiled monitor of a problem for batches of traces that came from the host."""
-
-    def __init__(self, problem: Problem, guidance: Guidance = NOTHING) -> None:
-        self.guidance = guidance
-
-        def decided(trace: Trace, features: PyTree) -> tuple[Array, Array, Array, Array]:
-            extra = jnp.zeros(0, jnp.float32)
-            if guidance.size:
-                extra = guidance.values(problem, trace, features)
-            return *trace_verdict(problem, trace), trace_coverage_ids(problem, trace), extra
-
-        self._decide = jax.jit(jax.vmap(decided))
-        self._holds = jax.jit(jax.vmap(lambda trace: boolean_semantics(problem, trace)))
-
-    def __call__(
-        self, traces: Trace, count: int, features: PyTree = None
-    ) -> tuple[
-        Float[np.ndarray, "n k"],
-        Int[np.ndarray, " n"],
-        Bool[np.ndarray, "n k"],
-        Int[np.ndarray, "n ids"],
-        Float[np.ndarray, "n guidance"],
-    ]:
-        """Return robustness, status, Boolean semantics, coverage ids and what steers a search.
-
-        In one shape for many `count`. `features` are needed only where something steers.
-        """
-        signals = {name: without_wrapping(signal) for name, signal in traces.signals.items()}
-        padded = jax.tree.map(pad_rows, _with_signals(traces, signals))
-        own = jax.tree.map(pad_rows, features) if self.guidance.size else {}
-        decided = self._decide(padded, own)
-        rho, status, coverage_ids, guidance = (np.asarray(leaf)[:count] for leaf in decided)
-        holds = np.ones(rho.shape, bool)
-        if np.any(rho == 0):
-            # Now, while the traces are here: simulating again may be dear.
-            holds = np.asarray(self._holds(padded))[:count]
-        return rho, status, holds, coverage_ids, guidance
-
-
-MONITORS: Slot[str, HostMonitor] = Slot("monitors of host systems")
-"""The monitor of a problem whose simulations steer no search."""
 
 
 class HostEngine:
@@ -184,7 +138,7 @@ class HostEngine:
         **Arguments:**
 
         - `features`: `[n, ...]` each.
-        - `seeds`: of the simulations.
+        - `seeds`: the seeds of the simulations.
         - `keys`: that the seeds are made of, which a system needs that simulates batches.
         """
         with in_precision(self.precision):
@@ -423,13 +377,6 @@ def _is_plain(trace: Trace) -> bool:
     valid = np.asarray(length if trace.valid is None else trace.valid)
     status = np.asarray(Status.OK if trace.status is None else trace.status)
     return bool(np.all((valid >= 1) & (valid <= length)) and np.all(np.isin(status, list(Status))))
-
-
-def _with_signals(trace: Trace, signals: dict[str, Any]) -> Trace:
-    """Return a batch of traces with other signals, which a `Trace` would check as one."""
-    batch = jax.tree.map(lambda leaf: leaf, trace)
-    object.__setattr__(batch, "signals", signals)
-    return batch
 
 
 def _form(trace: Trace) -> Any:

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.keys import IMPLEMENTATION, simulation_key
+from verifai_jax.core.machine_code import Unavailable
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
 from verifai_jax.core.trace import Status
@@ -30,7 +31,6 @@ from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.tree import Term, postorder
 from verifai_jax.native_code.library import (
     Library,
-    Unavailable,
     approve,
     is_approved,
     library_name,
@@ -62,7 +62,7 @@ class NativeEngine:
 
     **Arguments:**
 
-    - `engine`: of XLA, in single precision, over points of the unit cube.
+    - `engine`: the engine that runs XLA's program, in single precision, over points of the unit cube.
     - `wanted`: `"native"`, or `"auto"` for the rule of the module's docstring.
     - `budget`: simulations of the run.
     """

@@ -137,7 +137,7 @@ class Replay(InNotebook):
 
         **Arguments:**
 
-        - `path`: of a file to write too; none when left out.
+        - `path`: a file that is written too; none when left out.
         - `camera`: the name of a camera of a MuJoCo model; the one that sees best what moves when
           left out.
         - `size`: width and height of a frame in pixels.

@@ -79,8 +79,8 @@ class Replays:
     **Arguments:**
 
     - `problem`: on the backend that it ran on.
-    - `precision`: of the replays.
-    - `key`: of the run's simulations, from `run_keys`.
+    - `precision`: the precision of the replays.
+    - `key`: the key of the run's simulations, from `run_keys`.
 
     `draws` is whether the system uses its random key, and `compile_seconds` what its programs took
     to compile. One program is traced at once, and what that raises is raised here.
@@ -114,7 +114,7 @@ class Replays:
         - `factor`: by how much the step is smaller; 1 is the system's own step.
         - `each`: features `[n, ...]` of all rows, as `FeatureSpace.features_of` gives them; the
           rows are simulated once with each.
-        - `numbers`: of the rows, which their random keys come from.
+        - `numbers`: the numbers of the rows, which their random keys come from.
 
         **Returns:** the verdicts of the rows, once for each.
         """
@@ -367,9 +367,9 @@ def replay_block(
     - `shipment`: with the problem.
     - `how`: backend, precision, by how much the step is smaller, and whether the system is to be
       made anew.
-    - `words`: of the key of the run's simulations.
-    - `leaves`: of the features, `[n, ...]` each.
-    - `numbers`: of the rows.
+    - `words`: the two words of the key of the run's simulations.
+    - `leaves`: the leaves of the features, `[n, ...]` each.
+    - `numbers`: the numbers of the rows.
 
     **Returns:** `rho`, `status`, `violated` and `messages` of the rows.
     """

@@ -72,7 +72,7 @@ class CubePoints(Inputs):
     - `problem`: that says the space.
     - `given`: whether rows are those of `given_rows`: points, followed by the real numbers of
       features that somebody gave, which are simulated as they are; NaN for those of the point.
-    - `precision`: of what is given.
+    - `precision`: the precision of the given numbers.
     """
 
     keeps_features = True
@@ -170,7 +170,7 @@ class RowFunction(NamedTuple):
 
     - `problem`: a checked `Problem`.
     - `inputs`: how a row becomes features and a system.
-    - `precision`: of simulation, monitor and gradient.
+    - `precision`: the precision of simulation, monitor and gradient.
     - `gradient`: whether the smooth robustness is differentiated.
     - `goals`: for an evaluation clause by clause.
     - `guidance`: what is computed for a search in addition to the robustness.

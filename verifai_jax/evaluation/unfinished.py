@@ -60,7 +60,7 @@ class Unfinished:
 
         **Arguments:**
 
-        - `problem`: of the evaluator.
+        - `problem`: the problem of the evaluator.
         - `mode`: what else its verdicts depend on, as text.
         """
         number, self._parts = self._parts, self._parts + 1
@@ -136,7 +136,7 @@ class Part:
 
         **Arguments:**
 
-        - `numbers`: of the simulations, which their random keys come from.
+        - `numbers`: the numbers of the simulations, which their random keys come from.
         """
         asked = {
             "points": np.asarray(points),
@@ -192,13 +192,15 @@ def keeping(folder: Path, work: Mapping[str, Any]) -> Iterator[Unfinished]:
     other work.
     """
     with locked_cache(folder, KIND) as cache:
-        cache.claim(work)
         kept = Unfinished(cache, folder)
-        token = _PRESENT.set(kept)
         try:
-            yield kept
+            cache.claim(work)
+            token = _PRESENT.set(kept)
+            try:
+                yield kept
+            finally:
+                _PRESENT.reset(token)
         finally:
-            _PRESENT.reset(token)
             if kept.done or kept.empty:
                 shutil.rmtree(folder, ignore_errors=True)
 

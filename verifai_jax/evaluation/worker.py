@@ -47,7 +47,7 @@ class BlockMode(NamedTuple):
     - `lanes`: rows that a device works on together.
     - `gradient`, `clauses`, `precision`: as of `Engine`.
     - `padded_to`: rows that a host system's features are computed of together.
-    - `backend`: of a system that has several.
+    - `backend`: the backend of a system that has several.
     - `guidance`: what is computed for a search in addition to the robustness.
     - `given`: whether points are rows of given features, as of `CubePoints`.
     """
@@ -89,7 +89,7 @@ def evaluate_block(
     - `key`: words of the run's random key.
     - `first`: number of the first row.
     - `u`: points of the unit cube.
-    - `temperature`: of the smooth robustness, one for all or one each.
+    - `temperature`: the temperature of the smooth robustness, one for all or one each.
 
     **Returns:** arrays by the names of `ARRAYS`; the `leaves` of the features; `messages`; the
     `seconds` without compilation; the `processor`; the engine's `notes`; the `remarks` of the

@@ -88,7 +88,7 @@ def modes(
     - `budget`: simulations at most; one with its gradient counts 2.
     - `batch`: simulations at once.
     - `seed`: the same seed gives the same modes on the same machine.
-    - `confidence`: of all intervals, between 0 and 1.
+    - `confidence`: the confidence of all intervals, between 0 and 1.
     - `min_share`: part of the failure probability below which a region is not listed.
     - `precision`, `backend`: as in `falsify`.
     - `max_seconds`: wall-clock seconds after which what is finished is divided into modes.

@@ -47,7 +47,7 @@ def divide_by_chance(
 
     **Arguments:**
 
-    - `limit_state`: of whose budget a little is kept for what is handed out.
+    - `limit_state`: the limit state; a part of its budget is kept for the answer.
     - `samples`: weighted samples, of which there are failures.
     """
     limit_state.budget -= HANDED_OUT * GROUPS

@@ -13,7 +13,7 @@ from jaxtyping import Array, Key
 from verifai_jax.core.figure import Drawn
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.notebook import InNotebook, picture_html
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.text import format_percent, format_probability
 from verifai_jax.counterexamples import explain, shrink
 from verifai_jax.counterexamples._explain import Explained
 from verifai_jax.counterexamples.shrunk import Shrunk
@@ -28,12 +28,12 @@ class Mode(InNotebook):
 
     - `number`: its index in the order of probability; 0 is the most probable one.
     - `name`: conditions in words that set it apart from the prior.
-    - `probability`: of a failure in it, under the prior.
+    - `probability`: the probability of a failure in it, under the prior.
     - `low`, `high`: the interval, at the confidence of the result.
     - `share`: its part of the whole failure probability.
     - `features`: its likeliest failure under the prior (the design point).
-    - `distance`: of that point from the middle of the prior, in standard deviations of normal
-      space (the reliability index).
+    - `distance`: the distance of that point from the middle of the prior, in standard deviations of
+      normal space (the reliability index).
     - `rho`: robustness there.
     - `cause`: the formula and the predicate that decide there, as text; empty without a verdict.
     - `failures`: features of failures of this mode, distributed as the prior's, one a row.
@@ -88,7 +88,7 @@ class Mode(InNotebook):
 
         **Arguments:**
 
-        - `path`: of a file to write too; none when left out.
+        - `path`: a file that is written too; none when left out.
         - `options`: `camera`, `size` and `fps`, as in `Replay.animate`.
 
         **Raises:** as `Replay.animate`.
@@ -139,11 +139,11 @@ class Mode(InNotebook):
 class Modes(Drawn, InNotebook):
     """All failing regions that were found, the most probable first.
 
-    - `name`: of the problem.
+    - `name`: the name of the problem.
     - `modes`: the regions.
     - `probability`, `low`, `high`: of any failure, as `estimate` gives it; None without an
       estimate, with 0 and the guaranteed bound.
-    - `confidence`: of all intervals.
+    - `confidence`: the confidence of all intervals.
     - `unexplained`: share of the failures that no path of failures joins to a mode, from below to
       above: the interval of a count.
     - `rest`: probability of further regions that are too improbable to be listed.
@@ -224,8 +224,9 @@ class Modes(Drawn, InNotebook):
             ]
         else:
             lines = [
-                f"{self.name}: fails with probability {self.probability:z.3g} ({sure} interval "
-                f"{self.low:z.3g} to {self.high:z.3g}), in {len(self.modes)} "
+                f"{self.name}: fails with probability {format_probability(self.probability)} "
+                f"({sure} interval {format_probability(self.low)} to "
+                f"{format_probability(self.high)}), in {len(self.modes)} "
                 f"mode{'s' if len(self.modes) != 1 else ''}"
             ]
         if self.changed:

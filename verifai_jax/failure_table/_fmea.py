@@ -58,17 +58,17 @@ def fmea(
     **Arguments:**
 
     - `problem`: a problem, whose own features stay nominal.
-    - `faults`: of `vj.faults`, in addition to those that the problem has. Each has to have a number
-      at which it is off, such as `duration=vj.Box(0, 2)`.
+    - `faults`: the faults of `vj.faults`, in addition to those that the problem has. Each has to
+      have a number at which it is off, such as `duration=vj.Box(0, 2)`.
     - `rate`: occurrences in an hour, of each fault or by its name; `mission_time` in hours. A fault
       then happens with probability `1 - exp(-rate * mission_time)`, one independent of the other.
       Without them probabilities are those given that it happens.
     - `samples`: of each fault, and of each pair, from the prior of its numbers.
-    - `budget`: of the search for a failure where no sample fails, and of the estimate where few do;
-      0 for neither.
+    - `budget`: the budget of the search for a failure where no sample fails, and of the estimate
+      where few do; 0 for neither.
     - `pairs`: whether pairs are tried of those faults that never fail alone.
-    - `confidence`: of each interval.
-    - `seed`: of all chance.
+    - `confidence`: the confidence of each interval.
+    - `seed`: the seed of everything that is drawn at random.
     - `folder`: that keeps the counterexamples as a run, and what is simulated: a table that was cut
       off goes on there.
     - `executor`: whose workers simulate, as in `falsify`.

@@ -52,7 +52,7 @@ def effect_of(
 
     - `run`: with the candidates as rows.
     - `faults`: all of them by name.
-    - `verdicts`: of the confirmation, by row.
+    - `verdicts`: the verdicts of the confirmation, by row.
     """
     rows = range(found.first, found.first + len(found.candidates))
     row = next((row for row in rows if verdicts.get(row) == "confirmed"), None)

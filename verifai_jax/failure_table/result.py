@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.figure import Drawn
 from verifai_jax.core.notebook import InNotebook, frame_html
@@ -22,8 +23,8 @@ class Effect:
     - `faults`: their names.
     - `fails`: whether any simulation with it, and without another fault, breaks the property.
     - `severity`: the least at which one does, by the name of the number; empty if none does.
-    - `row`: of the counterexample in the run of the table; None if there is none.
-    - `verdict`: of the confirmation of that counterexample, see `vj.confirm`.
+    - `row`: the row of the counterexample in the run of the table; None if there is none.
+    - `verdict`: the verdict of the confirmation of that counterexample, see `vj.confirm`.
     - `broken`: the name of the formula.
     - `delay`: seconds from the onset to the violation.
     - `shown_by`: the signal that differs first from the same simulation without the fault;
@@ -66,13 +67,13 @@ class Effect:
 class FailureTable(Drawn, InNotebook):
     """Faults and their effects, the most probable failure first; made by `fmea`.
 
-    - `name`: of the problem.
+    - `name`: the name of the problem.
     - `effects`: the rows.
     - `run`: the counterexamples as a run, for `replay`, `explain` and `confirm`; None if no fault
       fails.
-    - `rate`: of each fault, in an hour; `mission_time`: in hours; None for probabilities of a
-      failure given that the fault happens.
-    - `confidence`: of each interval.
+    - `rate`: the rate of each fault, in an hour; `mission_time`: in hours; None for probabilities
+      of a failure given that the fault happens.
+    - `confidence`: the confidence of each interval.
     - `healthy`: whether the nominal features without a fault keep the property.
     - `seconds`: wall-clock time.
     """
@@ -135,9 +136,12 @@ class FailureTable(Drawn, InNotebook):
 
         **Arguments:**
 
-        - `path`: of the file.
+        - `path`: the path of the file.
+
+        **Raises:** `OSError` that names the file, for whatever the file system refuses.
         """
-        self.table.to_csv(path)
+        with replacing(path) as partial:
+            self.table.to_csv(partial)
 
     def replay(self, name: str) -> Any:
         """Simulate the counterexample of a row again, and keep the trace.

@@ -21,6 +21,7 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.precision import in_precision, reproducible_settings
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.evaluation.backends import resolved
+from verifai_jax.falsification import cheap as cheaply
 from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
 from verifai_jax.falsification.model_changes import continued_with
@@ -39,6 +40,7 @@ from verifai_jax.falsification.validation import (
     check_first,
     check_gradient,
     check_guide,
+    check_objective,
     check_rule,
     check_same_guide,
     check_same_space,
@@ -49,6 +51,7 @@ from verifai_jax.falsification.validation import (
     recorded_search,
     rows_of_first,
     slow_search,
+    with_objective,
 )
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
@@ -82,6 +85,7 @@ def falsify(
     backend: str | None = None,
     confirm: bool = True,
     diverse: bool | Literal["inputs", "behaviour"] = False,
+    objective: Literal["robustness", "likelihood"] = "robustness",
     first: "Rows | None" = None,
     callbacks: Iterable[Callback] = (),
     progress: bool | None = None,
@@ -89,6 +93,7 @@ def falsify(
     executor: "Executor | None" = None,
     keep_going: bool = False,
     engine: str = "xla",
+    cheap: Problem | None = None,
 ) -> Run:
     """Search the feature space for inputs under which the system breaks its property.
 
@@ -113,8 +118,9 @@ def falsify(
       starts. Its rows are not copied.
     - `folder`: where rows are kept on disk as they come; must not hold another run.
     - `precision`: `"float32"` or `"float64"`, of simulations and verdicts.
-    - `backend`: of a system that has several (`"mjx"`, `"native"`); the faster one that the search
-      can use when left out, as measured here. Name it for the same table on every machine.
+    - `backend`: the backend of a system that has several (`"mjx"`, `"native"`); the faster one that
+      the search can use when left out, as measured here. Name it for the same table on every
+      machine.
     - `confirm`: replay what violates the property in double precision and, where the system has
       finer steps, at a half and a quarter of its step, and do not claim what no longer does: it
       stays in the table, as `unconfirmed`. At most 1024 rows are replayed, or one for 128
@@ -125,6 +131,11 @@ def falsify(
       failures that are far from each other (`search.Diverse`). True or `"inputs"`: in their
       inputs; `"behaviour"`: in what happens, that is the predicate that decides, when it does, and
       the shape of the trace.
+    - `objective`: what the search makes better: `"robustness"`, how badly the property breaks, or
+      `"likelihood"`, how probable a failure is under the features' distributions
+      (`search.Likeliest`, around `cross_entropy` where no search is named). `vj.shrink(run,
+      by="likelihood")` goes on to the likeliest failure, and `run.improbability()` says how likely
+      each is.
     - `first`: features that are simulated before the search proposes any, and told to it where it
       learns: as in `simulate`. They count in the budget, and the run then has no failure rate.
     - `callbacks`: functions called after each round with the number of simulations and a dictionary
@@ -143,6 +154,9 @@ def falsify(
       to zero. `"auto"` takes it if the budget is worth the compilation, which the run records. What
       cannot be translated (other precisions, unusual operations) is simulated by XLA, and the notes
       say why.
+    - `cheap`: a cheap model of the same features. It is searched first, with 20 times the budget;
+      at most a quarter of the budget is then spent on what it found, the gravest first and no two
+      alike, from which the search goes on. Only `problem` decides what fails.
 
     Ctrl-C ends the run and returns what is finished. What is likely a mistake of the problem is in
     the run's `notes`, and above the progress bar.
@@ -160,9 +174,21 @@ def falsify(
     check_engine(engine)
     asking, search = without_suggestions(search)
     default = search == AUTO
-    search = check_search(problem, "portfolio" if default else search)
+    usual = "cross_entropy" if objective == "likelihood" else "portfolio"
+    search = check_search(problem, usual if default else search)
+    search = with_objective(search, objective, bool(diverse))
+    check_objective(problem, search)
     check_rule(search, stop_when)
     check_guide(problem, search)
+    if cheap is not None:
+        cheaply.check_same_features(problem, cheap)
+        if first is not None:
+            raise ValueError("give either first, or a cheap model that finds what comes first")
+        found = falsify(
+            cheap, budget=min(cheaply.TIMES * budget, cheaply.MAX_CHEAP), seed=seed, confirm=False,
+            precision=precision, progress=False,
+        )  # fmt: skip
+        first = cheaply.gravest_rows(found, budget)
     given = check_first(problem, first, stop_when, precision)
     callbacks = check_callbacks(callbacks)
     earlier = earlier_rows(warm_start, problem)
@@ -171,7 +197,8 @@ def falsify(
 
     def batch_for(search: Search) -> int:
         alone = whole and not problem.black_box
-        return batch_size(batch, search, budget, stop_after, alone, bool(diverse))
+        small = 16 if diverse else 64 if search.wants.likelihood else None
+        return batch_size(batch, search, budget, stop_after, alone, small)
 
     size = batch_for(search)
     choice = resolved(
@@ -200,7 +227,7 @@ def falsify(
         def prepare() -> None:
             if earlier is not None:
                 rounds.warm(earlier)
-            chooses = default and not diverse
+            chooses = default and not diverse and not search.wants.likelihood
             if asking is not None or not can_be_slow(problem, executor):
                 return
             if keep_going and not chooses:

@@ -35,8 +35,8 @@ class SeedConfirmer:
     **Arguments:**
 
     - `problem`: on a backend that JAX traces.
-    - `precision`: of the simulations.
-    - `seeds`: of the runs.
+    - `precision`: the precision of the simulations.
+    - `seeds`: the seeds of the runs.
     - `thorough`: replay all violations, not only each seed's until one is claimed.
     """
 
@@ -60,7 +60,7 @@ class SeedConfirmer:
         **Arguments:**
 
         - `seed`: index of the seed of each, ascending.
-        - `numbers`: of the simulations in their runs, ascending for each seed.
+        - `numbers`: the numbers of the simulations in their runs, ascending for each seed.
         - `u`, `rho`: their points and the least formula's robustness.
 
         **Returns:** which of them are not claimed, and the greatest robustness of their replays, at

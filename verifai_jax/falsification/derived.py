@@ -19,7 +19,7 @@ def as_simulated(problem: Problem, record: Mapping[str, Any]) -> Problem:
     **Arguments:**
 
     - `problem`: as a person wrote it, or the one of the run itself, which stays as it is.
-    - `record`: of the run.
+    - `record`: the record of the run.
 
     **Returns:** the given problem where nothing was made of it, or where it cannot be made.
     """

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from verifai_jax.evaluation.guidance import Guidance
 from verifai_jax.evaluation.verdicts import Verdicts
+from verifai_jax.falsification.likelihood import Likelihood
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Objective
 from verifai_jax.search import Search
@@ -40,7 +41,7 @@ Source = Literal["search", "first", "suggested"]
 class Batch(NamedTuple):
     """The points of a round.
 
-    - `points`: of the unit cube, or rows of given features (`given_rows`).
+    - `points`: the points of the unit cube, or rows of given features (`given_rows`).
     - `source`: who gave them.
     - `cut`: whether the budget cut the round.
     - `verdicts`: if workers have simulated them already.
@@ -62,9 +63,9 @@ class Learning:
 
     **Arguments:**
 
-    - `problem`: of the run.
-    - `search`: of the run.
-    - `key`: of the search.
+    - `problem`: the problem of the run.
+    - `search`: the search of the run.
+    - `key`: the key of the search.
 
     `surrogate` models the traces for a search that wants it, `coverage_ids` counts what was
     covered.
@@ -80,7 +81,11 @@ class Learning:
 
             self.coverage_ids = coverage_counts.CoverageCounts(problem)
         self.surrogate: Surrogate | None = None
-        self._objective = None if problem.rulebook is None else Objective(problem.rulebook)
+        self._objective: Objective | Likelihood | None = None
+        if search.wants.likelihood:
+            self._objective = Likelihood(problem.space)
+        elif problem.rulebook is not None:
+            self._objective = Objective(problem.rulebook)
         self.proposals: Any = None
         self.take(search)
 
@@ -125,7 +130,7 @@ class Learning:
 
     def objective(self, verdicts: Verdicts) -> Float[np.ndarray, " n"]:
         """Return what the search minimises; with a priority it depends on the rows before."""
-        if self._objective is None:
+        if self._objective is None or isinstance(self._objective, Likelihood):
             return verdicts.lowest
         return self._objective(verdicts.rho, verdicts.rho < 0)
 
@@ -142,8 +147,8 @@ class Learning:
 
         - `batch`: its points, of the unit cube.
         - `objective`: what the search minimises at each of them.
-        - `verdicts`: of its simulations.
-        - `coverage_ids`: of its simulations, for a search that wants them.
+        - `verdicts`: the verdicts of its simulations.
+        - `coverage_ids`: the coverage of its simulations, for a search that wants them.
         """
         outcomes = None
         if verdicts.guidance is not None:
@@ -151,6 +156,9 @@ class Learning:
                 objective = self._with_guide(objective, verdicts.guidance[:, 0])
             if self.guidance.outcome:
                 outcomes = verdicts.guidance[:, int(self.guidance.guide) :]
+        if isinstance(self._objective, Likelihood):
+            points = np.asarray(batch.points)
+            objective, verdicts = self._objective.learned(points, objective, verdicts)
         if batch.given:
             self._learn_given(batch, objective, verdicts, outcomes)
         else:
@@ -217,12 +225,15 @@ class Learning:
             return
         rho = proper["rho"].to_numpy(np.float32)
         names = [f"rho.{name}" for name in self.problem.formulas]
-        if self._objective is not None and all(name in proper for name in names):
+        points = self.problem.space.points(proper)
+        if isinstance(self._objective, Likelihood):
+            rho = self._objective(points, rho, proper["rho"].to_numpy() < 0).astype(np.float32)
+        elif self._objective is not None and all(name in proper for name in names):
             each = proper[names].to_numpy(np.float64)
             rho = self._objective(each, each < 0).astype(np.float32)
         # What the guide says of these rows is unknown; it counts as the least good.
         rho = self._with_guide(rho, np.full(len(rho), np.nan, np.float32))
-        self.proposals.warm_start(self.problem.space.points(proper), rho)
+        self.proposals.warm_start(points, rho)
 
     def checkpoint(self) -> dict[str, Any]:
         """Return what it knows as entries of a checkpoint, but for the state of the search."""

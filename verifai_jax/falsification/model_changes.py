@@ -46,7 +46,7 @@ def model_changes(
 
     - `recorded`: by the run or the sweep.
     - `now`: what the model is made of now; without it what lies on the disk counts.
-    - `row`: of a run; all that it was simulated with where it is None.
+    - `row`: the row of a run; every model that the run was simulated with if None.
 
     **Returns:** the changes; empty if nothing is recorded.
     """
@@ -69,7 +69,7 @@ def continued_with(
 
     **Arguments:**
 
-    - `name`: of the run.
+    - `name`: the name of the run.
     - `recorded`: by the run.
     - `problem`: with which it goes on.
     - `rows`: that it has.

@@ -17,7 +17,7 @@ def origin_of(search: Search, first: int) -> Origin:
 
     **Arguments:**
 
-    - `search`: of the run.
+    - `search`: the search of the run.
     - `first`: number of rows that were given before the search proposed any.
     """
     return "first" if first and search.samples_prior else search.origin

@@ -35,7 +35,7 @@ class Prefetch:
 
     **Arguments:**
 
-    - `proposals`: of a search that does not learn.
+    - `proposals`: the proposals of a search that does not learn.
     - `evaluate`: with an executor.
     - `batch`: rows of a round.
     - `limit`: rows of the whole run.

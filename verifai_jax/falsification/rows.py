@@ -18,7 +18,7 @@ def rows_of(
     **Arguments:**
 
     - `problem`: whose features and formulas name columns.
-    - `verdicts`: of a round, with features.
+    - `verdicts`: the verdicts of a round, with features.
     - `differentiates`: whether clauses are differentiated in some rounds; the rows then say in
       which.
     """

@@ -1,7 +1,7 @@
 """The result of a falsification: its table, its statistics, and how to see a row again."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,27 +37,25 @@ if TYPE_CHECKING:
 class Run(InNotebook):
     """The result of a falsification: its table, its record, and what follows from them.
 
-    - `name`: of the problem.
+    - `name`: the name of the problem.
     - `formulas`: their texts by name.
-    - `table`: one row a simulation.
-    - `search`: its repr.
+    - `table`, `search`: one row a simulation, and the repr of what proposed them.
     - `seed`, `batch`, `budget`: as given to `falsify`.
     - `stopped`: `"budget"`, `"max_seconds"`, `"stop_after"`, `"stop_when"`, `"exhausted"` (a finite
       search came to its end), `"interrupted"`, the error that ended it, or `"running"` for one that
       was cut off.
-    - `compile_seconds`, `confirm_seconds`, `run_seconds`: time spent compiling, in closer replays,
-      and in everything else; of a resumed run, that of all its parts.
+    - `compile_seconds`, `confirm_seconds`, `run_seconds`: time of all parts of the run spent
+      compiling, in closer replays, and in everything else.
     - `search_seconds`: the part of `run_seconds` that proposals and suggestions took, and learning
       from what came of them.
     - `simulate_seconds`: the part of `run_seconds` that simulations took, and their rows to be put
       into the table. What is left is that of callbacks and checkpoints.
-    - `version`: of verifai_jax.
+    - `version`: the version of verifai_jax.
     - `prior`: whether the rows are independent samples of the feature space.
-    - `origin`: where the rows come from, an `origin.Origin`, which says why they are no such
-      samples: `"first"` (rows that were given came before the samples), `"given"` (all rows were),
-      `"sequence"` (the points of a sequence that spreads them), `"coverage"` and `"learned"` (a
-      search that goes where coverage grows, or where failures are); empty in a record that does
-      not say.
+    - `origin`: where the rows come from, and why they are no such samples: `"first"` (rows that
+      were given came first), `"given"` (all rows were), `"sequence"` (the points of a sequence that
+      spreads them), `"coverage"` and `"learned"` (a search that goes where coverage grows, or where
+      failures are); empty in a record that does not say.
     - `folder`: on disk; None for a run in memory.
     - `target`: the problem's name on the command line.
     - `problem`: None for a run that was loaded without it.
@@ -77,15 +75,16 @@ class Run(InNotebook):
     - `sources`: what the model was made of when the run began, and again where it went on with
       another one: files with their hashes, and versions, as plain data; empty if that is not
       recorded.
-    - `derived`: what a verb made of the problem that it was given, as plain data; None if it was
-      simulated as it was.
+    - `derived`: what a verb made of the problem, as plain data; None if nothing.
+    - `requirements`: what the requirements of its formulas said, by identifier, as plain data.
+    - `model`: a hash of what was simulated, of a problem with requirements.
     - `damage`: what of its files could not be read; such a run cannot be resumed.
     """
 
     _internal = frozenset((
         "changed_since", "changes", "checkpoint", "checks", "compared", "damage",
-        "has_several_models", "lasting_notes", "origin", "search_data", "space_data", "table_path",
-        "verdict_counts",
+        "has_several_models", "lasting_notes", "model", "origin", "search_data", "space_data",
+        "table_path", "verdict_counts",
     ))  # fmt: skip
 
     name: str
@@ -123,6 +122,8 @@ class Run(InNotebook):
     damage: str = ""
     origin: str = ""
     derived: Mapping[str, Any] | None = None
+    requirements: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    model: str = ""
 
     @property
     def checked(self) -> str:
@@ -277,7 +278,7 @@ class Run(InNotebook):
 
         **Arguments:**
 
-        - `rows`: of the table, all counterexamples when left out.
+        - `rows`: the rows of the table, all counterexamples when left out.
 
         **Returns:** by the numbers of the rows `log_density`, the natural logarithm of the prior's
         density (of a constrained space without the share that is accepted), and for each column
@@ -397,7 +398,8 @@ class Run(InNotebook):
         **Arguments:**
 
         - `folder`: it is made where there is none.
-        - `options`: of `counterexamples.save_counterexamples`: `max_count`, `shrink`, `budget`.
+        - `options`: the options of `counterexamples.save_counterexamples`: `max_count`, `shrink`,
+          `budget`.
 
         **Raises:** `ValueError` for a run without its problem or without a counterexample.
         """
@@ -418,9 +420,9 @@ class Run(InNotebook):
 
         **Arguments:**
 
-        - `path`: of the HTML file.
-        - `options`: of `reports.write_report`: `units` and `reasons` of features, `traces`,
-          `studies`, `modes`.
+        - `path`: the path of the HTML file.
+        - `options`: the options of `reports.write_report`: `units` and `reasons` of features,
+          `traces`, `studies`, `modes`.
 
         **Returns:** the path.
         """
@@ -438,7 +440,8 @@ class Run(InNotebook):
         """Write the run to a folder: its record, table and state; returns the folder.
 
         **Raises:** `FolderInUse` where another process writes there; `ValueError` where it is the
-        run's own folder, and somebody has gone on with the run there.
+        run's own folder, and somebody has gone on with the run there; `OSError` for what the file
+        system refuses, such as a full disk: what the folder held before stays.
         """
         return lazy_import("verifai_jax.falsification.run_folder", "save_run")(self, Path(path))
 

@@ -25,7 +25,7 @@ from verifai_jax.core.sources import Sources
 from verifai_jax.core.text import one_line
 from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.run import Run
-from verifai_jax.falsification.segments import SEGMENTS, list_segments
+from verifai_jax.falsification.segments import FAILURES, SEGMENTS, list_segments
 from verifai_jax.falsification.table import FINISHED, ErrorTable
 from verifai_jax.falsification.tail import TAIL
 from verifai_jax.problem.problem import Problem
@@ -73,12 +73,25 @@ def save_run(run: Run, folder: Path) -> Path:
     """
     with write_lock(folder):
         check_not_continued(run, folder)
-        table = run.table.save(folder)
-        checksum = write_record(run, folder)
-        if run.checkpoint:
-            rows = table.digest(int(run.checkpoint["rows"]))
-            write_checkpoint(run.checkpoint, folder, rows, checksum)
+        if _is_own(run, folder):
+            _write(run, folder)
+        else:
+            names = (TAIL, SEGMENTS, FAILURES, FINISHED, STATE, RECORD)
+            with files.replacing_all(folder, names) as made:
+                _write(run, made)
     return folder
+
+
+def _write(run: Run, folder: Path) -> None:
+    table = run.table.save(folder)
+    checksum = write_record(run, folder)
+    if run.checkpoint:
+        rows = table.digest(int(run.checkpoint["rows"]))
+        write_checkpoint(run.checkpoint, folder, rows, checksum)
+
+
+def _is_own(run: Run, folder: Path) -> bool:
+    return run.folder is not None and folder.absolute() == run.folder.absolute()
 
 
 def load(path: str | Path, problem: Problem | None = None) -> Run:
@@ -179,9 +192,7 @@ def check_not_continued(run: Run, folder: Path) -> None:
 
     **Raises:** `ValueError`.
     """
-    if run.folder is None or folder.absolute() != run.folder.absolute():
-        return
-    if not (folder / RECORD).exists():
+    if not _is_own(run, folder) or not (folder / RECORD).exists():
         return
     record = read_record(folder)
     remedy = "load it, vj.load(folder, problem), or save this one elsewhere, run.save(folder)"
@@ -251,9 +262,9 @@ def write_checkpoint(
     **Arguments:**
 
     - `checkpoint`: the state of the search, with the number of `rows` that it has seen.
-    - `folder`: of the run.
-    - `rows_checksum`: of these rows.
-    - `record_checksum`: of the record.
+    - `folder`: the folder of the run.
+    - `rows_checksum`: the checksum of these rows.
+    - `record_checksum`: the checksum of the record.
     """
     arrays = {name: _plain(value) for name, value in checkpoint.items()}
     arrays[ROWS_CHECKSUM] = np.array(rows_checksum, np.uint32)

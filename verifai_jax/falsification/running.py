@@ -31,6 +31,7 @@ from verifai_jax.falsification.run_folder import write_record
 from verifai_jax.falsification.silent_mistakes import cut_short_note, nominal_note, notes_after
 from verifai_jax.falsification.summary import first_message
 from verifai_jax.falsification.validation import space_as_data
+from verifai_jax.problem.model_digest import digest_of_model
 from verifai_jax.search import Search
 from verifai_jax.store.locks import writing
 
@@ -89,8 +90,8 @@ class Running:
 
     - `rounds`: its rounds, not compiled yet.
     - `ends`: the conditions that end it.
-    - `choice`: of its backend.
-    - `seed`: of its search and its simulations.
+    - `choice`: the choice of its backend.
+    - `seed`: the seed of its search and its simulations.
     - `target`: name of the problem on the command line.
     - `notes`: on what is likely a mistake.
     - `lasting`: notes that are still true when the run goes on.
@@ -112,6 +113,7 @@ class Running:
     warm: bool = False
     keep_going: bool = False
     _models: tuple[Mapping[str, Any], ...] = field(default=(), init=False)
+    _model: str = field(default="", init=False)
 
     def play(
         self,
@@ -126,6 +128,8 @@ class Running:
         rounds, begun = self.rounds, time.time()
         now = self.sources
         self._models = (rounds.problem.sources().to_json(),) if now is None else tuple(now)
+        # Tracing once more is for those who ask which claims a change concerns.
+        self._model = digest_of_model(rounds.problem) if rounds.problem.requirements else ""
         # Checking and tracing are part of what a second run of the problem does not repeat.
         rounds.watch = Stopwatch(COMPILE, self.ends.started, self.ends.earlier)
         self._write_record()
@@ -283,6 +287,8 @@ class Running:
             guide=None if problem.guide is None else problem.guide.to_json(),
             sources=self._models,
             derived=problem.system.derived,
+            requirements=problem.requirement_entries(),
+            model=self._model,
             notes=(*chosen, *self.lasting, *self.notes, *rounds.chosen, *rounds.notes),
             lasting_notes=(*self.lasting, *rounds.chosen),
         )

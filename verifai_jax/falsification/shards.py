@@ -119,7 +119,7 @@ def simulate_shard(
     **Arguments:**
 
     - `shard`: the part.
-    - `folder`: of this part alone.
+    - `folder`: the folder of this part alone.
     - all other arguments: as in `falsify`, the same for all parts; `confirm` is done when they are
       merged.
 
@@ -371,9 +371,9 @@ def merge(
 
     **Arguments:**
 
-    - `folders`: of all parts.
-    - `problem`: of the run.
-    - `folder`: of the merged run; in memory when left out.
+    - `folders`: the folders of all parts.
+    - `problem`: the problem of the run.
+    - `folder`: the folder of the merged run; in memory when left out.
     - `progress`: as in `falsify`.
 
     **Returns:** the run.

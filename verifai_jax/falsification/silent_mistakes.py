@@ -59,9 +59,9 @@ def nominal_note(problem: Problem, evaluate: Evaluator, search: Search) -> tuple
 
     **Arguments:**
 
-    - `problem`: of the run.
+    - `problem`: the problem of the run.
     - `evaluate`: the run's own, compiled.
-    - `search`: of the run.
+    - `search`: the search of the run.
     """
     if problem.nominal is None or problem.system.backends or search.origin == "given":
         return ()
@@ -91,7 +91,9 @@ def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
         "the nominal point", jax.jit(lambda: space.flatten(varied)).lower(), "least"
     )
     u = np.asarray(flatten(), np.float32)
-    verdict = engine.evaluate(u[None], evaluate.key, 0)
+    # The engine may be one of rows that carry given features.
+    rows = u[None] if problem.black_box else evaluate.rows_of(u[None])
+    verdict = engine.evaluate(rows, evaluate.key, 0)
     if not verdict.violated[0]:
         return ()
     return (
@@ -112,9 +114,9 @@ def notes_after(
 
     **Arguments:**
 
-    - `table`: of the run.
+    - `table`: the table of the run.
     - `formulas`: texts by name.
-    - `search`: of the run.
+    - `search`: the search of the run.
     - `warm`: whether the search began where an earlier run had ended.
     """
     count = len(table) - table.counts.without_verdict
@@ -140,7 +142,7 @@ def cut_short_note(search: Search, total: int | None, simulated: int) -> tuple[s
 
     **Arguments:**
 
-    - `search`: of the run; it has more points to propose.
+    - `search`: the search of the run; it has more points to propose.
     - `total`: points of the whole search; None if it never ends.
     - `simulated`: points of it that were simulated.
     """

@@ -45,7 +45,7 @@ class Simulations:
     - `problem`: on the backend that it runs on.
     - `search`: what it wants decides what is computed in addition to the robustness.
     - `batch`: simulations of a round at most.
-    - `seed`: of the run.
+    - `seed`: the seed of the run.
     - `precision`, `journal`, `executor`, `target`, `guidance`, `keep_traces`, `given`,
       `engine`, `budget`: as for `Evaluator`.
 
@@ -143,10 +143,10 @@ class Simulations:
 
         **Arguments:**
 
-        - `points`: of the unit cube.
+        - `points`: the points of the unit cube.
         - `first`: number of the first of them in the run.
         - `differentiate`: whether derivatives of their clauses are wanted.
-        - `temperature`: of the smooth robustness, one for all or one each.
+        - `temperature`: the temperature of the smooth robustness, one for all or one each.
         """
         if self._measured is not None:
             return self._after_measured(points, first)

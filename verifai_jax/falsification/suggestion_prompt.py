@@ -48,8 +48,8 @@ def describe_run(
     - `problem`: the one that is falsified.
     - `frame`: the table so far.
     - `search`: the one that asks.
-    - `key`: of simulations, for the traces of the worst rows.
-    - `precision`: of simulations.
+    - `key`: the key of simulations, for the traces of the worst rows.
+    - `precision`: the precision of simulations.
     - `refused`: what was wrong with earlier suggestions.
 
     **Returns:** a dictionary of plain data:
@@ -58,7 +58,7 @@ def describe_run(
     - `formulas`: text by name; all of them are to be kept, and one of them broken is a failure.
     - `features`: one dictionary each, with `name`, `kind`, `unit` where there is one, and what its
       domain has (`low`, `high`, `choices`, `knots`, ...); `columns` are its names in the rows.
-    - `constraint`: of the features, its text or name; None without one.
+    - `constraint`: the constraint of the features, its text or name; None without one.
     - `nominal`: ordinary features; None without any.
     - `wanted`: how many suggestions.
     - `simulations`, `counterexamples`, `least_robustness`: the run so far.

@@ -89,7 +89,7 @@ class Suggestions:
         """Return the suggested rows that come next, after a question where it is time for one.
 
         - `table`: the rows of the run so far.
-        - `key`: of the run's simulations.
+        - `key`: the key of the run's simulations.
         - `keep`: writes a checkpoint, so that nobody is asked twice for the same suggestions.
         """
         rows = len(table)
@@ -155,7 +155,7 @@ def row_of(problem: Problem, suggestion: object, precision: str) -> Float[np.nda
     - `problem`: the one that is falsified.
     - `suggestion`: features by name, as a person writes them, or by the columns of the table;
       columns that are none of features are ignored.
-    - `precision`: of the run.
+    - `precision`: the precision of the run.
 
     **Raises:** `TypeError` for anything that is not a mapping; `ValueError` that names the feature
     for one that is missing, unknown or outside its domain, and for features that break the

@@ -65,9 +65,9 @@ class Surrogate:
 
     **Arguments:**
 
-    - `problem`: of the run; its monitored signals are modelled.
-    - `options`: of the model and the descents on it.
-    - `key`: of its random numbers.
+    - `problem`: the problem of the run; its monitored signals are modelled.
+    - `options`: the options of the model and the descents on it.
+    - `key`: the key of its random numbers.
     """
 
     def __init__(self, problem: Problem, options: TraceOptions, key: Key[Array, ""]) -> None:
@@ -339,8 +339,8 @@ def spread_factor(rho: Float[np.ndarray, " n"], number: int, dim: int) -> float:
     **Arguments:**
 
     - `rho`: robustness of the rows, in the order in which they were simulated.
-    - `number`: of the round.
-    - `dim`: of the cube.
+    - `number`: the number of the round.
+    - `dim`: the dimension of the cube.
     """
     lowest = np.minimum.accumulate(rho)
     if lowest[-1] <= 0:

@@ -155,7 +155,7 @@ class ErrorTable(TableView):
 
         **Arguments:**
 
-        - `folder`: of the table.
+        - `folder`: the folder of the table.
         - `features`: names of the feature columns.
         - `numbers`: those among them that are numbers, where that is known.
 

@@ -16,6 +16,7 @@ from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.run_folder import RECORD
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.features.given import Rows, check_columns, given_features, given_rows
+from verifai_jax.features.improbability import Improbability
 from verifai_jax.problem.dependence import has_gradient, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
@@ -74,7 +75,7 @@ def batch_size(
     budget: int,
     stop_after: int | None = None,
     whole: bool = False,
-    diverse: bool = False,
+    small: int | None = None,
 ) -> int:
     """Return the simulations of a round.
 
@@ -82,9 +83,10 @@ def batch_size(
 
     - `asked`: what the user wants; the default when left out.
     - `search`, `budget`, `stop_after`, `whole`: as of `usual_batch`.
-    - `diverse`: whether failures far from each other are wanted, which takes many small rounds.
+    - `small`: the usual size where many small rounds are wanted.
     """
-    usual = 16 if diverse else usual_batch(search, budget, stop_after, whole)
+    usual = usual_batch(search, budget, stop_after, whole)
+    usual = usual if small is None else min(usual, small)
     return min(usual if asked is None else asked, budget)
 
 
@@ -162,6 +164,39 @@ def check_guide(problem: Problem, search: Search) -> None:
     )
 
 
+def with_objective(search: Search, objective: str, diverse: bool) -> Search:
+    """Return the search with an objective by its name.
+
+    **Raises:** `UnknownNameError`; `ValueError` for a search or an option that has another one.
+    """
+    if objective not in OBJECTIVES:
+        raise unknown_name("objective", objective, OBJECTIVES)
+    if objective == "likelihood" and not search.wants.likelihood:
+        search = searches.Likeliest(search)
+    if search.wants.likelihood and diverse:
+        raise ValueError(
+            "diverse= looks for failures far from each other, and objective='likelihood' for the "
+            "likeliest one; leave out one of them"
+        )
+    return search
+
+
+def check_objective(problem: Problem, search: Search) -> None:
+    """Refuse a search for likely failures where something else orders them, or nothing can.
+
+    **Raises:** `ValueError`.
+    """
+    if not search.wants.likelihood:
+        return
+    other = "a guide" if problem.guide is not None else "a priority"
+    if problem.guide is not None or problem.rulebook is not None:
+        raise ValueError(
+            f"problem {problem.name!r} has {other}, which says which simulations are better, and "
+            "so does objective='likelihood'; leave out one of them"
+        )
+    Improbability(problem.space)
+
+
 def check_same_guide(run: Run, problem: Problem) -> None:
     """Refuse to go on with a run under another guide than it had.
 
@@ -235,6 +270,7 @@ def _why_no_traces(problem: Problem, executor: "Executor | None") -> str | None:
     return None
 
 
+OBJECTIVES = ("robustness", "likelihood")
 AUTO = "auto"
 """The search of a run that names none: by the seconds that a simulation takes."""
 SLOW = 0.5

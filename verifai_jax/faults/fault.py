@@ -85,7 +85,7 @@ class Fault:
     - `onset`: seconds from the beginning of the simulation until the fault; below 0 it has begun
       before.
     - `duration`: seconds until the channel recovers; None for never.
-    - `name`: of the fault, and of its feature: `gyro_dropout` when left out.
+    - `name`: the name of the fault, and of its feature: `gyro_dropout` when left out.
 
     **Raises:** `ValueError` for numbers that are not finite or out of range, with their names.
     """
@@ -195,9 +195,9 @@ class AtMost:
 
     **Arguments:**
 
-    - `count`: of faults in one simulation.
-    - `faults`: of which they are chosen.
-    - `name`: of the feature.
+    - `count`: the number of faults in one simulation.
+    - `faults`: the faults that are chosen from.
+    - `name`: the name of the feature.
 
     **Raises:** `ValueError` for a count that is not positive, and for things that are no faults.
     """

@@ -237,8 +237,8 @@ def on_host(
 
     - `faults`: those of `problem.with_faults(..., by_simulator=True)`, each with a channel that
       begins with `observation` or `action`.
-    - `features`: of the simulation, as the simulator gets them.
-    - `seed`: of the simulation, from which random faults draw.
+    - `features`: the features of the simulation, as the simulator gets them.
+    - `seed`: the seed of the simulation, from which random faults draw.
     - `period`: seconds between two observations.
     """
     return OnHost(faults, features, seed, period)

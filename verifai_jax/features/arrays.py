@@ -25,7 +25,7 @@ class Array(Domain):
 
     **Arguments:**
 
-    - `domain`: of each value.
+    - `domain`: the domain of each value.
     - `length`: their number, or a pair with the smallest and the greatest number.
 
     **Raises:** `ValueError` for a length that is not a positive integer, or a pair that is not
@@ -83,6 +83,10 @@ class Array(Domain):
 
     def from_unit(self, u: Float[jax.Array, " size"]) -> PyTree:
         return jax.vmap(self.domain.from_unit)(u.reshape(self.length, self.domain.size))
+
+    @property
+    def monotone(self) -> bool:
+        return self.domain.monotone
 
     def to_unit(self, value: PyTree) -> Float[jax.Array, " size"]:
         return jnp.ravel(jax.vmap(self.domain.to_unit, axis_size=self.length)(value))

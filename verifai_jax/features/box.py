@@ -183,6 +183,10 @@ class Box(Domain):
         ends = (low, high, low + (high - low) / 2, high - low)
         return tuple(np.asarray(end, dtype) for end in ends)  # pyright: ignore[reportReturnType]
 
+    @property
+    def monotone(self) -> bool:
+        return True
+
     def words(self) -> str:
         return f"uniform between {numbers(self.low)} and {numbers(self.high)}"
 
@@ -318,6 +322,10 @@ class DiscreteBox(Domain):
         """Return the lower ends and the numbers of values."""
         low = np.asarray(self.low, np.int32)
         return low, np.asarray(self.levels, np.int32).reshape(low.shape)
+
+    @property
+    def monotone(self) -> bool:
+        return True
 
     def words(self) -> str:
         ends = f"{numbers(self.low)} to {numbers(self.high)}"

@@ -163,6 +163,10 @@ class Categorical(Domain):
         dtype = u.dtype if self._dtype == np.float64 else self._dtype
         return jnp.asarray(self._shown, dtype)[index]
 
+    @property
+    def monotone(self) -> bool:
+        return True
+
     def to_unit(self, value: Numbers) -> Float[Array, "1"]:
         index = jnp.asarray(value)
         if self.numeric:
@@ -351,6 +355,10 @@ class Constant(Domain):
 
     def from_unit(self, u: Float[Array, "0"]) -> Shaped[Array, "*shape"]:
         return self._value(u.dtype)
+
+    @property
+    def monotone(self) -> bool:
+        return True
 
     def to_unit(self, value: PyTree) -> Float[Array, "0"]:
         return jnp.zeros(0, jnp.result_type(float))

@@ -106,6 +106,10 @@ class Struct(Domain):
             start += domain.size
         return value
 
+    @property
+    def monotone(self) -> bool:
+        return all(domain.monotone for _, domain in self.fields)
+
     def to_unit(self, value: Mapping[str, PyTree]) -> Float[jax.Array, " size"]:
         parts = [
             domain.to_unit(

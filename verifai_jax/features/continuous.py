@@ -155,6 +155,10 @@ class Continuous(Domain):
         """Return whether a float32 coordinate surely reaches a value of the support."""
         return False
 
+    @property
+    def monotone(self) -> bool:
+        return True
+
     def columns(self, name: str) -> tuple[str, ...]:
         return (name,)
 

@@ -37,7 +37,7 @@ def log_density(space: FeatureSpace, rows: Mapping[str, Any]) -> Float[np.ndarra
 
     **Arguments:**
 
-    - `space`: of the features.
+    - `space`: the space of the features.
     - `rows`: columns `[n]` by name; those that are none of features are ignored.
 
     **Raises:** `ValueError` for a row outside the space, and for a domain without a density, such

@@ -47,7 +47,7 @@ class Normal(Continuous):
 
     **Arguments:**
 
-    - `mean`: of the distribution.
+    - `mean`: the mean of the distribution.
     - `std`: its standard deviation, positive.
 
     **Raises:** `ValueError` for parameters that are not finite, a standard deviation that is not

@@ -72,7 +72,7 @@ class Tuning(NamedTuple):
     - `scale`: `"linear"`, `"log"` or `"integer"` for what is uniform between the ends on that
       scale, `"choice"`, or `"other"` for what such tools do not have.
     - `low`, `high`: the ends as they were written, not rounded to float32.
-    - `choices`: of a choice.
+    - `choices`: the options of a choice.
     """
 
     scale: Literal["linear", "log", "integer", "choice", "other"]
@@ -132,7 +132,7 @@ class Domain(ForUsers, abc.ABC):
         **Arguments:**
 
         - `value`: as `from_unit` gives it, or as a person writes it.
-        - `name`: of the feature, for the message.
+        - `name`: the name of the feature, for the message.
 
         **Raises:** `ValueError` for a value outside the domain, or of another kind.
         """
@@ -229,7 +229,7 @@ class Domain(ForUsers, abc.ABC):
 
         **Arguments:**
 
-        - `name`: of the feature.
+        - `name`: the name of the feature.
         """
         return ()
 
@@ -268,6 +268,11 @@ class Domain(ForUsers, abc.ABC):
         return (False,) * (self.size - len(inner)) + inner
 
     @property
+    def monotone(self) -> bool:
+        """True if each number of a value rises with one coordinate alone, or is constant."""
+        return False
+
+    @property
     def tuning(self) -> "Tuning | None":
         """The domain as tools that tune hyper-parameters have it; None for one that they lack."""
         return None
@@ -282,7 +287,7 @@ class Domain(ForUsers, abc.ABC):
 
         **Arguments:**
 
-        - `duration`: of the simulation in seconds.
+        - `duration`: the duration of the simulation in seconds.
         """
         return None
 
@@ -302,8 +307,9 @@ class Domain(ForUsers, abc.ABC):
 
         **Arguments:**
 
-        - `name`: of the feature.
-        - `duration`: of a simulation in seconds, for signals that have none of their own.
+        - `name`: the name of the feature.
+        - `duration`: the duration of a simulation in seconds, for signals that have none of their
+          own.
         """
         return self.coordinates(name)
 
@@ -342,6 +348,8 @@ def real_numbers(value: Any) -> Any:
     if several or isinstance(value, plain):
         # Of an array of JAX each first operation of a kind compiles a program.
         array = np.asarray(value)
+        if array.dtype == object:  # Integers of more than 64 bits.
+            array = array.astype(np.float64)
         if array.dtype.kind in "fiub":
             real = array.dtype.kind == "f" and not isinstance(value, float)
             kind = dtypes.canonicalize_dtype(array.dtype) if real else jnp.result_type(float)
@@ -353,10 +361,10 @@ def real_numbers(value: Any) -> Any:
 
 
 def without_objects(value: Value) -> Value | np.ndarray:
-    """Convert numbers of other types, such as `Decimal`, to those of NumPy; others stay."""
-    other = Decimal | Fraction
+    """Convert numbers that JAX has not, such as `Decimal`, to those of NumPy; others stay."""
+    other = Decimal | Fraction | np.longdouble
     several = isinstance(value, list | tuple) and any(isinstance(each, other) for each in value)
-    objects = isinstance(value, np.ndarray) and value.dtype == object
+    objects = isinstance(value, np.ndarray) and value.dtype in (object, np.longdouble)
     if several or objects or isinstance(value, other):
         return np.asarray(value, np.float64)
     return value
@@ -387,14 +395,19 @@ def as_numbers(value: object, name: str) -> Float[np.ndarray, "*shape"]:
     try:
         numbers = np.asarray(value)
         if numbers.dtype == object:
-            if any(isinstance(each, str | bytes) for each in numbers.ravel()):
+            if any(isinstance(each, _NO_NUMBERS) for each in numbers.ravel()):
                 raise TypeError
             numbers = numbers.astype(np.float64)
     except (TypeError, ValueError, OverflowError):
         numbers = np.asarray("")
     if numbers.dtype.kind not in "iufb":
-        raise ValueError(f"{name} must be a number; got {value!r}")
+        shown = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
+        raise ValueError(f"{name} must be a number; got {shown!r}")
     return numbers.astype(np.float64)
+
+
+_NO_NUMBERS = (str, bytes, complex, np.complexfloating, np.datetime64, np.timedelta64)
+"""Types that NumPy converts to a real number, and that are none."""
 
 
 def as_scalar(value: Value) -> Value:

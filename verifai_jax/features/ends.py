@@ -48,7 +48,7 @@ def ends_within(
     **Arguments:**
 
     - `low`, `high`: the ends.
-    - `dtype`: of the precision.
+    - `dtype`: the data type of the precision.
     - `closed`: which ends belong to the intervals, one of `CLOSED`.
     """
     ends = _ends(low, high, np.dtype(dtype), closed)

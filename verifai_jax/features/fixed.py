@@ -18,9 +18,9 @@ class Fixed(Domain):
 
     **Arguments:**
 
-    - `domain`: of the feature.
+    - `domain`: the domain of the feature.
     - `value`: in the domain, as a person writes it.
-    - `name`: of the feature, for messages.
+    - `name`: the name of the feature, for messages.
 
     **Raises:** `ValueError` for a value outside the domain.
     """
@@ -51,6 +51,10 @@ class Fixed(Domain):
             return leaf.astype(u.dtype) if real else leaf
 
         return self.domain.coerce(jax.tree.map(cast, self.value))
+
+    @property
+    def monotone(self) -> bool:
+        return True
 
     def to_unit(self, value: PyTree) -> Float[Array, "0"]:
         return jnp.zeros(0, jnp.result_type(float))

@@ -22,7 +22,7 @@ from verifai_jax.features.arrays import Array, VariableArray
 from verifai_jax.features.box import Box
 from verifai_jax.features.compound import Struct
 from verifai_jax.features.continuous import Continuous
-from verifai_jax.features.domain import Domain, as_numbers, dotted
+from verifai_jax.features.domain import Domain, as_numbers, as_scalar, dotted
 from verifai_jax.features.signal import Signal
 from verifai_jax.features.space import FeatureSpace
 
@@ -43,7 +43,7 @@ def given_features(space: FeatureSpace, rows: Rows, precision: str = "float32") 
 
     **Arguments:**
 
-    - `space`: of the features.
+    - `space`: the space of the features.
     - `rows`: a DataFrame with the columns of a table, a row of one, or dictionaries (one or
       several) that hold features by name or by the columns of a table.
     - `precision`: `"float32"` or `"float64"`, of their real numbers.
@@ -81,7 +81,7 @@ def given_rows(space: FeatureSpace, features: Mapping[str, Any]) -> Float[np.nda
 
     **Arguments:**
 
-    - `space`: of the features.
+    - `space`: the space of the features.
     - `features`: `[n, ...]`, as `given_features` gives them.
 
     **Returns:** the points of the unit cube nearest to the features, and after each the real
@@ -104,7 +104,7 @@ def check_columns(
 
     **Arguments:**
 
-    - `space`: of the features.
+    - `space`: the space of the features.
     - `columns`: by name; others than those of features are ignored.
     - `held`: whether features that the space holds at one value are checked too.
 
@@ -113,12 +113,31 @@ def check_columns(
     for name in space.columns:
         if name not in columns:
             raise unknown_name("column", name, columns)
-    own = {name: np.asarray(columns[name]) for name in space.columns}
+    own = {name: _column(columns[name], name) for name in space.columns}
     features = _converted(space, own, "float64")
     for name, domain in space.domains.items():
         if held or domain.size:
             _check_batch(domain, features[name], own, name)
     return features
+
+
+def _column(entries: Any, name: str) -> np.ndarray:
+    """Return a column of a table `[n]`, each entry of which is one value.
+
+    **Raises:** `ValueError` for an entry that is several, such as a list.
+    """
+    column = np.asarray(entries)
+    if column.dtype == object and column.ndim == 1:
+        column = np.fromiter(map(as_scalar, column), object, len(column))
+    several = [each for each in column if _is_several(each)] if column.dtype == object else []
+    if column.ndim != 1 or several:
+        shown = several[0] if several else column[0].tolist()
+        raise ValueError(f"{name} must be one value in each row; got {shown!r}")
+    return column
+
+
+def _is_several(entry: object) -> bool:
+    return isinstance(entry, Iterable) and not isinstance(entry, str | bytes)
 
 
 def _converted(
@@ -142,7 +161,7 @@ def _of_columns(space: FeatureSpace, columns: Mapping[str, Any], precision: str)
     features = check_columns(space, columns)
     _check_absent(space, columns)
     if precision != "float64":
-        own = {name: np.asarray(columns[name]) for name in space.columns}
+        own = {name: _column(columns[name], name) for name in space.columns}
         features = _converted(space, own, precision)
     count = len(jax.tree.leaves(features)[0])
     if space.where is not None and count:

@@ -80,8 +80,8 @@ class PointMaps:
 
         **Arguments:**
 
-        - `duration`: of a simulation in seconds, for signals that have none of their own; without
-          it their control points keep their numbers.
+        - `duration`: the duration of a simulation in seconds, for signals that have none of their
+          own; without it their control points keep their numbers.
         """
         return dict(zip(self.coordinates, self.root.labels("", duration), strict=True))
 

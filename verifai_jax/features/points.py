@@ -28,7 +28,7 @@ def features_of_rows(
 
     **Arguments:**
 
-    - `domains`: of the features, by name.
+    - `domains`: the domains of the features, by name.
     - `rows`: columns `[n]` by name; others than those of features are ignored.
     - `precision`: `"float32"` or `"float64"`, of real numbers.
 

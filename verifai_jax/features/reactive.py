@@ -30,7 +30,7 @@ class Reactive(Domain):
     - `inputs`: signal -> `(low, high)`, the range that it usually has, which is scaled to -1 to 1;
       or names of signals that are of that size anyway.
     - `hidden`: hidden units of a network with hyperbolic tangents; 0 for an affine function.
-    - `bounds`: of the output.
+    - `bounds`: the bounds of the output.
     - `scale`: weights and biases are uniform from `-scale` to `scale`.
 
     **Raises:** `ValueError` for no inputs, ranges or bounds that are none, a negative number of

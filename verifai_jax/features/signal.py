@@ -48,16 +48,16 @@ class Signal(Domain):
 
     **Arguments:**
 
-    - `domain`: of each control point: a `Box`, of numbers or vectors, or a distribution.
+    - `domain`: the domain of each control point: a `Box`, of numbers or vectors, or a distribution.
     - `knots`: number of control points, at equal distances; with `times` it is theirs.
     - `hold`: `"linear"` joins them by lines, the first at time 0 and the last at the end;
       `"pchip"` by a cubic that is monotone between them and never beyond them;
       `"constant"` holds each for an equal part of the time;
       `"pulse"` holds each for `width` seconds from its time on, and is 0 otherwise.
     - `duration`: in seconds; that of the simulation when left out (`ode` knows it).
-    - `times`: of the control points in seconds, increasing. The first and the last value hold
-      before and after them.
-    - `width`: of a pulse in seconds; half the shortest distance of two when left out.
+    - `times`: the times of the control points in seconds, increasing. The first and the last value
+      hold before and after them.
+    - `width`: the width of a pulse in seconds; half the shortest distance of two when left out.
 
     **Raises:** `ValueError` for a domain that is not continuous, an unknown `hold`, too few knots
     (1 for constant and pulse, 2 for linear and pchip), a duration or width that is not positive,
@@ -122,6 +122,10 @@ class Signal(Domain):
         knots = jax.vmap(self.domain.from_unit)(u.reshape(self.knots, self.domain.size))
         return self.waveform(knots)
 
+    @property
+    def monotone(self) -> bool:
+        return self.domain.monotone
+
     def to_unit(self, value: Waveform) -> Float[Array, " size"]:
         return jnp.ravel(jax.vmap(self.domain.to_unit)(value.knots))
 
@@ -180,7 +184,7 @@ class Signal(Domain):
 
         **Arguments:**
 
-        - `duration`: of the simulation in seconds; that of the signal comes first.
+        - `duration`: the duration of the simulation in seconds; that of the signal comes first.
         """
         length = self.duration or duration
         return acting_spans(self.knots, self.hold, self.times, self.width, length)

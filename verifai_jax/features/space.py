@@ -179,7 +179,7 @@ class FeatureSpace(PointMaps, ForUsers):
 
         **Arguments:**
 
-        - `seed`: of the samples.
+        - `seed`: the seed of the samples.
 
         **Raises:** `ValueError` for a constraint that raises, does not return one truth value, or
         accepts none of 65 536 samples, or of those that Python can decide in a minute.

@@ -59,7 +59,7 @@ class Transition:
     """An event that may happen in a state.
 
     - `source` and `to`: the states before and after it.
-    - `name`: of the event.
+    - `name`: the name of the event.
     - `wait`: domain of the seconds since the event before.
     - `parameters`: domains by name.
     - `weight`: relative probability among the transitions that are enabled.

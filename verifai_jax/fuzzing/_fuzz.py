@@ -55,7 +55,7 @@ def fuzz(
     - `budget`: simulations at most.
     - `space`, `system`: what varies and what is simulated, where there is no formula. A simulation
       then fails if it raises, hangs, has a signal that is not finite or one outside its range.
-    - `name`: of the run, where there is no problem.
+    - `name`: the name of the run, where there is no problem.
     - `ranges`: signal -> `(low, high)`: within which it must stay.
     - `cells`: signal -> `(low, high, how many)`: cells of behaviour to cover, of all these signals
       together. When left out those of the problem's `behaviour`, or each signal with a range is cut

@@ -25,7 +25,7 @@ class Covered:
 
     - `where`: the feature, or `traces`.
     - `what`: `states`, `transitions`, `pairs`, `cells` or `clauses`.
-    - `names`: of all there are.
+    - `names`: all names that there are.
     - `hits`: how many simulations had each.
     """
 

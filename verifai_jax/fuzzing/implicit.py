@@ -54,10 +54,11 @@ class CheckedSystem(System):
     **Arguments:**
 
     - `system`: the system.
-    - `ranges`: of signals; what is not finite is replaced by the middle, as it is reported anyway.
+    - `ranges`: the ranges of signals; what is not finite is replaced by the middle, as it is
+      reported anyway.
     - `verdicts`: whether a simulation that raises, hangs or is not finite gets a trace that breaks
       a property, instead of a status without a verdict.
-    - `cells`: of signals, as given to `fuzz`; they are for the record of the run.
+    - `cells`: the cells of signals, as given to `fuzz`; they are for the record of the run.
     """
 
     def __init__(

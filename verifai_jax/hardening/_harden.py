@@ -137,12 +137,12 @@ def harden(
     - `study`: a `Study`, a `Trainer`, or a task. A task says by `start(key, features) -> state` how
       an episode with the features of the problem starts, as tasks of `ode_task` do.
     - `problem`: from a policy to the problem of its closed loop; that of the study when left out.
-    - `algorithm`: of a task; `PPO()` when left out.
+    - `algorithm`: the algorithm of a task; `PPO()` when left out.
     - `start(key, features) -> state`: where the task has no such method.
     - `hyperparameters`: values of the trainer's hyper-parameters.
-    - `rounds`: of attack and further training at most.
+    - `rounds`: the maximum number of rounds of attack and further training.
     - `steps`: environment steps of the first training; those of the trainer when left out.
-    - `further_steps`: of each round; a quarter of `steps` when left out.
+    - `further_steps`: the number of further steps in each round; by default a quarter of `steps`.
     - `p`: failure probability below which the policy is safe; that of the study, or 0.01.
     - `confidence`: with which the intervals before and after hold together.
     - `samples`, `attack`, `attack_simulations`: of each certificate, as in `certify`.
@@ -150,10 +150,11 @@ def harden(
     - `own`, `failing`: shares of episodes that are the task's own, and that begin near failures;
       the others are of the prior.
     - `tolerance`: share of the first policy's return that may be lost.
-    - `episodes`: of the task itself, the same for all policies, that measure returns.
+    - `episodes`: the number of episodes of the task itself, the same for all policies, that measure
+      returns.
     - `baseline`: whether an arm with plain domain randomisation is trained beside it: the same
       seed, own episodes and environment steps, and the prior in place of what fails.
-    - `seed`: of training, attacks and samples.
+    - `seed`: the seed of training, attacks and samples.
     - `max_seconds`: after which no other round begins.
     - `folder`: keeps finished work: the same call goes on where it was interrupted.
     - `even_if_changed`: whether to go on with a folder although files of the model have changed.
@@ -182,7 +183,8 @@ def harden(
         work = Work(made, plan, values, untrained, start, cache)
         result = work.run(max_seconds)
     if folder is not None:
-        result.save(folder)
+        with cache.writing(folder):
+            result.save(folder)
     return result
 
 

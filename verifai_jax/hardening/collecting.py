@@ -31,7 +31,7 @@ class Collected(NamedTuple):
     """Points of the unit cube to train around.
 
     - `points`: `[n, d]`.
-    - `sources`: of each, `"counterexample"`, `"shrunk"` or `"rule"`.
+    - `sources`: the origin of each, `"counterexample"`, `"shrunk"` or `"rule"`.
     - `simulations`: spent to confirm and shrink.
     """
 
@@ -47,9 +47,9 @@ def collect(
 
     **Arguments:**
 
-    - `problem`: of the policy.
+    - `problem`: the problem of the policy.
     - `failing`: rows that fail, the worst first.
-    - `seed`: of the uniform samples beside them.
+    - `seed`: the seed of the uniform samples beside them.
     - `added`: points at most.
     - `table`: uniform samples that tell the rules where nothing fails.
     - `shrunk`: counterexamples that are shrunk, where the problem says what is nominal.

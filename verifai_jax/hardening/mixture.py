@@ -43,7 +43,8 @@ class HardeningError(ValueError):
 class MixtureTask:
     """A task that draws the features of an episode from a mixture; made by `mixture_of`.
 
-    - `shares`: of episodes that are the task's own, from the prior, and from neighbourhoods.
+    - `shares`: the shares of episodes that are the task's own, from the prior, and from
+      neighbourhoods.
     - `low`, `high`: `[neighbourhoods, d]`, boxes of the unit cube; the first `count` of them count.
     - `own`: the point of the unit cube of the task's own episodes; None if `reset` starts them.
     """

@@ -16,17 +16,19 @@ from jaxtyping import Float
 
 from verifai_jax.certification import Certificate, Certificates
 from verifai_jax.comparison import Comparison
-from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.figure import Drawn
 from verifai_jax.core.notebook import InNotebook, frame_html
 from verifai_jax.core.text import format_percent
 from verifai_jax.rl.policy import Policy, save_policy
 from verifai_jax.statistics.confidence_sequences import safe_at
 from verifai_jax.statistics.paired import PairedDifference, paired_difference
+from verifai_jax.store.files import replacing_all
 from verifai_jax.store.locks import write_lock
 
 HARDENED, BASELINE = "hardened", "randomised"
 """Names of the arms: with counterexamples, and with the prior alone (domain randomisation)."""
+FILES = ("added.parquet", "summary.txt", "start.npz", "policy.npz", "table.parquet")
+"""Files of a result in a folder."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +42,12 @@ class Hardening(Drawn, InNotebook):
       `seconds`.
     - `added`: features of all points that were trained around, with `round` and `source`.
     - `start`, `policy`: before and after.
-    - `policies`: of each arm and round; `chosen`: the round of each arm.
-    - `certificates`: of the policies before, after, and of the baseline's, if there is one, from
-      samples that nothing was trained on or chosen by. Their intervals hold together.
-    - `comparison`: of before and after in pairs; None if the first policy is returned.
+    - `policies`: the policies of each arm and round; `chosen`: the round of each arm.
+    - `certificates`: the certificates of the policies before, after, and of the baseline's, if
+      there is one, from samples that nothing was trained on or chosen by. Their intervals hold
+      together.
+    - `comparison`: the comparison of before and after in pairs; None if the first policy is
+      returned.
     - `returns`: of `"start"` and the arms' chosen policies, episode by episode in pairs.
     - `stopped`: `"certified"`, `"budget"` or `"max_seconds"`.
     - `options`: numbers that it was called with; `notes` for people; `seconds`; `version`.
@@ -153,20 +157,19 @@ class Hardening(Drawn, InNotebook):
     def save(self, folder: str | Path) -> Path:
         """Write table, added features, summary and policies to a folder.
 
-        **Raises:** `FolderInUse` where another process writes it.
+        **Raises:** `FolderInUse` where another process writes it; `OSError` for what the file
+        system refuses, which leaves what was there.
         """
         path = Path(folder)
-        with write_lock(path):
+        with write_lock(path), replacing_all(path, FILES) as made:
             for name, frame in (("table", self.table), ("added", self.added)):
-                with replacing(path / f"{name}.parquet") as partial:
-                    frame.to_parquet(partial)
-            with replacing(path / "summary.txt") as partial:
-                partial.write_text(f"{self.summary()}\n")
+                frame.to_parquet(made / f"{name}.parquet")
+            (made / "summary.txt").write_text(f"{self.summary()}\n", encoding="utf-8")
             for name, policy in (("start", self.start), ("policy", self.policy)):
                 if isinstance(policy, Policy):
-                    save_policy(policy, path / f"{name}.npz", problem=self.problem)
+                    save_policy(policy, made / f"{name}.npz", problem=self.problem)
                 else:
-                    policy.save(path / f"{name}.npz")
+                    policy.save(made / f"{name}.npz")
         return path
 
     def _notebook_parts(self) -> list[str]:

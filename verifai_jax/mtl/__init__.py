@@ -6,40 +6,66 @@ from verifai_jax.mtl._online import Online, online
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl._robustness import robustness, robustness_signal, satisfied
 from verifai_jax.mtl._smoothing_error import SmoothingError, smoothing_error
+from verifai_jax.mtl.c_monitor import export_c
+from verifai_jax.mtl.calibrated import (
+    DomainMonitor,
+    PredictiveMonitor,
+    domain_monitor,
+    predictive_monitor,
+)
+from verifai_jax.mtl.counting import durations
+from verifai_jax.mtl.dense import dense_gradient, dense_robustness, dense_signal
+from verifai_jax.mtl.distinguishing import Distinction, distinguish
 from verifai_jax.mtl.evaluate import End, IntervalError
+from verifai_jax.mtl.exemplary import Examples, examples
 from verifai_jax.mtl.expression import Expression, signal
+from verifai_jax.mtl.findings import Finding, Findings
 from verifai_jax.mtl.formula import FALSE, TRUE, Formula
 from verifai_jax.mtl.grammar import FormulaSyntaxError
 from verifai_jax.mtl.judgement import Judgement
 from verifai_jax.mtl.judging import judge
+from verifai_jax.mtl.linting import lint
 from verifai_jax.mtl.mining import Mined, mine
+from verifai_jax.mtl.mutation import Mutant, Mutants, mutants
 from verifai_jax.mtl.normalization import anneal, normalize
 from verifai_jax.mtl.operators import (
     always,
+    during,
     eventually,
+    fall,
     historically,
     next_,
     once,
+    phase,
     prev,
+    rise,
     since,
+    sometime_during,
     until,
 )
 from verifai_jax.mtl.plot import draw
 from verifai_jax.mtl.recording import TimeColumnError, read
-from verifai_jax.mtl.requirements import Requirement, read_requirements
+from verifai_jax.mtl.requirements import Requirement, read_requirements, write_requirements
 from verifai_jax.mtl.resampling import resample
 from verifai_jax.mtl.rewriting import nnf, simplify
 from verifai_jax.mtl.semantics import Semantics, boolean, hard, smooth
 from verifai_jax.mtl.setting import HorizonError, SamplingError
+from verifai_jax.mtl.templating import Template, templates
+from verifai_jax.mtl.watching import Watch, watch
 
 __all__ = [
-    "FALSE", "TRUE", "End", "Explanation", "Expression", "Formula", "FormulaSyntaxError",
-    "HorizonError", "IntervalError", "Judgement", "Mined", "Online", "Requirement",
-    "SamplingError", "Semantics", "SmoothingError", "TimeColumnError", "always", "anneal",
-    "boolean", "draw", "eventually", "explain", "hard", "historically", "judge", "latex", "mine",
-    "next_", "nnf", "normalize", "once", "online", "parse", "prev", "read", "read_requirements",
-    "resample", "robustness", "robustness_signal", "satisfied", "signal", "simplify", "since",
-    "smooth", "smoothing_error", "until",
+    "FALSE", "TRUE", "Distinction", "DomainMonitor", "End", "Examples", "Explanation",
+    "Expression", "Finding", "Findings", "Formula", "FormulaSyntaxError", "HorizonError",
+    "IntervalError", "Judgement", "Mined", "Mutant", "Mutants", "Online", "PredictiveMonitor",
+    "Requirement", "SamplingError", "Semantics", "SmoothingError", "Template",
+    "TimeColumnError", "Watch", "always", "anneal", "boolean", "dense_gradient",
+    "dense_robustness", "dense_signal", "distinguish", "domain_monitor", "draw", "durations",
+    "during", "eventually", "examples", "explain", "export_c", "fall", "hard", "historically",
+    "judge", "latex", "lint", "mine", "mutants", "next_", "nnf", "normalize", "once", "online",
+    "parse", "phase", "predictive_monitor", "prev", "read", "read_requirements", "resample",
+    "rise", "robustness", "robustness_signal", "satisfied", "signal", "simplify", "since",
+    "smooth", "smoothing_error", "sometime_during", "templates", "until", "watch",
+    "write_requirements",
 ]  # fmt: skip
 
 

@@ -10,7 +10,6 @@ operand that decides each minimum or maximum finds it.
 """
 
 import functools
-import math
 from dataclasses import dataclass, field
 
 import jax
@@ -21,13 +20,12 @@ from jaxtyping import Array, Float
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import LONG, STAMPS, format_seconds, format_time
 from verifai_jax.core.trace import Trace
-from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._robustness import satisfied
 from verifai_jax.mtl.evaluate import End, Evaluator
 from verifai_jax.mtl.formula import Formula, surface
 from verifai_jax.mtl.semantics import hard
 from verifai_jax.mtl.setting import Setting, check_trace, evaluator_of, prepare
-from verifai_jax.mtl.tree import missing_case
+from verifai_jax.mtl.walk import Walk
 
 
 @dataclass(frozen=True)
@@ -171,8 +169,10 @@ def explain(
     series = dict(
         zip(_distinct(formula), map(np.asarray, _all_values(setting, signals)), strict=True)
     )
-    walk = _Walk(evaluator_of(setting, signals, None, None, 0), series, trace)
-    tree = walk.node(formula, 0, True)
+    evaluator = evaluator_of(setting, signals, None, None, 0)
+    walk = Walk(series.__getitem__, evaluator.span, setting.length, setting.end, setting.stride)
+    nodes = _Tree(walk, np.asarray(trace.finely().clock()))
+    tree = nodes.node(formula, 0, True)
     leaves: dict[Formula, np.ndarray] = {f: series[f] for f in series if f.is_predicate}
     critical: tuple[Instant, ...] = ()
     if leaves:
@@ -180,7 +180,7 @@ def explain(
             finite = np.concatenate([v[np.isfinite(v)] for v in leaves.values()])
             tau = 0.1 * float(np.std(finite)) or 1e-3
         shares = [np.asarray(s) for s in _influence(setting, signals, tau)]
-        critical = _critical(list(leaves), leaves, shares, walk, k)
+        critical = _critical(leaves, shares, nodes, k)
     return Explanation(formula, holds, tree.robustness, tree, critical, trace)
 
 
@@ -224,25 +224,17 @@ def _influence(
     return jax.grad(rho)([jnp.zeros(setting.length, dtype) for _ in leaves])
 
 
-class _Walk:
-    """Follows the operand that decides each minimum and maximum."""
+class _Tree:
+    """The nodes of an explanation, made along a walk."""
 
-    def __init__(
-        self, evaluator: Evaluator, series: dict[Formula, np.ndarray], trace: Trace
-    ) -> None:
-        self.evaluator = evaluator
-        self.series = series
-        self.clock = trace.finely().clock()
-        self.last = evaluator.length - 1
+    def __init__(self, walk: Walk, clock: Float[np.ndarray, " time"]) -> None:
+        self.walk, self.clock = walk, clock
         self._nodes: dict[tuple[Formula, int, bool], Node] = {}
 
     def time(self, i: int) -> float:
+        """Return the time of a sample in seconds."""
         # Beyond the end a trace repeats its last sample, so that is where to look.
-        return float(self.clock[min(i, self.last)])
-
-    def at(self, f: Formula, i: int) -> float:
-        values = self.series[f]
-        return float(values[min(i, len(values) - 1)])
+        return float(self.clock[min(i, self.walk.length - 1)])
 
     def node(self, f: Formula, i: int, decides: bool) -> Node:
         """Return the node of `f` at sample `i`: one object, wherever it stands."""
@@ -251,103 +243,26 @@ class _Walk:
         return self._nodes[f, i, decides]
 
     def _node(self, f: Formula, i: int, decides: bool) -> Node:
-        operands = self.operands(f, i)
-        deciding = self.deciding(f, i, operands) if decides else None
-        if not operands:
-            children = ()
-        else:
-            children = tuple(
-                self.node(part, j, decides and k == deciding)
-                for k, (part, j) in enumerate(operands)
-            )
-        series = self.series[f][: self.last + 1 : self.evaluator.stride]
-        return Node(f, self.time(i), self.at(f, i), decides, children, series)
-
-    def operands(self, f: Formula, i: int) -> list[tuple[Formula, int]]:
-        """Return the operands at the instants that matter for `f` at `i`; none if vacuous."""
-        match f:
-            case ast.Not(p):
-                return [(p, i)]
-            case ast.Join(parts):
-                return [(p, i) for p in parts]
-            case ast.Derived():
-                return [(f.meaning, i)]
-            case ast.Next(p):
-                later = i + self.evaluator.stride
-                return [(p, later if self.evaluator.end != "truncate" else min(later, self.last))]
-            case ast.Prev(p):
-                earlier = i - self.evaluator.stride
-                return [(p, earlier)] if earlier >= 0 else []
-            case ast.Window(p):
-                return self.best(p, self.window(f, i), f.sign < 0)
-            case ast.Witness(p, q):
-                return self.witness(p, q, self.window(f, i), i, 1 if f.side == "ahead" else -1)
-            case ast.Leaf():
-                return []
-        raise missing_case("the explanation", f)
-
-    def deciding(self, f: Formula, i: int, operands: list[tuple[Formula, int]]) -> int | None:
-        """Return the number of the operand that has the value of `f`."""
-        if not operands:
-            return None
-        values = [self.at(p, j) for p, j in operands]
-        if isinstance(f, ast.Join) and f.sign > 0:
-            return int(np.argmax(values))
-        return int(np.argmin(values)) if len(values) > 1 else 0
-
-    def window(self, f: Formula, i: int) -> range:
-        """Return the samples at which an operator with an interval looks from sample `i` on."""
-        a, b = self.evaluator.span(f.interval)
-        if f.side == "back":
-            return range(0 if math.isinf(b) else max(0, i - int(b)), i - a + 1)
-        if self.evaluator.end == "truncate":
-            stop = self.last
-        else:
-            stop = max(i + a, *(len(self.series[p]) - 1 for p in f.operands()))
-        return range(i + a, (stop if math.isinf(b) else min(i + int(b), stop)) + 1)
-
-    def best(self, p: Formula, window: range, lowest: bool) -> list[tuple[Formula, int]]:
-        if not window:
-            return []
-        values = [self.at(p, j) for j in window]
-        return [(p, window[int(np.argmin(values) if lowest else np.argmax(values))])]
-
-    def witness(
-        self, p: Formula, q: Formula, window: range, i: int, step: int
-    ) -> list[tuple[Formula, int]]:
-        """Find where until (since) is most nearly fulfilled: the witness and the weakest link."""
-        if not window:
-            return []
-        best, found = -math.inf, None
-        weakest, link = math.inf, i
-        ordered = window if step > 0 else reversed(window)
-        k = i
-        for j in ordered:
-            while k != j:
-                if self.at(p, k) < weakest:
-                    weakest, link = self.at(p, k), k
-                k += step
-            value = min(self.at(q, j), weakest)
-            if found is None or value > best:
-                best, found = value, (j, link)
-        assert found is not None
-        return [(p, found[1]), (q, found[0])] if found[0] != i else [(q, i)]
+        walk = self.walk
+        operands = walk.operands(f, i)
+        deciding = walk.deciding(f, i, operands) if decides else None
+        children = tuple(
+            self.node(part, j, decides and k == deciding) for k, (part, j) in enumerate(operands)
+        )
+        series = walk.values_of(f)[: walk.length : walk.stride]
+        return Node(f, self.time(i), walk.at(f, i), decides, children, series)
 
 
 def _critical(
-    leaves: list[Formula],
-    values: dict[Formula, np.ndarray],
-    shares: list[np.ndarray],
-    walk: _Walk,
-    k: int,
+    leaves: dict[Formula, np.ndarray], shares: list[np.ndarray], nodes: _Tree, k: int
 ) -> tuple[Instant, ...]:
     """Find the greatest local peaks of each leaf's share over time."""
     total = sum(float(np.abs(share).sum()) for share in shares) or 1.0
     instants = []
-    for leaf, share in zip(leaves, shares, strict=True):
+    for (leaf, values), share in zip(leaves.items(), shares, strict=True):
         share = np.abs(share) / total
         padded = np.concatenate([[-1.0], share, [-1.0]])
         peaks = (padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]) & (share > 1e-4)
         for i in map(int, np.flatnonzero(peaks)):
-            instants.append(Instant(leaf, walk.time(i), float(values[leaf][i]), float(share[i])))
+            instants.append(Instant(leaf, nodes.time(i), float(values[i]), float(share[i])))
     return tuple(sorted(instants, key=lambda instant: -instant.share)[:k])

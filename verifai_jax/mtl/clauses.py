@@ -25,7 +25,7 @@ from verifai_jax.mtl._robustness import robustness
 from verifai_jax.mtl.evaluate import End, Evaluator
 from verifai_jax.mtl.expression import Number, Signal
 from verifai_jax.mtl.formula import Formula
-from verifai_jax.mtl.rewriting import nnf, rebuild
+from verifai_jax.mtl.rewriting import nnf, rebuild, replaced
 from verifai_jax.mtl.semantics import Semantics, hard
 from verifai_jax.mtl.setting import prepare
 
@@ -109,7 +109,7 @@ def goals_of(formulas: Iterable[Formula]) -> Goals:
     names: dict[Formula, Formula] = {
         leaf: ast.Predicate(">", Signal(_name(i)), Number(0.0)) for i, leaf in enumerate(leaves)
     }
-    return Goals(leaves, tuple(tuple(_over(clause, names) for clause in goal) for goal in goals))
+    return Goals(leaves, tuple(tuple(replaced(clause, names) for clause in goal) for goal in goals))
 
 
 def _name(i: int) -> str:
@@ -137,10 +137,3 @@ def _few(
     if len(parts) <= count:
         return parts
     return (*parts[: count - 1], kind(parts[count - 1 :]))
-
-
-def _over(formula: Formula, names: dict[Formula, Formula]) -> Formula:
-    """Return the formula over other leaves."""
-    if formula in names:
-        return names[formula]
-    return rebuild(formula, tuple(_over(part, names) for part in formula.operands()))

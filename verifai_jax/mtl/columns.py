@@ -1,10 +1,11 @@
 """Columns of a recording as numbers: what a cell may be, and how one that is none is refused.
 
 numbers_of("flight.csv", "x", column)               # [time], or [time, k] of a column of lists
-seconds_of("flight.csv", "time", column)            # dates and durations since the first
+seconds_of("flight.csv", "time", column)            # from the first, and when that was
 """
 
 import datetime
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -117,11 +118,14 @@ def _brief(value: object) -> str:
     return text if len(text) <= 40 else f"{text[:37]}..."
 
 
-def seconds_of(source: str, name: str, column: Any) -> np.ndarray:
+def seconds_of(source: str, name: str, column: Any) -> tuple[np.ndarray, Fraction]:
     """Return the sample times of an Arrow column in seconds; NaN for an empty cell.
 
     Dates, times of day and durations, also as ISO 8601 texts, become seconds since the first,
     which is subtracted before anything is rounded.
+
+    **Returns:** the times, and the instant that they are counted from, in seconds since 1970; 0
+    for numbers that are seconds already.
 
     **Raises:** `ValueError` as `numbers_of`, and for lists of numbers.
     """
@@ -139,7 +143,8 @@ def seconds_of(source: str, name: str, column: Any) -> np.ndarray:
         wide = "int32" if getattr(column.type, "bit_width", 64) == 32 else "int64"
         counts = column.cast(wide).to_pylist()
         first = next((count for count in counts if count is not None), 0)
-        return np.array([np.nan if c is None else (c - first) / fraction for c in counts])
+        seconds = [np.nan if c is None else (c - first) / fraction for c in counts]
+        return np.array(seconds), Fraction(first, fraction)
     values = numbers_of(source, name, column)
     if values.ndim > 1:
         raise ValueError(
@@ -148,9 +153,10 @@ def seconds_of(source: str, name: str, column: Any) -> np.ndarray:
         )
     unit = epoch_unit(values)
     if unit == "s":
-        return values
+        return values, Fraction(0)
     first = values[0].item()
-    return np.array([(stamp - first) / FRACTIONS[unit] for stamp in values.tolist()])
+    seconds = [(stamp - first) / FRACTIONS[unit] for stamp in values.tolist()]
+    return np.array(seconds), Fraction(first) / FRACTIONS[unit]
 
 
 def epoch_unit(values: np.ndarray) -> str:
@@ -174,7 +180,7 @@ def moment_of(text: str) -> datetime.datetime:
         return datetime.datetime.fromisoformat(f"2000-01-01T{text}")
 
 
-def _moments(texts: list[str | None]) -> np.ndarray | None:
+def _moments(texts: list[str | None]) -> tuple[np.ndarray, Fraction] | None:
     """Return the seconds from the first ISO 8601 text to each; None if a text is no moment."""
     moments: list[datetime.datetime | None] = []
     for text in texts:
@@ -186,6 +192,9 @@ def _moments(texts: list[str | None]) -> np.ndarray | None:
     if first is None:
         return None
     try:
-        return np.array([np.nan if m is None else (m - first).total_seconds() for m in moments])
+        seconds = [np.nan if m is None else (m - first).total_seconds() for m in moments]
+        zone = first.tzinfo or datetime.UTC
+        since = first.replace(tzinfo=zone) - datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
+        return np.array(seconds), Fraction(since // datetime.timedelta(microseconds=1), 10**6)
     except TypeError:  # Some have a time zone and others have none.
         return None

@@ -6,7 +6,7 @@ instants costs nothing, and an unbounded window need only reach that far.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -46,6 +46,23 @@ def samples(time: float, dt: float, interval: Interval) -> float:
             f"{format_seconds(low * dt)} and {format_seconds(high * dt)}"
         )
     return round(n)
+
+
+def check_scalar(e: Term, shape: Sequence[int], lanes: int) -> None:
+    """Refuse a vector signal where a number is needed. **Raises:** `TypeError`."""
+    if isinstance(e, Signal) and len(shape) != 1 + lanes:
+        raise TypeError(
+            f"signal {e.name!r} is a vector of {shape[-1]} components and cannot be used as a "
+            f"number: take a component, {e}[0], or norm({e})"
+        )
+
+
+def check_vector(name: str, shape: Sequence[int], lanes: int, text: str, index: int = 0) -> None:
+    """Refuse a signal without the component that `text` needs. **Raises:** `TypeError`."""
+    if len(shape) != 2 + lanes:
+        raise TypeError(f"signal {name!r} is a scalar: {text} needs a vector [time, k]")
+    if index >= shape[-1]:
+        raise TypeError(f"signal {name!r} has {shape[-1]} components, counted from 0; got {text}")
 
 
 @dataclass
@@ -177,11 +194,7 @@ class Evaluator:
                 return value
             case Signal(name):
                 signal = self.signals[name]
-                if signal.ndim != 1 + self.lanes:
-                    raise TypeError(
-                        f"signal {name!r} is a vector of {signal.shape[-1]} components and cannot "
-                        f"be used as a number: take a component, {e}[0], or norm({e})"
-                    )
+                check_scalar(e, signal.shape, self.lanes)
                 return signal[start : stop + 1]
             case Component(Signal(name), index):
                 return self._vector(name, f"{e}", index)[start : stop + 1, ..., index]
@@ -214,12 +227,7 @@ class Evaluator:
 
     def _vector(self, name: str, text: str, index: int = 0) -> Array:
         signal = self.signals[name]
-        if signal.ndim != 2 + self.lanes:
-            raise TypeError(f"signal {name!r} is a scalar: {text} needs a vector [time, k]")
-        if index >= signal.shape[-1]:
-            raise TypeError(
-                f"signal {name!r} has {signal.shape[-1]} components, counted from 0; got {text}"
-            )
+        check_vector(name, signal.shape, self.lanes, text, index)
         return signal
 
     # Joining values
@@ -383,7 +391,8 @@ def _apply(name: str, values: list[Array | float]) -> Array | float:
             for other in others:
                 first = operation(first, other)
             return first
-    return {"abs": jnp.abs, "sqrt": jnp.sqrt, "sin": jnp.sin, "cos": jnp.cos}[name](first)
+    functions = {"abs": jnp.abs, "sqrt": jnp.sqrt, "sin": jnp.sin, "cos": jnp.cos, "exp": jnp.exp}
+    return functions[name](first)
 
 
 def _power(base: Array | float, exponent: Array | float) -> Array | float:

@@ -15,7 +15,7 @@ from verifai_jax.mtl.formula import Formula, Predicate, Term, formula
 from verifai_jax.mtl.tree import postorder
 from verifai_jax.mtl.words import FUNCTIONS, NUMBERS, name_text, number_text
 
-_CONSTANT: dict[str, Callable[..., float]] = {
+CONSTANT: dict[str, Callable[..., float]] = {
     "neg": lambda a: -a,
     "+": lambda a, b: a + b,
     "-": lambda a, b: a - b,
@@ -26,9 +26,11 @@ _CONSTANT: dict[str, Callable[..., float]] = {
     "sqrt": math.sqrt,
     "sin": math.sin,
     "cos": math.cos,
+    "exp": math.exp,
     "min": min,
     "max": max,
 }
+"""The functions of numbers, which raise where the result is not finite; `norm` is of vectors."""
 _NAMED = {sign * v: f"{'-' * (sign < 0)}{word}" for word, v in NUMBERS.items() for sign in (1, -1)}
 """Numbers that are printed by their name, and their opposites."""
 PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2, "neg": 3, "**": 4}
@@ -96,6 +98,10 @@ class Expression(Term):
     def cos(self) -> "Expression":
         """Return the cosine of an angle in radians."""
         return Arithmetic("cos", (self,))
+
+    def exp(self) -> "Expression":
+        """Return e to this power."""
+        return Arithmetic("exp", (self,))
 
     def norm(self) -> "Expression":
         """Return the Euclidean norm of a vector signal `[time, k]` at every instant."""
@@ -248,9 +254,9 @@ class Arithmetic(Expression):
         values = [constant_value(argument) for argument in self.arguments]
         if self.name == "/" and values[1] == 0.0:
             raise ValueError(f"a division by zero: {self}")
-        if None not in values and self.name in _CONSTANT:
+        if None not in values and self.name in CONSTANT:
             try:
-                value = float(_CONSTANT[self.name](*values))
+                value = float(CONSTANT[self.name](*values))
             except (ArithmeticError, ValueError):
                 value = math.nan
             if not math.isfinite(value):

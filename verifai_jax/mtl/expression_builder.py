@@ -7,7 +7,7 @@ known. An error offers texts that settle it, each of which was read before it is
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.mtl import formula as ast
@@ -41,7 +41,7 @@ class ExpressionBuilder:
 
     **Arguments:**
 
-    - `text`: of the formula.
+    - `text`: the text of the formula.
     - `constants`, `known`: numbers and formulas by name.
     - `reads`: whether a text is a formula; by default no text is offered in an error.
     """
@@ -237,8 +237,11 @@ class ExpressionBuilder:
         return Part(value, *self._span(tree))
 
     def _call(self, tree: Tree) -> Part:
-        name, *arguments = tree.children
+        name, *arguments = cast("list[Any]", tree.children)
         span = self._span(tree)
+        if str(name) == "pow" and len(arguments) == 2:
+            base, exponent = (self._expression(self._build(c)) for c in arguments)
+            return Part(base**exponent, *span)
         if str(name) not in FUNCTIONS:
             error = unknown_name("function", str(name), FUNCTIONS)
             raise self._fail(str(error), name.start_pos, name.start_pos + len(name))

@@ -362,6 +362,8 @@ NODES: dict[str, Callable[..., Formula]] = {
     "next": Next,
     "prev": Prev,
     "weak_prev": lambda operand: Prev(operand, weak=True),
+    "rise": lambda operand: And((operand, Prev(Not(operand)))),
+    "fall": lambda operand: And((Not(operand), Prev(operand))),
     "implies": Formula.implies,
     "iff": Formula.iff,
     "xor": Formula.__xor__,
@@ -377,7 +379,7 @@ def build(word: str, operands: Iterable[Formula], interval: Interval = EVERYTHIN
 
     **Arguments:**
 
-    - `word`: of the operator, a key of `OPERATORS`.
+    - `word`: the name of the operator, a key of `OPERATORS`.
     - `operands`: as many as the operator takes.
     - `interval`: for an operator that takes one.
     """
@@ -387,7 +389,8 @@ def build(word: str, operands: Iterable[Formula], interval: Interval = EVERYTHIN
 def surface(f: Formula) -> tuple[str, tuple[Formula, ...], Interval | None]:
     """Return how a formula reads: its operator's word, the operands, and the interval if any.
 
-    Sugar that was rewritten away (`->`, `<->`, `xor`, weak until, release) is recognised.
+    Sugar that was rewritten away (`->`, `<->`, `xor`, weak until, release, rise, fall) is
+    recognised.
     """
     match f:
         case Not(Or((And((p, q)), And((Not(r), Not(s)))))) if p == r and q == s:
@@ -402,6 +405,10 @@ def surface(f: Formula) -> tuple[str, tuple[Formula, ...], Interval | None]:
             return "weak_until", (p, q), interval
         case Or((Not(p), q)):
             return "implies", (p, q), None
+        case And((p, Prev(Not(q), False))) if p == q:
+            return "rise", (p,), None
+        case And((Not(p), Prev(q, False))) if p == q:
+            return "fall", (p,), None
     return f.operator.word, f.operands(), f.interval if f.operator.timed else None
 
 

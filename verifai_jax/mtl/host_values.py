@@ -8,6 +8,7 @@ For many formulas on few recordings, as mining and mutants ask: JAX would compil
 meaning is that of `Evaluator` (tests compare them). Arrays are time-major, `[time, *lanes]`.
 """
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,16 +19,17 @@ from jaxtyping import Float
 from verifai_jax.core.errors import missing_name
 from verifai_jax.core.trace import Trace, without_wrapping
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl.evaluate import End, samples
+from verifai_jax.mtl.evaluate import End, check_scalar, check_vector, samples
 from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
 from verifai_jax.mtl.formula import Formula, Interval, Term
 from verifai_jax.mtl.semantics import compared
 from verifai_jax.mtl.setting import check_trace, period
 from verifai_jax.mtl.tree import missing_case, postorder
+from verifai_jax.mtl.walk import Walk
 
 Values = Float[np.ndarray, "time *lanes"]
 
-_FUNCTIONS: dict[str, Callable[..., Values]] = {
+FUNCTIONS: dict[str, Callable[..., Values]] = {
     "neg": np.negative,
     "+": np.add,
     "-": np.subtract,
@@ -38,9 +40,11 @@ _FUNCTIONS: dict[str, Callable[..., Values]] = {
     "sqrt": np.sqrt,
     "sin": np.sin,
     "cos": np.cos,
+    "exp": np.exp,
     "min": lambda *values: _joined(values, -1),
     "max": lambda *values: _joined(values, 1),
 }
+"""The functions of expressions on the host, but for `norm`."""
 
 
 @dataclass
@@ -50,6 +54,8 @@ class HostValues:
     - `dt`: sampling period in seconds, for which `stride` samples stand.
     - `end`: what comes after the last sample, `"hold"` or `"truncate"`.
     - `lanes`: number of lane axes.
+    - `blend`: share of the sum of all operands that `&` and `|` add to the one that decides: a
+      search then sees an operand that gets better while another one decides. 0 for the robustness.
     """
 
     signals: Mapping[str, Values]
@@ -57,6 +63,7 @@ class HostValues:
     end: End = "hold"
     stride: int = 1
     lanes: int = 0
+    blend: float = 0.0
     _padded: dict[int, dict[str, Values]] = field(default_factory=dict)
     _known: dict[tuple[Formula, bool, int], Values] = field(default_factory=dict)
 
@@ -68,10 +75,10 @@ class HostValues:
         """
         check_trace(trace)
         dt, trace = period(trace), trace.trim()
-        signals = {name: _numbers(signal) for name, signal in trace.signals.items()}
+        signals = {name: numbers(signal) for name, signal in trace.signals.items()}
         if trace.between is not None:
             for name, own in signals.items():
-                inner = _numbers(trace.between.signals[name])
+                inner = numbers(trace.between.signals[name])
                 rows = inner.reshape(trace.length, -1, *own.shape[1:])
                 joined = np.concatenate([own[:, None], rows], axis=1)
                 signals[name] = joined.reshape(-1, *own.shape[1:])
@@ -97,28 +104,33 @@ class HostValues:
             raise ValueError(f"no verdict: a signal of {formula} is NaN where it matters")
         return value > 0
 
+    def walk(self, formula: Formula) -> Walk:
+        """Return the way to what decides a formula at the first sample."""
+        pad = self._pad(formula)
+
+        def values_of(part: Formula) -> Values:
+            known = self._known.get((part, False, pad))
+            if known is not None:
+                return known
+            with np.errstate(all="ignore"):
+                return self._value(part, False, pad)
+
+        return Walk(values_of, self._span, self.length, self.end, self.stride)
+
     def _everywhere(self, formula: Formula, boolean: bool) -> Values:
         for name in formula.signals():
             if name not in self.signals:
                 raise missing_name("the trace", "signal", name, self.signals)
-        # Under hold the last sample goes on for ever, and past operators see it for a while.
-        pad = self._look_back(formula) if self.end == "hold" else 0
         with np.errstate(all="ignore"):
-            return self._value(formula, boolean, pad)[: self.length]
+            return self._value(formula, boolean, self._pad(formula))[: self.length]
 
-    def _look_back(self, formula: Formula) -> int:
-        backs = [f for f in postorder(formula) if isinstance(f, Formula) and f.side == "back"]
-        spans = [
-            self._span(f.interval) if f.operator.timed else (self.stride, self.stride)
-            for f in backs
-        ]
-        return sum(int(a if math.isinf(b) else b) for a, b in spans)
+    def _pad(self, formula: Formula) -> int:
+        """Return the number of samples after the last one that past operators tell apart."""
+        # Under hold the last sample goes on for ever, and past operators see it for a while.
+        return _look_back(formula, self.dt, self.stride) if self.end == "hold" else 0
 
     def _span(self, interval: Interval) -> tuple[int, float]:
-        first, last = (
-            samples(t, self.dt, interval) * self.stride for t in (interval.start, interval.end)
-        )
-        return int(first), last
+        return _span(interval, self.dt, self.stride)
 
     def _value(self, f: Formula, boolean: bool, pad: int) -> Values:
         key = (f, boolean, pad)
@@ -140,7 +152,10 @@ class HostValues:
             case ast.Not():
                 return -below[0]
             case ast.Join():
-                return _joined(below, f.sign)
+                joined = _joined(below, f.sign)
+                if self.blend and not boolean:
+                    joined = joined + self.blend * sum(np.clip(v, -1e9, 1e9) for v in below)
+                return joined
             case ast.Window():
                 return _window(
                     below[0], *self._span(f.interval), f.sign, top, hold, f.side == "back"
@@ -172,14 +187,21 @@ class HostValues:
                     values[id(part)] = np.full((1,), value)
                 case Signal(name):
                     values[id(part)] = self._signal(name, pad)
-                case Component(vector, index):
+                case Component(Signal(name) as vector, index):
+                    check_vector(name, values[id(vector)].shape, self.lanes, f"{part}", index)
                     values[id(part)] = values[id(vector)][..., index]
                 case Arithmetic("norm", (vector,)):
+                    if not isinstance(vector, Signal):
+                        raise TypeError(f"norm takes a vector signal; got norm({vector})")
+                    check_vector(vector.name, values[id(vector)].shape, self.lanes, f"{part}")
                     values[id(part)] = np.sqrt(np.sum(values[id(vector)] ** 2, axis=-1))
                 case Arithmetic(name, arguments):
-                    values[id(part)] = _FUNCTIONS[name](*(values[id(a)] for a in arguments))
+                    for argument in arguments:
+                        check_scalar(argument, values[id(argument)].shape, self.lanes)
+                    values[id(part)] = FUNCTIONS[name](*(values[id(a)] for a in arguments))
                 case _:
                     raise missing_case("the value", part)
+        check_scalar(e, values[id(e)].shape, self.lanes)
         return values[id(e)]
 
     def _signal(self, name: str, pad: int) -> Values:
@@ -191,7 +213,22 @@ class HostValues:
         return padded[name]
 
 
-def _numbers(signal: object) -> Values:
+def _span(interval: Interval, dt: float, stride: int) -> tuple[int, float]:
+    """Return the first and the last sample of an interval, relative to now."""
+    first, last = (samples(t, dt, interval) * stride for t in (interval.start, interval.end))
+    return int(first), last
+
+
+@functools.lru_cache(1024)
+def _look_back(formula: Formula, dt: float, stride: int) -> int:
+    """Return how many samples the past operators of a formula look back in all."""
+    backs = [f for f in postorder(formula) if isinstance(f, Formula) and f.side == "back"]
+    spans = [_span(f.interval, dt, stride) if f.operator.timed else (stride, stride) for f in backs]
+    return sum(int(a if math.isinf(b) else b) for a, b in spans)
+
+
+def numbers(signal: object) -> Values:
+    """Return a signal in double precision, a truth value as 1 or -1."""
     array = np.asarray(without_wrapping(signal))  # pyright: ignore[reportArgumentType]
     return np.where(array, 1.0, -1.0) if array.dtype == bool else array.astype(float)
 
@@ -205,8 +242,10 @@ def _joined(values: Sequence[Values], sign: int) -> Values:
 
 def _extended(x: Values, count: int, fill: float | None) -> Values:
     """Return `x` with more samples: those of its last one, or of a fill value."""
-    tail = np.repeat(x[-1:], count, axis=0)
-    return np.concatenate([x, tail if fill is None else np.full_like(tail, fill)])
+    extended = np.empty((len(x) + count, *x.shape[1:]))
+    extended[: len(x)] = x
+    extended[len(x) :] = x[-1:] if fill is None else fill
+    return extended
 
 
 def _window(
@@ -234,7 +273,7 @@ def _window(
 def _witness(f: Values, g: Values, a: int, b: float, top: float, hold: bool, back: bool) -> Values:
     """Compute until over the samples `a` to `b` ahead, and since over those back."""
     f, g = np.broadcast_arrays(f, g)
-    found = _witness_anywhere(*((f[::-1], g[::-1]) if back else (f, g)), top)
+    found = _witness_anywhere(*((f[::-1], g[::-1]) if back else (f, g)))
     terms = [_window(found[::-1] if back else found, a, a, 1, top, hold, back)]
     if math.isfinite(b):
         terms.append(_window(g, a, b, 1, top, hold, back))
@@ -243,12 +282,12 @@ def _witness(f: Values, g: Values, a: int, b: float, top: float, hold: bool, bac
     return _joined(terms, -1)
 
 
-def _witness_anywhere(f: Values, g: Values, top: float) -> Values:
+def _witness_anywhere(f: Values, g: Values) -> Values:
     """Compute `u[t] = max(g[t], min(f[t], u[t+1]))` by doubling."""
+    g, f = g.copy(), f.copy()
     shift = 1
     while shift < len(g):
-        later_g = _extended(g, shift, -top)[shift:]
-        later_f = _extended(f, shift, top)[shift:]
-        g, f = np.maximum(g, np.minimum(f, later_g)), np.minimum(f, later_f)
+        np.maximum(g[:-shift], np.minimum(f[:-shift], g[shift:]), out=g[:-shift])
+        np.minimum(f[:-shift], f[shift:], out=f[:-shift])
         shift *= 2
     return g

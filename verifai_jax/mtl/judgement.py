@@ -106,7 +106,7 @@ class Judgement(InNotebook):
 
         **Arguments:**
 
-        - `shares`: of the recordings, from 0 (the least robustness) to 1 (the greatest).
+        - `shares`: the shares of the recordings, from 0 (the least robustness) to 1 (the greatest).
 
         **Returns:** a row for each requirement: how many recordings have a verdict, how many fail,
         how many have none, and a column for each share, by the recording at that rank.
@@ -221,7 +221,6 @@ class Judgement(InNotebook):
             )
             for row in rows:
                 _case(suite, each, row)
-        path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as partial:
             ElementTree.ElementTree(root).write(partial, encoding="utf-8", xml_declaration=True)
         return path

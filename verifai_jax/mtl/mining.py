@@ -24,13 +24,14 @@ import numpy as np
 from verifai_jax.core.checks import check_fraction
 from verifai_jax.core.figure import Drawn
 from verifai_jax.core.lazy import lazy_import
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.mtl.parametric import Parametric, read_parametric
-from verifai_jax.mtl.recorded import Recordings, Simulated, as_recordings
+from verifai_jax.mtl.recorded import Recordings, Simulated, named_traces
 from verifai_jax.mtl.words import number_text
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
 
@@ -43,7 +44,7 @@ SAMPLED = 129
 
 
 @dataclass(frozen=True)
-class Mined(Drawn):
+class Mined(Drawn, InNotebook):
     """The tightest parameters that recordings satisfy.
 
     - `text`: the formula with its parameters.
@@ -109,6 +110,7 @@ def mine(
     confidence: float = 0.95,
     budget: int = 2000,
     seed: int = 0,
+    progress: bool | None = None,
 ) -> Mined:
     """Find the tightest parameters with which recordings satisfy a formula.
 
@@ -119,11 +121,12 @@ def mine(
     - `text`: a formula with one or two parameters `?name`, for numbers or ends of intervals.
     - `recordings`: traces, files or tables; or a `Problem`, whose tightest values that a search
       does not break are found, which proves nothing.
-    - `share`: of the recordings that are to satisfy it.
+    - `share`: the share of the recordings that are to satisfy it.
     - `end`: what comes after the last sample, `"hold"` or `"truncate"`.
     - `constants`, `definitions`: as of `parse`; a constant can fix a parameter's value.
-    - `confidence`: of the interval for the rate of recordings that break it.
+    - `confidence`: the confidence of the interval for the rate of recordings that break it.
     - `budget`, `seed`: simulations of the search at most, and its seed, for a problem.
+    - `progress`: whether to show one line of progress for a problem; see `core.progress`.
 
     **Raises:** `FormulaSyntaxError`; `ValueError` for more than two parameters, one in which the
     formula is not monotone, or one that nothing bounds or that no value satisfies.
@@ -137,9 +140,9 @@ def mine(
     check_fraction("share", share, one=True)
     if isinstance(recordings, Simulated):
         return lazy_import("verifai_jax.requirements", "mine_by_search")(
-            template, recordings, budget, seed, confidence
+            template, recordings, budget, seed, confidence, progress
         )
-    return mine_template(template, as_recordings(recordings), share, end, confidence)
+    return mine_template(template, tuple(named_traces(recordings).values()), share, end, confidence)
 
 
 def mine_template(

@@ -8,14 +8,17 @@ import math
 
 from verifai_jax.mtl.formula import (
     Always,
+    And,
     Eventually,
     Formula,
     Formulaic,
     Historically,
     Interval,
     Next,
+    Not,
     Once,
     Prev,
+    build,
     formula,
 )
 
@@ -53,6 +56,33 @@ def since(left: Formulaic, right: Formulaic, a: float = 0.0, b: float = math.inf
 def next_(operand: Formulaic) -> Formula:
     """Require `operand` at the next sample."""
     return Next(formula(operand))
+
+
+def rise(operand: Formulaic) -> Formula:
+    """Require `operand` at this sample and not at the previous one; false at the first sample."""
+    return build("rise", (formula(operand),))
+
+
+def fall(operand: Formulaic) -> Formula:
+    """Require `operand` at the previous sample and not at this one; false at the first sample."""
+    return build("fall", (formula(operand),))
+
+
+def phase(begins: Formulaic, ends: Formulaic) -> Formula:
+    """Return the formula that holds from the sample where `begins` does to before `ends` does."""
+    return (~formula(ends)).since(formula(begins) & ~formula(ends))
+
+
+def during(phase: Formulaic, operand: Formulaic) -> Formula:
+    """Require `operand` at every instant of a phase, whenever and how often there is one."""
+    return Always(formula(phase).implies(operand))
+
+
+def sometime_during(phase: Formulaic, operand: Formulaic) -> Formula:
+    """Require that each phase has an instant with `operand`, before it ends."""
+    now = formula(phase)
+    begins = And((now, Prev(Not(now), weak=True)))
+    return Always(begins.implies(now.until(now & formula(operand))))
 
 
 def prev(operand: Formulaic, weak: bool = False) -> Formula:

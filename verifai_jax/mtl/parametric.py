@@ -200,7 +200,7 @@ def _term_signs(e: Term, name: str) -> set[int]:
     match e:
         case Signal():
             return {1}
-        case Arithmetic("+" | "min" | "max" | "sqrt", arguments):
+        case Arithmetic("+" | "min" | "max" | "sqrt" | "exp", arguments):
             return {sign for a in arguments for sign in _term_signs(a, name)}
         case Arithmetic("-", (left, right)):
             return _term_signs(left, name) | {-sign for sign in _term_signs(right, name)}

@@ -1,13 +1,12 @@
-"""Recorded signals as a trace: from CSV and Parquet files, and from uneven sample times.
+"""Recorded signals as a trace: from files and tables, of one clock or of several.
 
 read("flight.csv")                                        # a column `time`
 read(frame, dt=0.02)                                      # a pandas.DataFrame
-read("flight.parquet", dt=0.02)                           # rows 0.02 s apart
-read("flight.csv", resample_to=0.1, method="linear")
+read("drive.mcap", resample_to=0.1, method="hold")        # topics that arrive when they do
+read(["imu.csv", "gps.csv"], missing={"speed": "hold"}, resample_to=0.1, method="linear")
 """
 
-import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,20 +14,23 @@ import numpy as np
 
 from verifai_jax.core.errors import missing_name
 from verifai_jax.core.trace import Trace
+from verifai_jax.mtl import containers
 from verifai_jax.mtl.columns import LeftOut, epoch_unit, is_numeric, numbers_of, seconds_of
-from verifai_jax.mtl.resampling import Method, check_increasing, resample
+from verifai_jax.mtl.containers import UNIT, Episode, Table
+from verifai_jax.mtl.csv_files import read_csv
+from verifai_jax.mtl.resampling import (
+    Method,
+    Missing,
+    check_increasing,
+    joined,
+    resample,
+    without_gaps,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
 
-NUMBER = re.compile(r'^\s*"?[-+]?[.,]?\d')
-"""The beginning of a number, or of a date."""
-DECIMAL_COMMAS = r"^\s*[-+]?\d*(,\d*)?([eE][-+]?\d+)?\s*$"
-"""Numbers with a decimal comma, `1,5`, and those without decimals."""
-THOUSANDS = r"^\s*[-+]?(\d{1,3}|[1-9]\d{0,2},\d{3})\s*$"
-"""Numbers in which a comma, where there is one, may stand between thousands, `1,500`."""
-
-ENDINGS = (".csv", ".parquet", ".npz")
+ENDINGS = (".csv", ".parquet", ".npz", ".mcap", ".nc", ".zarr", ".h5", ".hdf5")
 """Endings of files that are recordings."""
 
 
@@ -47,61 +49,153 @@ class TimeColumnError(ValueError):
 
 
 def read(
-    source: "str | Path | pd.DataFrame",
+    source: "str | Path | Episode | pd.DataFrame | Sequence[str | Path]",
     *,
-    time: str = "time",
+    time: str | Mapping[str, Sequence[str]] = "time",
     dt: float | None = None,
     columns: Sequence[str] | None = None,
     resample_to: float | None = None,
     method: Method | None = None,
+    missing: Missing | Mapping[str, Missing] | None = None,
+    episode: int | None = None,
 ) -> Trace:
-    """Read a trace from a file of CSV, Parquet or NumPy, or a data frame: a column is a signal.
+    """Read a trace from a file or a table: its columns, topics or variables are signals.
 
     Columns `p[0]`, `p[1]`, ... make one vector signal `p`, and so does a column of lists of one
     length. Columns that hold no numbers are left out, with a note, unless named in `columns`. An
     empty cell is a gap (NaN). In a CSV file commas, semicolons or tabs separate the columns,
     whichever the first line has; numbers may have a decimal comma, if all of them do. Lines of
-    comments (`#`) before the names, and a row of units below them, are passed over.
+    comments (`#`) before the names are passed over, and a row of units may stand below them.
+
+    What has several clocks, such as the topics of an MCAP file, the groups of an HDF5 file or
+    several files, becomes one trace with all of their instants, and a signal has a gap where only
+    others have a sample. Resampling with `"hold"` then keeps each signal's own last value.
 
     **Arguments:**
 
-    - `source`: the path of a `.csv` (first line: names), `.parquet` or `.npz` file (an array of it
-      is a column), or a `pandas.DataFrame`, whose index is read as a column if it has a name.
+    - `source`: the path of a `.csv` (first line: names), `.parquet`, `.npz` (an array is a column),
+      `.mcap`, `.nc`, `.h5` or `.hdf5` file, of a `.zarr` store, or of the folder of a LeRobot data
+      set; a `pandas.DataFrame`, whose index is read as a column if it has a name; several paths.
     - `time`: the column of sample times in seconds, or of dates (ISO 8601 where they are text) or
       durations, which become seconds since the first; so do numbers that can only be milli-, micro-
-      or nanoseconds since 1970, with a note.
+      or nanoseconds since 1970, with a note. Of several clocks in one table, the columns that
+      each is the clock of, `{"t_imu": ["gyro"], "t_gps": ["speed"]}`.
     - `dt`: the sampling period, instead of a column of times.
     - `columns`: the signals to read; all when left out.
     - `resample_to`, `method`: a period to resample to, and how (`"hold"` or `"linear"`).
+    - `missing`: what a gap becomes, for all signals or by name: `"hold"`, the signal's own last
+      value; `"interpolate"`, what is on the line between its neighbours; `"drop"`, the instant is
+      left out. A gap stays one when left out.
+    - `episode`: number of an episode of a LeRobot data set.
 
-    **Raises:** `FileNotFoundError`; `ValueError` for another kind of file, no rows, a column that
-    does not exist or holds no numbers, a text among numbers, times that do not increase, or
-    `resample_to` without `method`.
+    **Raises:** `FileNotFoundError`; `MissingExtra` for a kind of file whose package is not
+    installed; `ValueError` for another kind of file, no rows, a column that does not exist or holds
+    no numbers, a text among numbers, times that do not increase, or `resample_to` without `method`.
     """
     if (resample_to is None) != (method is None):
         raise ValueError('resampling needs both: resample_to=PERIOD, method="hold" or "linear"')
+    name, tables = _tables(source, "time" if isinstance(time, Mapping) else time, episode)
+    if isinstance(time, Mapping):
+        tables = [_of_clock(name, tables, clock, own) for clock, own in time.items()]
+        time = "time"
+    units = {name: unit for _, said in tables for name, unit in said.items()}
+    notes: dict[str, int] = {}
+    parts, clocks = [], []
+    for table, _ in tables:
+        if time not in table and dt is None:
+            raise TimeColumnError(f"{name} has no column {time!r} of sample times", list(table))
+        clocks.append(table.pop(time, None))
+        parts.append(_values(name, table, columns, notes))
+    if columns is None and not any(parts):
+        raise ValueError(f"{name} has no column of numbers")
+    if dt is not None:
+        if len(parts) > 1:
+            raise ValueError(f"{name} has {len(parts)} clocks, for which one period dt cannot do")
+        times, values = None, parts[0]
+    else:
+        stamps = [seconds_of(name, time, clock) for clock in clocks]
+        for clock in clocks:
+            if is_numeric(clock) and (unit := epoch_unit(numbers_of(name, time, clock))) != "s":
+                notes[
+                    f"column {time!r} is read as {unit} since 1970, in seconds from the first"
+                ] = 1
+        for seconds, _ in stamps:
+            check_increasing(seconds)
+        times, values = (stamps[0][0], parts[0]) if len(parts) == 1 else joined(stamps, parts)
+    signals = _signals(name, values, columns)
+    units = {each: unit for each in signals if (unit := units.get(each) or units.get(f"{each}[0]"))}
+    trace = Trace(signals, dt=dt, times=times, notes=notes, units=units)
+    if missing is not None:
+        trace = without_gaps(trace, missing)
+    if resample_to is not None and method is not None:
+        return resample(trace, resample_to, method)
+    return trace
+
+
+Columns = dict[str, Any]
+
+
+def _tables(
+    source: "str | Path | Episode | pd.DataFrame | Sequence[str | Path]",
+    time: str,
+    episode: int | None,
+) -> tuple[str, list[tuple[Columns, dict[str, str]]]]:
+    """Return how a recording is called, and the columns of each of its clocks with their units."""
+    if isinstance(source, Episode):
+        source, episode = source.path, source.number
     if isinstance(source, str | Path):
         path = Path(source)
         if not path.exists():
             raise FileNotFoundError(f"there is no recording {path}")
-        name, table = str(path), _file_columns(path)
-    else:
-        name, table = "the data frame", _frame_columns(source)
-    if time not in table and dt is None:
-        raise TimeColumnError(f"{name} has no column {time!r} of sample times", list(table))
-    times = table.pop(time, None)
-    signals, notes = _signals(name, table, columns)
-    if dt is not None:
-        trace = Trace(signals, dt=dt, notes=notes)
-    else:
-        stamps = seconds_of(name, time, times)
-        if is_numeric(times) and (unit := epoch_unit(numbers_of(name, time, times))) != "s":
-            notes[f"column {time!r} is read as {unit} since 1970, in seconds from the first"] = 1
-        check_increasing(stamps)
-        trace = Trace(signals, times=stamps, notes=notes)
-    if resample_to is not None and method is not None:
-        return resample(trace, resample_to, method)
-    return trace
+        if files := containers.lerobot_files(path):
+            path = _file_of_episode(path, files, episode)
+        return str(path), [_columns(path, table) for table in _file_tables(path, time, episode)]
+    if isinstance(source, Sequence) and all(isinstance(each, str | Path) for each in source):
+        found = [_tables(each, time, episode) for each in source]
+        if not found:
+            raise ValueError("there is no recording: the list of files is empty")
+        tables = [table for _, several in found for table in several]
+        _refuse_repeated("the files", [name for own, _ in tables for name in own if name != time])
+        return " and ".join(name for name, _ in found), tables
+    return "the data frame", [(_frame_columns(source), {})]  # pyright: ignore[reportArgumentType]
+
+
+def _file_of_episode(folder: Path, files: Sequence[Path], episode: int | None) -> Path:
+    known = list(containers.episodes_of(files))
+    if episode is None and len(known) == 1:
+        return known[0].path
+    named = [each.path for each in known if each.number == episode]
+    if not named:
+        last = known[-1].number if known else -1
+        wanted = "name one of its episodes" if episode is None else f"it has no episode {episode}"
+        raise ValueError(f"{folder} is a LeRobot data set: {wanted}, episode=0 to {last}")
+    return named[0]
+
+
+def _columns(path: Path, table: Table) -> tuple[Columns, dict[str, str]]:
+    names = table.column_names
+    if table.num_rows == 0:
+        raise ValueError(f"{path} has no rows")
+    _refuse_repeated(str(path), names)
+    said = {field.name: (field.metadata or {}).get(UNIT, b"").decode() for field in table.schema}
+    return {name: table.column(name) for name in names}, {n: u for n, u in said.items() if u}
+
+
+def _of_clock(
+    source: str,
+    tables: list[tuple[Columns, dict[str, str]]],
+    clock: str,
+    names: Sequence[str],
+) -> tuple[Columns, dict[str, str]]:
+    """Return the columns of one of several clocks of a table, its times as `time`."""
+    columns = {name: column for table, _ in tables for name, column in table.items()}
+    for name in (clock, *names):
+        if name not in columns:
+            raise missing_name(source, "column", name, columns)
+    given = columns[clock].is_valid()
+    units = {name: unit for _, said in tables for name, unit in said.items()}
+    found = {"time": clock} | {name: name for name in names}
+    return {name: columns[column].filter(given) for name, column in found.items()}, units
 
 
 def _frame_columns(frame: "pd.DataFrame") -> dict[str, Any]:
@@ -143,17 +237,28 @@ def _refuse_repeated(source: str, names: Sequence[str]) -> None:
         raise ValueError(f"{source} has more than one column {', '.join(map(repr, repeated))}")
 
 
-def _file_columns(path: Path) -> dict[str, Any]:
-    """Read columns by name, as Arrow arrays."""
+def _file_tables(path: Path, time: str, episode: int | None) -> list[Table]:
+    """Read the Arrow tables of a file, one for each of its clocks."""
     import pyarrow
-    from pyarrow import parquet
 
-    readers = {".csv": _read_csv, ".parquet": parquet.read_table, ".npz": _read_arrays}
-    if path.suffix.lower() not in readers:
-        raise ValueError(f"a recording is a .csv, .parquet or .npz file; got {path.name}")
+    readers = {
+        ".csv": lambda: [read_csv(path)],
+        ".parquet": lambda: containers.read_parquet(path, time, episode),
+        ".npz": lambda: [_read_arrays(path)],
+        ".mcap": lambda: containers.read_mcap(path, time),
+        ".nc": lambda: containers.read_dataset(path, time),
+        ".zarr": lambda: containers.read_dataset(path, time),
+        ".h5": lambda: containers.read_hdf5(path, time),
+        ".hdf5": lambda: containers.read_hdf5(path, time),
+    }
+    ending = path.suffix.lower()
+    if ending not in readers:
+        known = f"{', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
+        raise ValueError(f"a recording is a {known} file; got {path.name}")
+    if episode is not None and ending != ".parquet":
+        raise ValueError(f"episodes are those of a LeRobot data set; {path.name} has none")
     try:
-        table = readers[path.suffix.lower()](path)
-        names = table.column_names
+        return readers[ending]()
     except UnicodeDecodeError as error:
         raise ValueError(
             f"{path} cannot be read: the names of its columns are no UTF-8 ({error}); save it as "
@@ -164,61 +269,6 @@ def _file_columns(path: Path) -> dict[str, Any]:
         advice = ". Decimal commas need semicolons between the columns"
         advice = advice if "Expected" in str(error) else ""
         raise ValueError(f"{path} cannot be read: {error}{advice}") from None
-    if table.num_rows == 0:
-        raise ValueError(f"{path} has no rows")
-    _refuse_repeated(str(path), names)
-    return {name: table.column(name) for name in names}
-
-
-def _read_csv(path: Path) -> Any:
-    """Read a CSV file as an Arrow table, whatever separates its columns and its decimals."""
-    from pyarrow import csv
-
-    with open(path, encoding="utf-8", errors="replace") as file:
-        comments, first = 0, file.readline()
-        while first.startswith("#"):
-            comments, first = comments + 1, file.readline()
-        second, third = file.readline(), file.readline()
-    separator = max((",", ";", "\t"), key=first.count)
-    units = _are_units(*(line.rstrip("\n").split(separator) for line in (second, third)))
-    parsed = csv.ParseOptions(delimiter=separator)
-    skipped = csv.ReadOptions(skip_rows=comments, skip_rows_after_names=int(units))
-    table = csv.read_csv(path, parse_options=parsed, read_options=skipped)
-    named = list(zip(table.column_names, table.columns, strict=True))
-    commas = [name for name, column in named if _all_match(column, DECIMAL_COMMAS)]
-    if not commas:
-        return table
-    # Semicolons between the columns are there because commas are those of decimals.
-    unclear = [name for name in commas if _all_match(table.column(name), THOUSANDS)]
-    if unclear and separator != ";":
-        cell = next(cell for cell in table.column(unclear[0]).to_pylist() if cell and "," in cell)
-        raise ValueError(
-            f"{path} has {cell.strip()!r} in column {unclear[0]!r}, which may have a decimal comma "
-            "or one between thousands: write it without, or put semicolons between the columns"
-        )
-    again = csv.read_csv(
-        path,
-        parse_options=parsed,
-        read_options=skipped,
-        convert_options=csv.ConvertOptions(decimal_point=","),
-    )
-    for (name, before), after in zip(named, again.columns, strict=True):
-        if is_numeric(before) and not is_numeric(after):
-            raise ValueError(
-                f"{path} has decimal commas in column {commas[0]!r} and decimal points in column "
-                f"{name!r}: write all numbers in one way"
-            )
-    return again
-
-
-def _are_units(second: list[str], third: list[str]) -> bool:
-    """Return whether the row below the names has texts alone, and the next one numbers."""
-    named = [cell.strip().strip('"') for cell in second]
-    constants = {"nan", "null", "na", "true", "false"}
-    values = any(NUMBER.match(cell) or cell.lower() in constants for cell in named)
-    if values or len(named) != len(third):
-        return False
-    return any(cell and NUMBER.match(below) for cell, below in zip(named, third, strict=True))
 
 
 def _read_arrays(path: Path) -> Any:
@@ -234,29 +284,14 @@ def _read_arrays(path: Path) -> Any:
                     f"array {name!r} of {path} must have shape [time] or [time, k]; "
                     f"got {list(array.shape)}"
                 )
-            flat = pyarrow.array(array.reshape(-1))
-            wide = array.ndim == 2
-            columns[name] = (
-                pyarrow.FixedSizeListArray.from_arrays(flat, array.shape[1]) if wide else flat
-            )
+            columns[name] = containers.matrix_column(array)
     return pyarrow.table(columns)
 
 
-def _all_match(column: Any, number: str) -> bool:
-    """Return whether a column of text holds numbers of a form, and nothing else."""
-    from pyarrow import compute, types
-
-    if not types.is_string(column.type) or column.null_count == len(column):
-        return False
-    fits = compute.match_substring_regex(column, number)  # pyright: ignore[reportAttributeAccessIssue]
-    return bool(compute.all(fits, skip_nulls=True).as_py())  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def _signals(
-    source: str, table: dict[str, Any], columns: Sequence[str] | None
-) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Return the signals by name, and notes on the columns that are left out."""
-    notes: dict[str, int] = {}
+def _values(
+    source: str, table: Columns, columns: Sequence[str] | None, notes: dict[str, int]
+) -> dict[str, np.ndarray]:
+    """Return columns as numbers, and put a note on each that is left out."""
     values: dict[str, np.ndarray] = {}
     for name, column in table.items():
         try:
@@ -266,8 +301,13 @@ def _signals(
                 raise
             why = str(error).replace(f" of {source}", "", 1)
             notes[LeftOut(f"{why}: it is left out", name)] = 1
-    if columns is None and not values:
-        raise ValueError(f"{source} has no column of numbers")
+    return values
+
+
+def _signals(
+    source: str, values: dict[str, np.ndarray], columns: Sequence[str] | None
+) -> dict[str, np.ndarray]:
+    """Return the signals of columns by name: scalars, and vectors of several columns."""
     vectors = vector_columns([name for name in values if values[name].ndim == 1])
     in_vectors = {name for parts in vectors.values() for name in parts}
     scalars = [name for name in values if name not in in_vectors]
@@ -280,7 +320,7 @@ def _signals(
             signals[name] = values[name]
         else:
             raise missing_name(source, "column", name, [*scalars, *vectors])
-    return signals, notes
+    return signals
 
 
 def vector_columns(names: Collection[str]) -> dict[str, list[str]]:

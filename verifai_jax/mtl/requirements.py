@@ -1,42 +1,83 @@
-"""A file of requirements: formulas with what people say of them.
+"""A file of requirements: what people demand, with the formulas that stand for it.
 
 read_requirements("requirements.toml")              # tables [[requirement]]
+read_requirements("requirements.yaml")              # a list `requirements`
 read_requirements("requirements.csv")               # a row a requirement
+read_requirements("requirements.reqif")             # OMG's exchange format
+write_requirements(requirements, "requirements.csv")
 """
 
 import csv
+import os
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from verifai_jax.core.errors import check_names
+from verifai_jax.core.atomic_files import replacing
+from verifai_jax.core.errors import check_names, require
+from verifai_jax.core.reads import documents
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.reqif import read_reqif, reqif_document
 from verifai_jax.mtl.setting import as_formula
 
-ENDINGS = (".toml", ".csv")
+ENDINGS = (".toml", ".yaml", ".yml", ".csv", ".reqif")
 """Endings of files of requirements."""
-FIELDS = ("id", "formula", "text", "unit", "source")
-"""What an entry may say; it must have the first two."""
+FIELDS: tuple[str, ...] = (
+    "id",
+    "formula",
+    "text",
+    "unit",
+    "source",
+    "rationale",
+    "severity",
+    "links",
+)
+"""What an entry may say; each has an `id`, and a `formula` where recordings are judged by it."""
 
 
 @dataclass(frozen=True)
 class Requirement:
-    """A formula with an identifier, and what people say of it.
+    """A demand with an identifier, and the formula that stands for it.
 
     - `id`: by which tables and reports name it.
-    - `formula`: what is required.
+    - `formula`: what is required; None for one of which a problem has the formula, or nobody.
     - `text`: the sentence that the formula stands for.
-    - `unit`: of its robustness.
+    - `unit`: the unit of its robustness.
     - `source`: a standard or a document, with its number.
+    - `rationale`: why it is required.
+    - `severity`: how grave a violation is, in the words of the project.
+    - `links`: other requirements that it comes from, or documents.
+    - `file`: that it was read from.
     """
 
     id: str
-    formula: Formula
+    formula: Formula | None = None
     text: str = ""
     unit: str = ""
     source: str = ""
+    rationale: str = ""
+    severity: str = ""
+    links: tuple[str, ...] = ()
+    file: str = field(default="", compare=False)
+
+    @property
+    def formalized(self) -> Formula:
+        """The formula.
+
+        **Raises:** `ValueError` for a requirement without one.
+        """
+        if self.formula is None:
+            raise ValueError(f"requirement {self.id!r} has no formula: give it one in its file")
+        return self.formula
+
+    def entry(self) -> dict[str, str]:
+        """Return what is said of the requirement as texts by field; what is empty is left out."""
+        formula = "" if self.formula is None else str(self.formula)
+        said = {name: getattr(self, name) for name in FIELDS}
+        said |= {"formula": formula, "links": " ".join(self.links)}
+        return {name: value for name, value in said.items() if value}
 
 
 Requirements = Formula | str | Mapping[str, Formula | str] | Iterable[Formula | str | Requirement]
@@ -64,61 +105,101 @@ def read_requirements(
     path: str | Path,
     constants: Mapping[str, float] | None = None,
     definitions: Mapping[str, str] | None = None,
+    need_formulas: bool = True,
 ) -> tuple[Requirement, ...]:
-    """Read requirements from a TOML or a CSV file.
+    """Read requirements from a TOML, YAML, CSV or ReqIF file.
 
     A TOML file has a table `[[requirement]]` for each, and may have tables `[constants]` and
-    `[definitions]` of names that the formulas use. A CSV file has a row for each, below the names
-    of its columns. Either way a requirement has `id` and `formula`, and may have `text`, `unit` and
-    `source`.
+    `[definitions]` of names that the formulas use; a YAML file has the same as a list
+    `requirements` and two mappings. A CSV file has a row for each, below the names of its columns.
+    A requirement has `id` and `formula`, and may have `text`, `unit`, `source`, `rationale`,
+    `severity` and `links`. Attributes of a ReqIF file count by their long names, such as
+    `ReqIF.ForeignID` (the id) and `ReqIF.Text`; others are left out.
 
     **Arguments:**
 
     - `constants`, `definitions`: further names; they come before those of the file.
+    - `need_formulas`: whether an entry without a formula is refused.
 
     **Raises:** `FileNotFoundError`; `ValueError` that names the entry for one that is not as it
-    should be.
+    should be, and for XML with a document type or entities, which are refused unread.
     """
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"there is no file of requirements {path}")
-    if path.suffix.lower() not in ENDINGS:
+    suffix = path.suffix.lower()
+    if suffix not in ENDINGS:
         raise ValueError(
-            f"a file of requirements is a .toml or a .csv file; got {path.name}: write each as a "
-            'table of TOML, [[requirement]] with id = "..." and formula = "..."'
+            f"a file of requirements ends with {', '.join(ENDINGS)}; got {path.name}: write each "
+            'as a table of TOML, [[requirement]] with id = "..." and formula = "..."'
         )
+    documents.add(os.path.abspath(path))
     numbers, parts = dict(constants or {}), dict(definitions or {})
-    if path.suffix.lower() == ".csv":
+    entries: Sequence[Mapping[str, object]]
+    if suffix == ".csv":
         with open(path, encoding="utf-8-sig", newline="") as file:
-            entries: Sequence[Mapping[str, object]] = list(csv.DictReader(file))
+            entries = list(csv.DictReader(file))
+    elif suffix == ".reqif":
+        entries = read_reqif(path, FIELDS)
     else:
-        entries, numbers, parts = _toml_entries(path, numbers, parts)
+        entries, numbers, parts = _tables(path, numbers, parts)
     found = []
     for index, entry in enumerate(entries, 1):
         where = f"requirement {index} of {path}"
-        fields = _fields(where, entry)
+        fields = _fields(where, entry, need_formulas)
+        links = tuple(fields.pop("links", "").replace(";", " ").replace(",", " ").split())
         try:
-            formula = parse(fields.pop("formula"), numbers, parts)
+            text = fields.pop("formula", None)
+            formula = None if text is None else parse(text, numbers, parts)
         except ValueError as error:
             raise ValueError(f"{where}, {fields['id']!r}: {error}") from None
-        found.append(Requirement(formula=formula, **fields))
+        found.append(Requirement(formula=formula, links=links, file=str(path), **fields))
     return _checked(str(path), found)
 
 
-def _toml_entries(
+def write_requirements(requirements: Iterable[Requirement], path: str | Path) -> Path:
+    """Write requirements to a CSV or a ReqIF file, which `read_requirements` reads again.
+
+    **Returns:** the path.
+
+    **Raises:** `ValueError` for another ending, and for what `read_requirements` would refuse.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (".csv", ".reqif"):
+        raise ValueError(f"requirements are written to a .csv or a .reqif file; got {path.name}")
+    entries = [each.entry() for each in _checked("the sequence", tuple(requirements))]
+    with replacing(path) as partial:
+        if suffix == ".reqif":
+            partial.write_bytes(reqif_document(entries, FIELDS, path.stem))
+        else:
+            with open(partial, "w", encoding="utf-8", newline="") as file:
+                writer = csv.DictWriter(file, FIELDS)
+                writer.writeheader()
+                writer.writerows(entries)
+    return path
+
+
+def _tables(
     path: Path, numbers: dict[str, float], parts: dict[str, str]
 ) -> tuple[Sequence[Mapping[str, object]], dict[str, float], dict[str, str]]:
-    """Return the entries of a TOML file, and all names that their formulas may use."""
+    """Return the entries of a TOML or YAML file, and all names that their formulas may use."""
+    kind = "TOML" if path.suffix.lower() == ".toml" else "YAML"
     try:
-        whole = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is no TOML: {error}") from None
-    check_names(f"table of {path}", whole, ("requirement", "constants", "definitions"))
+        text = path.read_text(encoding="utf-8")
+        whole: object = tomllib.loads(text) if kind == "TOML" else _read_yaml(text)
+    except ValueError as error:
+        raise ValueError(f"{path} is no {kind}: {error}") from None
+    if not isinstance(whole, dict):
+        raise ValueError(f"{path} must have a list `requirements`; got {type(whole).__name__}")
+    listed = "requirements" if "requirements" in whole else "requirement"
+    check_names(f"table of {path}", map(str, whole), (listed, "constants", "definitions"))
     entries, own, named = (
-        whole.get("requirement", []), whole.get("constants", {}), whole.get("definitions", {}),
+        whole.get(listed, []), whole.get("constants", {}), whole.get("definitions", {}),
     )  # fmt: skip
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise ValueError(f"{path}: each requirement begins with a line [[requirement]]")
+        begins = "[[requirement]]" if kind == "TOML" else "- id: ..."
+        raise ValueError(f"{path}: each requirement begins with a line {begins}")
     for name, value in own.items():
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise ValueError(f"{path}: constant {name!r} must be a number; got {value!r}")
@@ -128,15 +209,32 @@ def _toml_entries(
     return entries, {**own, **numbers}, {**named, **parts}
 
 
-def _fields(where: str, entry: Mapping[str, object]) -> dict[str, str]:
+def _read_yaml(text: str) -> object:
+    """Read YAML without tags of Python.
+
+    **Raises:** `ValueError` for anything else.
+    """
+    yaml = require("yaml", "yaml")
+    try:
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, RecursionError) as error:
+        raise ValueError(" ".join(str(error).split())) from None
+
+
+def _fields(where: str, entry: Mapping[str, object], need_formulas: bool) -> dict[str, str]:
     check_names(f"field of {where}", [str(name) for name in entry], FIELDS)
-    fields = {str(name): value for name, value in entry.items() if value not in (None, "")}
+    fields = {str(name): value for name, value in entry.items() if value not in (None, "", [])}
     for name, value in fields.items():
-        if not isinstance(value, str):
+        if name == "links" and isinstance(value, list):
+            fields[name] = " ".join(map(str, value))
+        elif name == "severity" and isinstance(value, int) and not isinstance(value, bool):
+            fields[name] = str(value)
+        elif not isinstance(value, str):
             raise ValueError(f"{where}: {name} must be a text; got {value!r}")
-    for name in FIELDS[:2]:
+    for name in FIELDS[: 1 + need_formulas]:
         if name not in fields:
-            raise ValueError(f"{where} has no {name}: it needs an id and a formula")
+            needed = "an id and a formula" if need_formulas else "an id"
+            raise ValueError(f"{where} has no {name}: it needs {needed}")
     return {name: str(value).strip() for name, value in fields.items()}
 
 

@@ -6,16 +6,21 @@ What was recorded between two samples of the new clock stays with the trace (`Tr
 verdicts count it: a spike between two samples is not lost.
 """
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from fractions import Fraction
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from verifai_jax.core.errors import check_names
 from verifai_jax.core.text import format_seconds, format_time
 from verifai_jax.core.trace import Trace, check_period
 from verifai_jax.mtl.setting import since_first
 
 Method = Literal["hold", "linear"]
+Missing = Literal["hold", "drop", "interpolate"]
 
 MAX_SAMPLES = 100_000_000
 """Samples that a resampled trace may have: a signal of so many takes 800 MB in double precision."""
@@ -66,17 +71,17 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
     for name, recorded in trace.signals.items():
         values = np.asarray(recorded)
         if values.dtype == bool or method == "hold":
-            missing = _missing(values)
+            missing = gaps(values)
             if missing.any():
                 notes[
                     f"signal {name!r} has no value in {missing.sum()} of {len(missing)} rows: "
                     "its last one is held there"
                 ] = int(missing.sum())
-            values = _held(values)
+            values = held(values)
             signals[name], inner[name] = values[index], values[passed]
         else:
             signals[name] = _interpolated(values, elapsed, clock, index, tolerance)
-            inner[name] = _filled(values, elapsed)[passed]
+            inner[name] = filled(values, elapsed)[passed]
     between = None
     if len(passed):
         positions = _positions(cell[passed], len(clock))
@@ -85,7 +90,8 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
             {name: np.concatenate([signals[name], inner[name]])[positions] for name in signals},
             times=times,
         )
-    return Trace(signals, dt=float(dt), status=trace.status, between=between, notes=notes)
+    about = {"status": trace.status, "notes": notes, "units": trace.units}
+    return Trace(signals, dt=float(dt), between=between, **about)
 
 
 def _recorded(trace: Trace) -> Trace:
@@ -96,7 +102,7 @@ def _recorded(trace: Trace) -> Trace:
     fine = trace.finely()
     new = np.append(True, np.diff(fine.clock()) > 0)
     signals = {name: np.asarray(signal)[new] for name, signal in fine.signals.items()}
-    return Trace(signals, times=fine.clock()[new], status=trace.status, notes=trace.notes)
+    return replace(trace, signals=signals, dt=None, times=fine.clock()[new], between=None)
 
 
 def _positions(cells: Int[np.ndarray, " passed"], count: int) -> Int[np.ndarray, " positions"]:
@@ -120,15 +126,16 @@ def _positions(cells: Int[np.ndarray, " passed"], count: int) -> Int[np.ndarray,
     return np.maximum.accumulate(positions, axis=1).reshape(-1)
 
 
-def _missing(values: np.ndarray) -> np.ndarray:
+def gaps(values: np.ndarray) -> np.ndarray:
+    """Return in which rows a signal has no value, or a vector lacks one."""
     if values.dtype.kind != "f":
         return np.zeros(len(values), bool)
     return np.asarray(np.any(np.isnan(values).reshape(len(values), -1), axis=1))
 
 
-def _held(values: np.ndarray) -> np.ndarray:
+def held(values: np.ndarray) -> np.ndarray:
     """Return each column with its last value for a missing one; nothing before the first."""
-    if not _missing(values).any():
+    if not gaps(values).any():
         return values
     columns = values.reshape(len(values), -1)
     last = np.maximum.accumulate(
@@ -154,18 +161,69 @@ def _interpolated(
     return np.where(weight == 0, here, here + weight * (there - here))
 
 
-def _filled(values: np.ndarray, elapsed: Float[np.ndarray, " time"]) -> np.ndarray:
+def filled(values: np.ndarray, elapsed: Float[np.ndarray, " time"]) -> np.ndarray:
     """Return a signal with its missing values on the line between its own neighbours.
 
     A row in which a signal has no value hides none of it; the samples of the clock show the gap.
     """
-    if not _missing(values).any():
+    if not gaps(values).any():
         return values
     columns = []
     for column in values.reshape(len(values), -1).T:
         known = np.flatnonzero(~np.isnan(column))
         columns.append(np.interp(elapsed, elapsed[known], column[known]) if len(known) else column)
     return np.stack(columns, axis=1).reshape(values.shape)
+
+
+def joined(
+    stamps: Sequence[tuple[np.ndarray, Fraction]], parts: Sequence[dict[str, np.ndarray]]
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return the instants of several clocks in one order, and columns with gaps at those of others.
+
+    **Arguments:**
+
+    - `stamps`: times of each clock in seconds, and the instant that they are counted from.
+    - `parts`: the columns of each clock.
+    """
+    origin = min(start for _, start in stamps)
+    clocks = [seconds + float(start - origin) for seconds, start in stamps]
+    union = np.unique(np.concatenate(clocks))
+    values = {}
+    for clock, part in zip(clocks, parts, strict=True):
+        rows = np.searchsorted(union, clock)
+        for name, column in part.items():
+            numbers = np.where(column, 1.0, -1.0) if column.dtype == bool else column
+            values[name] = np.full((len(union), *column.shape[1:]), np.nan)
+            values[name][rows] = numbers
+    return union, values
+
+
+def without_gaps(trace: Trace, missing: Missing | Mapping[str, Missing]) -> Trace:
+    """Fill the gaps of signals, or leave out the instants at which they have one."""
+    ways = missing if isinstance(missing, Mapping) else dict.fromkeys(trace.signals, missing)
+    check_names("signal", ways, trace.signals)
+    check_names("way to treat a gap", ways.values(), ("hold", "drop", "interpolate"))
+    signals, notes = {n: np.asarray(s) for n, s in trace.signals.items()}, dict(trace.notes)
+    kept = np.ones(trace.length, bool)
+    for name, way in ways.items():
+        gap = gaps(signals[name])
+        if not gap.any():
+            continue
+        done = {"hold": "its last one is held", "interpolate": "it is interpolated"}
+        said = done.get(way, "these are left out")
+        notes[f"signal {name!r} has no value in {gap.sum()} of {len(gap)} rows: {said} there"] = 1
+        if way == "drop":
+            kept &= ~gap
+        else:
+            clock = np.asarray(trace.clock())
+            signals[name] = held(signals[name]) if way == "hold" else filled(signals[name], clock)
+    if not kept.any():
+        raise ValueError("no instant is left: at each one a signal whose gaps are dropped has one")
+    signals = {name: signal[kept] for name, signal in signals.items()}
+    if trace.times is None and kept.all():
+        return replace(trace, signals=signals, notes=notes)
+    clock = np.asarray(trace.clock())[kept]
+    return replace(trace, signals=signals, notes=notes, times=clock, dt=None)
 
 
 def check_increasing(times: np.ndarray) -> None:

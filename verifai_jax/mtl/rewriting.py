@@ -4,6 +4,7 @@ nnf(f)                                            # negations only at the leaves
 simplify(f)                                       # fewer nodes, the same robustness
 """
 
+from collections.abc import Mapping
 from decimal import Decimal
 
 from verifai_jax.mtl import formula as ast
@@ -131,6 +132,13 @@ def rebuild(f: Formula, operands: tuple[Formula, ...]) -> Formula:
     if isinstance(f, ast.Leaf):
         return f
     return ast.build(f.operator.word, operands, *([f.interval] if f.operator.timed else ()))
+
+
+def replaced(f: Formula, parts: Mapping[Formula, Formula]) -> Formula:
+    """Return the formula with other formulas in place of some of its parts."""
+    if f in parts:
+        return parts[f]
+    return rebuild(f, tuple(replaced(part, parts) for part in f.operands()))
 
 
 def expand(f: Formula) -> Formula:

@@ -42,9 +42,9 @@ class Node(ForUsers):
     """A node that is equal to another of the same kind with equal fields."""
 
     _internal = frozenset((
-        "below", "children", "compared", "depth", "first_look_ahead", "interval", "is_predicate",
-        "is_signal", "meaning", "number", "operands", "operator", "side", "span", "temporal_depth",
-        "terms", "text", "timeless", "valued", "word",
+        "asked", "below", "children", "compared", "depth", "first_look_ahead", "interval",
+        "is_predicate", "is_signal", "meaning", "number", "operands", "operator", "side", "span",
+        "temporal_depth", "terms", "text", "timeless", "valued", "word",
     ))  # fmt: skip
 
     def below(self) -> tuple["Node", ...]:
@@ -243,6 +243,29 @@ class Tree(Node):
         latest = start + (last if math.isfinite(last) else first)
         below = [part.first_look_ahead(dt, start + first) for part in self.valued()]
         return max([latest, *below])
+
+    def asked(self, dt: float = 0.0) -> dict["Tree", tuple[float, float]]:
+        """Return from when to when each part is asked if it is asked at 0 itself, in seconds.
+
+        **Arguments:**
+
+        - `dt`: sampling period in seconds, by which `next` and `prev` look.
+        """
+        spans: dict[Tree, tuple[float, float]] = {self: (0.0, 0.0)}
+        for part in reversed(list(postorder(self))):
+            if not isinstance(part, Tree):
+                continue
+            (first, last), (near, far) = spans[part], part.span(dt)
+            ahead = part.side == "ahead"
+            window = (first + near, last + far) if ahead else (first - far, last - near)
+            # What stands on the left of until and since is asked from now on to the witness.
+            left = (first, last + far) if ahead else (first - far, last)
+            witness = bool(part.side) and part.operator.operands == 2
+            for index, below in enumerate(part.valued()):
+                own = left if witness and index == 0 else window
+                known = spans.get(below, own)
+                spans[below] = min(own[0], known[0]), max(own[1], known[1])
+        return spans
 
     @property
     def depth(self) -> int:

@@ -16,7 +16,9 @@ from typing import Literal, NamedTuple
 NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
 """Names of signals, constants and definitions that need no quotes."""
 
-FUNCTIONS = {"abs": 1, "sqrt": 1, "sin": 1, "cos": 1, "norm": 1, "min": 2, "max": 2}
+FUNCTIONS = {
+    "abs": 1, "sqrt": 1, "sin": 1, "cos": 1, "exp": 1, "norm": 1, "min": 2, "max": 2
+}  # fmt: skip
 """Functions of expressions, with the smallest number of their arguments."""
 
 NUMBERS = {"pi": math.pi}
@@ -105,6 +107,8 @@ OPERATORS: dict[str, Operator] = {
             ("weak_prev",), r"\widetilde{\ominus}",
             "at the previous sample, if there is one, {0}", side="back", dual="prev",
         ),
+        Operator(("rise",), r"\uparrow", "{0} begins to hold", side="back"),
+        Operator(("fall",), r"\downarrow", "{0} ceases to hold", side="back"),
         Operator(
             ("until", "U"), r"\mathbin{\mathcal{U}}", "{0} until, at some time{when}, {1}",
             operands=2, side="ahead", timed=True,

@@ -110,7 +110,7 @@ def expression(name: str, params: Params, kinds: list[str], out: str) -> tuple[s
     **Arguments:**
 
     - `name`, `params`: of the primitive.
-    - `kinds`: of its operands.
+    - `kinds`: the kinds of its operands.
     - `out`: the kind of its result.
 
     **Raises:** `Untranslatable` for an unknown one.

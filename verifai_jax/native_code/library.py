@@ -1,21 +1,12 @@
 """Translated programs as libraries of machine code, compiled once and kept on disk.
 
-    name = library_name(fingerprint)                    # `Unavailable` without a compiler
-    library = load(name, lambda: translate(program))    # or `Unavailable`, which says why
-    library(rows, key, first, temperatures, numbers)    # [n, count] of bits
-
-The machine's own C++ compiler makes them. A file is only loaded if its content has the checksum
-that its name says, from a folder that nobody else can write to.
+name = library_name(fingerprint)                    # `Unavailable` without a compiler
+library = load(name, lambda: translate(program))    # or `Unavailable`, which says why
+library(rows, key, first, temperatures, numbers)    # [n, count] of bits
 """
 
 import ctypes
-import hashlib
-import os
 import platform
-import shutil
-import stat
-import subprocess
-import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -24,29 +15,28 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt32
 
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.cores import available_cores
-from verifai_jax.core.devices import cache_folder
+from verifai_jax.core.machine_code import (
+    Program,
+    Unavailable,
+    compiler,
+    library_file,
+    library_folder,
+)
 from verifai_jax.core.remembered import remembered_as
 from verifai_jax.native_code.source import PRELUDE
 
-COMPILERS = ("c++", "g++", "clang++")
-"""Names under which a compiler is looked for."""
 FLAGS = (
-    "-std=c++11", "-shared", "-fPIC", "-march=native", "-ffp-contract=fast", "-w",
+    "-std=c++11", "-march=native", "-ffp-contract=fast",
     "-fno-math-errno", "-fno-trapping-math", "-fno-exceptions", "-fno-rtti",
 )  # fmt: skip
 """Not `-ffast-math`, which takes NaN for a number. XLA contracts to fused operations, too."""
 LONG = 8000
 """Lines of a program from which on it is compiled with -O1: in half the time, and slower by a
 twentieth (a reverse sweep) to a third (a rollout)."""
-MAX_SECONDS = 60.0
-"""Seconds that a compiler may take; the programs of the shipped problems take up to two."""
 PARTS = 4
 """Parts of a batch for each thread, so that a core that is busy delays the others less."""
-
-
-class Unavailable(Exception):
-    """There is no library; the text says why."""
 
 
 class Library:
@@ -108,17 +98,13 @@ def library_name(fingerprint: str | None) -> str:
 
     **Arguments:**
 
-    - `fingerprint`: of the program; None if it has none.
+    - `fingerprint`: the fingerprint of the program; None if it has none.
 
     **Raises:** `Unavailable` where there is no compiler, no cache folder, or no fingerprint.
     """
-    compiler = _compiler() if os.name == "posix" else None
-    if compiler is None:
-        raise Unavailable("there is no C++ compiler: none of c++, g++, clang++ is in PATH")
-    if cache_folder() is None:
-        raise Unavailable("the cache of compiled programs is switched off")
-    about = compiler.stat()
-    which = (str(compiler), about.st_size, about.st_mtime_ns, _processor(), FLAGS, PRELUDE)
+    tool = compiler()
+    about = tool.stat()
+    which = (str(tool), about.st_size, about.st_mtime_ns, _processor(), FLAGS, PRELUDE)
     name = remembered_as("native", fingerprint, which)
     if name is None:
         raise Unavailable("a part of the program cannot be identified")
@@ -137,20 +123,19 @@ def load(name: str, count: int, translate: Callable[[], str], quickly: bool = Fa
 
     **Raises:** `Unavailable` where it cannot be compiled, kept or loaded.
     """
-    try:
-        folder = _folder()
-        path = next(filter(_is_whole, sorted(folder.glob(f"{name}-*.so"))), None)
-        if path is None:
-            path = _compile(folder, name, translate(), quickly)
-        return Library(path, count)
-    except OSError as error:
-        raise Unavailable(f"the cache of compiled programs cannot be used: {error}") from error
+
+    def program() -> Program:
+        source = translate()
+        effort = "-O1" if quickly or source.count("\n") > LONG else "-O2"
+        return source, (effort, *FLAGS)
+
+    return Library(library_file(name, program), count)
 
 
 def is_approved(name: str) -> bool | None:
     """Return whether a library computes what XLA does, as `approve` noted; None if unknown."""
     try:
-        return {"yes": True, "no": False}.get((_folder() / f"{name}.agrees").read_text())
+        return {"yes": True, "no": False}.get((library_folder() / f"{name}.agrees").read_text())
     except (OSError, Unavailable):
         return None
 
@@ -158,69 +143,10 @@ def is_approved(name: str) -> bool | None:
 def approve(name: str, agrees: bool) -> None:
     """Note whether a library computes what XLA does, for later processes."""
     try:
-        _write(_folder() / f"{name}.agrees", (b"no", b"yes")[agrees])
+        with replacing(library_folder() / f"{name}.agrees") as partial:
+            partial.write_bytes((b"no", b"yes")[agrees])
     except (OSError, Unavailable):
         return  # It is compared again.
-
-
-def _folder() -> Path:
-    """Return the folder of libraries, which only this user may write to."""
-    base = cache_folder()
-    assert base is not None
-    folder = base / "native"
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    about = os.lstat(folder)
-    if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid() or about.st_mode & 0o022:
-        raise Unavailable(f"others can write to {folder}, so no program of it is loaded")
-    return folder
-
-
-def _is_whole(path: Path) -> bool:
-    """Return whether a library has the content that its name says."""
-    try:
-        return path.stem.endswith(f"-{_checksum(path.read_bytes())}")
-    except OSError:
-        return False
-
-
-def _checksum(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()[:32]
-
-
-def _compile(folder: Path, name: str, source: str, quickly: bool) -> Path:
-    compiler = _compiler()
-    assert compiler is not None
-    with tempfile.TemporaryDirectory(dir=folder) as cell:
-        code, made = Path(cell) / "program.cpp", Path(cell) / "program.so"
-        code.write_text(source)
-        effort = "-O1" if quickly or source.count("\n") > LONG else "-O2"
-        command = [str(compiler), effort, *FLAGS, str(code), "-o", str(made), "-lm"]
-        try:
-            done = subprocess.run(
-                command, capture_output=True, timeout=MAX_SECONDS, check=False, cwd=cell,
-                stdin=subprocess.DEVNULL,
-            )  # fmt: skip
-        except subprocess.TimeoutExpired:
-            raise Unavailable(f"{compiler} took more than {MAX_SECONDS:z.0f} s") from None
-        if done.returncode != 0 or not made.is_file():
-            said = done.stderr.decode(errors="replace").strip().splitlines() or ["it said nothing"]
-            raise Unavailable(f"{compiler} failed: {said[0][:200]}")
-        path = folder / f"{name}-{_checksum(made.read_bytes())}.so"
-        # At once, or not at all: another process may be compiling the same.
-        os.replace(made, path)
-        return path
-
-
-def _write(path: Path, data: bytes) -> None:
-    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-        file.write(data)
-    os.replace(file.name, path)
-
-
-def _compiler() -> Path | None:
-    found = filter(None, map(shutil.which, COMPILERS))
-    first = next(found, None)
-    return None if first is None else Path(first).resolve()
 
 
 @cache

@@ -25,7 +25,7 @@ class Element(NamedTuple):
     - `text`: its C expression.
     - `kind`: `f`, `i`, `u` or `b`, for float, int, unsigned and truth values.
     - `uniform`: whether it is the same for all simulations.
-    - `value`: of a constant; None for others.
+    - `value`: the value of a constant; None for others.
     """
 
     text: str
@@ -37,11 +37,11 @@ class Element(NamedTuple):
 class Memory(NamedTuple):
     """An array in the memory of the program, its elements one after another.
 
-    - `name`: of the C array.
+    - `name`: the name of the C array.
     - `kind`, `uniform`: as of an element.
-    - `shape`: of the array.
+    - `shape`: the shape of the array.
     - `offset`: C expression of the index of its first element; empty for 0.
-    - `values`: of a constant; None for others.
+    - `values`: the values of a constant; None for others.
     - `formula`: C expression of an element by its index, of an array that is not stored but
       computed where it is used; None for others.
     """

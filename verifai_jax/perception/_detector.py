@@ -133,11 +133,11 @@ def detector(
 
     **Arguments:**
 
-    - `key`: of the weights.
+    - `key`: the key of the weights.
     - `shape`: height and width of the images.
     - `kinds`: number of kinds of objects to tell apart.
     - `values`: numbers to estimate of an object.
-    - `channels`: of the convolutions, each of which halves the image.
+    - `channels`: the channels of the convolutions, each of which halves the image.
     - `hidden`: units of the dense layers.
 
     **Raises:** `ValueError` for images that are smaller than the convolutions make of them.

@@ -178,7 +178,7 @@ class Camera:
 
     - `height`, `width`: pixels of the image.
     - `field_of_view`: horizontal angle of view in rad.
-    - `position`: of the eye, in m.
+    - `position`: the position of the eye, in m.
     - `yaw`: heading in rad, counterclockwise from the x axis.
     - `pitch`: elevation of the optical axis in rad; -pi/2 looks down, the top of the image then
       being ahead.

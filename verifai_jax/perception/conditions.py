@@ -79,8 +79,8 @@ def taken(
 
     - `image`: colours of the scene.
     - `conditions`: fog apart, which is part of the scene.
-    - `key`: of what is drawn anew for each frame: noise and rain.
-    - `lens`: of what belongs to the lens and the sensor: dirt and dead pixels.
+    - `key`: the key of what is drawn anew for each frame: noise and rain.
+    - `lens`: the key of what belongs to the lens and the sensor: dirt and dead pixels.
     """
     _, height, width = image.shape
     if conditions.rain is not None:

@@ -52,8 +52,8 @@ class Scene:
 
         - `camera`: its pose must be above the ground.
         - `conditions`: weather, lens and sensor; None is a clear day and a perfect camera.
-        - `key`: of what differs from frame to frame (noise, rain).
-        - `lens`: of what stays (dirt, dead pixels).
+        - `key`: the key of what differs from frame to frame (noise, rain).
+        - `lens`: the key of what stays (dirt, dead pixels).
 
         **Returns:** red, green and blue in [0, 1].
 

@@ -16,6 +16,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.progress import say_done, shows_progress
 from verifai_jax.perception._detector import Detection, Detector, Layer, detector
 
@@ -55,12 +56,12 @@ def train_detector(
     **Arguments:**
 
     - `images`: colours in [0, 1].
-    - `labels`: of each image.
+    - `labels`: the labels of each image.
     - `network`: one to go on from; None begins anew, with the layers that `detector` chooses.
     - `steps`, `batch`: number of steps, and images in each.
-    - `learning_rate`: of the first step.
+    - `learning_rate`: the learning rate of the first step.
     - `noise`: standard deviation of what is added to each pixel, anew in each step.
-    - `seed`: of the weights, the order of the images and the noise.
+    - `seed`: the seed of the weights, the order of the images and the noise.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     **Returns:** the network, and the loss of each step.
@@ -167,7 +168,7 @@ def losses_of(network: Detector, seen: Detection, labels: Labels) -> Float[Array
 
 
 @dataclasses.dataclass(frozen=True)
-class Score:
+class Score(InNotebook):
     """The quality of a detector on a test set.
 
     - `images`: number of images.

@@ -37,7 +37,6 @@ class Animation:
         """
         _check_gif(path)
         path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as partial:
             partial.write_bytes(self.gif)
         return path
@@ -63,7 +62,7 @@ def animate(
     **Arguments:**
 
     - `replay`: what `run.replay` returned.
-    - `path`: of a file to write too; folders are made.
+    - `path`: a file that is written too; folders are made.
     - `camera`: the name of a camera of a MuJoCo model; the one that sees best what moves when left
       out.
     - `size`: width and height of a frame in pixels.

@@ -79,7 +79,7 @@ def plot_bars(
       in `low` and `high`.
     - `columns`: the name in the legend of each column to draw, empty for none.
     - `title`: above the bars.
-    - `label`: of the horizontal axis.
+    - `label`: the label of the horizontal axis.
     - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.

@@ -14,7 +14,7 @@ def plot_pairs(coverage: FuzzCoverage, path: str | Path | None = None) -> Figure
 
     **Arguments:**
 
-    - `coverage`: of a run whose features have an automaton; the first one is drawn.
+    - `coverage`: the coverage of a run whose features have an automaton; the first one is drawn.
     - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.

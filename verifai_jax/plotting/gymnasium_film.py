@@ -36,7 +36,7 @@ def film_episode(
 
     **Arguments:**
 
-    - `replay`: of a problem with an environment of Gymnasium.
+    - `replay`: the replay of a problem with an environment of Gymnasium.
     - `size`: width and height in pixels; those of the environment when left out.
     - `fps`: frames a second; `FRAMES_PER_SECOND` when left out.
 

@@ -50,7 +50,7 @@ def film(
     **Arguments:**
 
     - `motion`: what `record` returned.
-    - `path`: of the file; folders are made.
+    - `path`: the path of the file; folders are made.
     - `size`: width and height in pixels; `SIZE` when left out.
     - `camera`: as for `frames`.
     - `fps`: frames a second; `FRAMES_PER_SECOND` when left out.
@@ -66,7 +66,7 @@ def film(
         _labelled(frame, motion, sample, motion.caption)
         for frame, sample in zip(plain, samples.tolist(), strict=True)
     ]
-    path = _folder_of(path)
+    path = Path(path)
     with replacing(path) as partial:
         partial.write_bytes(gif(drawn, shown))
     return path
@@ -86,7 +86,7 @@ def strip(
     **Arguments:**
 
     - `motion`: what `record` returned.
-    - `path`: of the file; folders are made.
+    - `path`: the path of the file; folders are made.
     - `count`: instants.
     - `size`: width and height of each in pixels.
     - `camera`: as for `frames`.
@@ -107,8 +107,9 @@ def strip(
     for frame, sample in zip(frames(motion, samples, size, camera=camera), samples, strict=True):
         labelled = _labelled(frame, motion, sample, "" if pieces else motion.caption)
         pieces += [labelled, np.full((len(labelled), 4, 3), 255, np.uint8)]
-    path = _folder_of(path)
-    Image.fromarray(np.hstack(pieces[:-1])).save(path)
+    path = Path(path)
+    with replacing(path) as partial:
+        Image.fromarray(np.hstack(pieces[:-1])).save(partial)
     return path
 
 
@@ -271,9 +272,3 @@ def _labelled(
     """Write caption and time above a frame; a red edge from the decisive sample on."""
     failed = motion.decisive is not None and sample >= motion.decisive
     return labelled(image, caption, float(motion.clock[sample]), failed)
-
-
-def _folder_of(path: str | Path) -> Path:
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path

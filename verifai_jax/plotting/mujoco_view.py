@@ -42,7 +42,7 @@ def best_view(motion: Motion, draw: Callable[..., Any], size: tuple[int, int]) -
 
     **Arguments:**
 
-    - `motion`: of the model.
+    - `motion`: the motion of the model.
     - `draw`: what `mujoco_scene.canvas` gives, for pictures of this `size`.
     """
     mujoco = require("mujoco", extra="mujoco")

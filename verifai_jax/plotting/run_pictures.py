@@ -28,7 +28,6 @@ def write_run_pictures(run: Run, folder: str | Path) -> list[Path]:
     **Returns:** the paths of the pictures.
     """
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / "features.png", folder / "robustness.png"]
     plot_features(run, paths[0])
     plot_robustness_history(run, paths[1])
@@ -50,12 +49,11 @@ def write_replay_pictures(
 
     - `replay`: what `run.replay` returned.
     - `folder`: to write into; it is made where there is none.
-    - `name`: of the files, without an ending; by default that of the row.
+    - `name`: the name of the files, without an ending; by default that of the row.
 
     **Returns:** the paths of the pictures.
     """
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     name = name or ("replay" if replay.row is None else f"row-{replay.row}")
     paths = [folder / f"{name}.png"]
     plot_replay(replay, paths[0])

@@ -46,7 +46,8 @@ def show_or_save(drawn: Figure, path: str | Path | None) -> Figure:
 
     **Returns:** the figure, for a notebook to show.
     """
-    _wrap_texts(drawn)
+    with figure.missing_glyphs():
+        _wrap_texts(drawn)
     if path is not None:
         with replacing(path) as partial:
             drawn.savefig(partial)
@@ -83,7 +84,7 @@ def name_points(
     **Arguments:**
 
     - `axes`: with the points.
-    - `names`: of the points at `x` and `y`, in the units of the data.
+    - `names`: the names of the points at `x` and `y`, in the units of the data.
     - `low`, `high`: ends of a horizontal bar at each point, on which no name lies.
     """
     figure: Any = axes.figure
@@ -188,4 +189,11 @@ def _wrap(text: Any, room: float, renderer: Any) -> None:
     if length > room:
         lines = text.get_text().split("\n")
         width = max(12, int(max(map(len, lines)) * room / length))
-        text.set_text("\n".join(part for line in lines for part in _broken(line, width)))
+        parts = [part for line in lines for part in _broken(line, width)]
+        # A word that is longer than the room is broken anywhere; its letters may be wide ones.
+        piece = int(0.9 * width)
+        text.set_text("\n".join(
+            part[i : i + piece] if len(part) > width else part
+            for part in parts
+            for i in range(0, len(part) if len(part) > width else 1, piece)
+        ))  # fmt: skip

@@ -72,7 +72,7 @@ def plot_importance(importance: HyperparameterImportance, path: str | Path | Non
 
     **Arguments:**
 
-    - `importance`: of hyper-parameters.
+    - `importance`: the importance of hyper-parameters.
     - `path`: file that the picture is written to, if given.
 
     **Returns:** the figure.

@@ -15,7 +15,7 @@ def plot_transfer(result: Transfer, path: str | Path | None = None) -> Figure:
     **Arguments:**
 
     - `result`: what `vj.transfer` returned.
-    - `path`: of a picture to write; none when left out.
+    - `path`: the picture that is written; none when left out.
 
     **Returns:** the figure.
     """

@@ -43,7 +43,9 @@ class Actions:
 
     - `kind`: one of `ACTIONS`.
     - `low`, `high`: bounds of each entry of the action; for `clip`, `scale` and `tanh`.
-    - `counts`: of several choices the number of each, in the order of the outputs; for `argmax`.
+    - `counts`: the number of options of each of several choices, in the order of the outputs; for
+      `argmax`.
+    - `shape`: the shape of an action with bounds; a vector when left out.
 
     **Raises:** `UnknownNameError` for another kind; `PolicyError` for bounds that are missing or
     do not fit.
@@ -53,6 +55,7 @@ class Actions:
     low: tuple[float, ...] = ()
     high: tuple[float, ...] = ()
     counts: tuple[int, ...] = ()
+    shape: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         check_names("action", [self.kind], ACTIONS)
@@ -82,9 +85,11 @@ class Actions:
             return outputs
         low, high = (np.asarray(bounds, outputs.dtype) for bounds in (self.low, self.high))
         if self.kind == "clip":
-            return jnp.clip(outputs, low, high)
-        unit = jnp.tanh(outputs) if self.kind == "tanh" else outputs
-        return jnp.clip((high + low) / 2 + (high - low) / 2 * unit, low, high)
+            action = jnp.clip(outputs, low, high)
+        else:
+            unit = jnp.tanh(outputs) if self.kind == "tanh" else outputs
+            action = jnp.clip((high + low) / 2 + (high - low) / 2 * unit, low, high)
+        return action.reshape(*action.shape[:-1], *self.shape) if self.shape else action
 
 
 @jax.tree_util.register_dataclass
@@ -155,7 +160,8 @@ class Policy:
         **Arguments:**
 
         - `observation`: one observation, or a batch for a network of vectors.
-        - `memory`: of a policy that remembers; `initial_memory` at the start of an episode.
+        - `memory`: the memory of a policy that remembers; `initial_memory` at the start of an
+          episode.
 
         **Raises:** `TypeError` for a memory that is missing, or that it does not have.
         """

@@ -75,12 +75,12 @@ def policy(
     - `action`: what the outputs mean, where the file does not say it: `"argmax"`; `"clip"`,
       `"scale"` or `"tanh"` with `low=` and `high=`; `"positive"`; `"outputs"` (default).
     - `low`, `high`: bounds of the action.
-    - `activation`: of an MLP, after each of its layers but the last.
+    - `activation`: the activation of an MLP, after each of its layers but the last.
     - `network(weights, observation) -> outputs`: of other weights; `weights` by their names.
     - `layers`: names of the layers of an MLP, in order; otherwise in the order of their names.
-    - `output`: of an ONNX graph with several outputs, the one that is the action.
-    - `memory`: of an ONNX graph, `{input: output}` of what it remembers; found by its shapes where
-      None.
+    - `output`: the output of an ONNX graph with several outputs, the one that is the action.
+    - `memory`: the memory of an ONNX graph, `{input: output}` of what it remembers; found by its
+      shapes where None.
     - `stack`: observations that the policy sees at once, the newest last.
     - `batched`: a Python function takes a batch of observations.
 

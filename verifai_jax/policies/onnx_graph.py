@@ -179,7 +179,7 @@ def read_onnx(
 
     **Arguments:**
 
-    - `path`: of the file, next to which tensors may be kept; None for bytes alone.
+    - `path`: the path of the file, next to which tensors may be kept; None for bytes alone.
     - `data`: the model.
     - `what`: its name, for errors.
     - `output`: name of the output that is meant, of several.

@@ -31,7 +31,7 @@ class Record:
     """An object that a pickle would make by a call.
 
     - `function`: what would be called.
-    - `arguments`: of the call.
+    - `arguments`: the arguments of the call.
     - `state`: what would be set on the object afterwards, or None.
     - `items`: what would be put into it, as for a dictionary.
     """

@@ -198,7 +198,8 @@ def _actions(acts: tuple[str, dict[str, Any]], squashed: bool, what: str) -> Act
         return Actions("argmax", counts=tuple(int(n) for n in np.ravel(space["nvec"])))
     if kind == "MultiBinary":
         return Actions("positive")
-    if kind != "Box" or np.ndim(space.get("low", 0)) != 1:
+    if kind != "Box" or not np.ndim(space.get("low", 0)):
         raise PolicyError(f"{what} has actions of {kind} of a form that is not supported")
     low, high = (tuple(np.ravel(space[name]).astype(float).tolist()) for name in ("low", "high"))
-    return Actions("tanh" if squashed else "clip", low, high)
+    shape = np.shape(space["low"])
+    return Actions("tanh" if squashed else "clip", low, high, shape=shape if len(shape) > 1 else ())

@@ -41,7 +41,8 @@ class Guide:
 
     - `term`: a formula or its text, of which the robustness serves, or a function of the trace and
       the features, pure and traceable by JAX, also for a black box; less is nearer to a failure.
-    - `weight`: of the term, above 0; with 1 the robustness of safe simulations says nothing.
+    - `weight`: the weight of the term, above 0; with 1 the robustness of safe simulations says
+      nothing.
     - `scale`: the size of values of the term that matters, in its unit.
 
     **Raises:** `TypeError` for a term that is neither; `ValueError` for a formula that does not
@@ -100,7 +101,7 @@ class Guide:
         **Arguments:**
 
         - `observed`: the robustness, or what a search receives otherwise.
-        - `value`: of the term.
+        - `value`: the value of the term.
         """
         # In NumPy: of an array of JAX each first use of this kind compiles a program.
         known = np.where(np.isfinite(value), value, 0.0).astype(np.float64)

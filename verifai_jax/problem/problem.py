@@ -6,10 +6,11 @@
 `Problem.check()` says everything that is wrong with it before anything compiles.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -37,6 +38,7 @@ from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.mtl import Formula, hard, parse, robustness
 from verifai_jax.mtl.deciding import leaves_of
 from verifai_jax.mtl.evaluate import End
+from verifai_jax.mtl.requirements import Requirement, read_requirements
 from verifai_jax.mtl.semantics import Semantics
 from verifai_jax.problem.behaviour import Behaviour
 from verifai_jax.problem.guide import Guide, Term
@@ -71,6 +73,9 @@ class Problem(InNotebook):
     - `guide`: a term in addition to the robustness that steers searches and decides nothing: a
       formula, its text, a function of the trace and the features, or a `Guide` with its weight.
     - `draw`: draws one instant for an animation: `(axes, trace, sample, features)`.
+    - `requirements`: what the formulas stand for: a file (`mtl.read_requirements`), or requirements
+      themselves; a formula belongs to the requirement whose identifier is its name. See
+      `trace_matrix`.
     - `made_in`: the modules whose code makes the problem, for the record of its runs; those on the
       stack when left out, and where a problem is made of another one, those of the other.
 
@@ -82,8 +87,8 @@ class Problem(InNotebook):
     """
 
     _internal = frozenset((
-        "black_box", "draws", "form", "made_in", "monitored", "on_backend", "programs",
-        "sources",
+        "black_box", "draws", "form", "made_in", "monitored", "on_backend",
+        "programs", "requirement_entries", "sources",
     ))  # fmt: skip
 
     name: str
@@ -97,6 +102,7 @@ class Problem(InNotebook):
     priority: Sequence[str] | Sequence[tuple[str, str]] | None
     behaviour: Behaviour | None
     guide: Guide | None
+    requirements: tuple[Requirement, ...]
     made_in: Sequence[Maker] | None = field(repr=False)
     formulas: Mapping[str, Formula] = field(init=False, repr=False)
     rulebook: Rulebook | None = field(init=False, repr=False)
@@ -115,6 +121,7 @@ class Problem(InNotebook):
         priority: Sequence[str] | Sequence[tuple[str, str]] | None = None,
         behaviour: Behaviour | None = None,
         guide: Guide | Formula | str | Term | None = None,
+        requirements: str | Path | Iterable[Requirement] | None = None,
         made_in: Sequence[Maker] | None = None,
     ) -> None:
         if not isinstance(name, str) or not name.strip():
@@ -150,6 +157,7 @@ class Problem(InNotebook):
             "priority": priority,
             "behaviour": behaviour,
             "guide": guide if guide is None or isinstance(guide, Guide) else Guide(guide),
+            "requirements": _requirements(requirements),
             "made_in": made_here() if made_in is None else tuple(made_in),
             "formulas": formulas,
             "rulebook": None if priority is None else _rulebook(priority, formulas),
@@ -179,6 +187,10 @@ class Problem(InNotebook):
         - `first`: the row of a table from which on that holds.
         """
         return sources_of(self, made=self.made_in or (), first=first)
+
+    def requirement_entries(self) -> dict[str, dict[str, str]]:
+        """Return what the requirements of the formulas say, by identifier, as plain data."""
+        return {each.id: each.entry() for each in self.requirements if each.id in self.formulas}
 
     @truncate_silently()
     def draws(self) -> bool:
@@ -229,9 +241,9 @@ class Problem(InNotebook):
 
         **Arguments:**
 
-        - `faults`: of `vj.faults`, in the order in which those of one channel apply. What varies of
-          each is a feature under its name, whose nominal value is the weakest, shortest and latest
-          fault.
+        - `faults`: the faults of `vj.faults`, in the order in which those of one channel apply.
+          What varies of each is a feature under its name, whose nominal value is the weakest,
+          shortest and latest fault.
         - `by_simulator`: whether the simulator applies them itself, as `vj.faults.on_host` helps
           it to; for `remote`, and for a `blackbox` of one's own.
 
@@ -403,6 +415,18 @@ def _rulebook(
     if all(isinstance(entry, str) for entry in entries):
         return Rulebook(formulas, list(pairwise(entries)))
     return Rulebook(formulas, entries)
+
+
+def _requirements(given: str | Path | Iterable[Requirement] | None) -> tuple[Requirement, ...]:
+    if isinstance(given, str | Path):
+        return read_requirements(given, need_formulas=False)
+    found = tuple(given or ())
+    if other := next((each for each in found if not isinstance(each, Requirement)), None):
+        raise ProblemError(
+            f"requirements must be a file or Requirements, as mtl.read_requirements gives; got "
+            f"{other!r}"
+        )
+    return found
 
 
 def _formula(name: str, formula: Formula | str) -> Formula:

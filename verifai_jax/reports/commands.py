@@ -18,7 +18,9 @@ def run_command(run: Run) -> str | None:
 
     A run of a problem that no file names, or with a search that has no name, is repeated in Python.
     """
-    search = run.search_data
+    search = run.search_data or {}
+    objective = ["--objective", "likelihood"] if "likeliest" in search else []
+    search = search.get("likeliest", search)
     if run.target is None or not search or "name" not in search or isinstance(run, FuzzRun):
         return None
     words = ["verifai-jax", "falsify", run.target, "--search", str(search["name"])]
@@ -26,6 +28,7 @@ def run_command(run: Run) -> str | None:
     # As many as were made: what ended the run before is no option of a repetition.
     budget = run.budget if run.stopped == "budget" and run.budget else run.simulations
     words += ["--budget", str(budget), "--batch", str(run.batch), "--seed", str(run.seed)]
+    words += objective
     if run.precision != "float32":
         words += ["--precision", run.precision]
     if run.backend is not None:

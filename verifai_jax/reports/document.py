@@ -14,12 +14,15 @@ from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.progress import shows_progress
+from verifai_jax.error_budgets.result import ErrorBudget
 from verifai_jax.estimation.result import Estimate
 from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import Judgement
 from verifai_jax.problem.problem import Problem
+from verifai_jax.reports.assessment import with_assessment
 from verifai_jax.reports.comparison_report import comparison_page
+from verifai_jax.reports.errors_section import with_errors
 from verifai_jax.reports.estimate_report import estimate_page
 from verifai_jax.reports.judgement_report import judgement_page
 from verifai_jax.reports.page import render
@@ -41,6 +44,8 @@ def write_report(
     studies: bool | None = None,
     modes: int | None = None,
     problem: Problem | None = None,
+    errors: ErrorBudget | None = None,
+    assessment: bool = False,
     progress: bool | None = None,
 ) -> Path:
     """Write the evidence report on a result as one HTML file, and its claims as JSON next to it.
@@ -49,8 +54,9 @@ def write_report(
 
     - `result`: a run, a sweep, an estimate, a comparison, a transfer or a judgement. The failures
       of a run that has its problem are simulated again.
-    - `path`: of the HTML file; the claims go to the same name with the ending `.claims.json`.
-    - `units`: of features, by name.
+    - `path`: the path of the HTML file; the claims go to the same name with the ending
+      `.claims.json`.
+    - `units`: the units of features, by name.
     - `reasons`: why a feature has the range that it has, by name.
     - `traces`: rows of a run that are simulated beforehand at most; 24 by default, 5 for a black
       box that takes long.
@@ -58,7 +64,11 @@ def write_report(
       system is a black box that takes long.
     - `modes`: simulations spent on all ways of failing of a run and their probabilities, as
       `vj.modes` finds them; none when left out.
-    - `problem`: of an estimate, or the baseline of a comparison, for its property and prior.
+    - `problem`: the problem of an estimate, or the baseline of a comparison, for its property and
+      prior.
+    - `errors`: how wrong the number can be, as `vj.error_budget` says: a section and a claim.
+    - `assessment`: whether sections for an assessor follow: the claims as a tree, the nine steps of
+      credibility with boxes to be filled in, and a page to be signed.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     **Returns:** the path of the HTML file.
@@ -80,7 +90,8 @@ def write_report(
                 )
             space = result.problem.space if result.problem else None
             _check(about, space, result.table.features)
-            page = run_page(result, about, traces, studies, modes)
+            words = None if errors is not None else " --assessment" * assessment
+            page = run_page(result, about, traces, studies, modes, words)
         case Sweep():
             _check(about, result.space, result.hyperparameters)
             page = sweep_page(result, about)
@@ -102,7 +113,10 @@ def write_report(
                 "a report is on a run, a sweep, an estimate, a comparison, a transfer or a "
                 f"judgement; got {kind}"
             )
-    path.parent.mkdir(parents=True, exist_ok=True)
+    if errors is not None:
+        page = with_errors(page, errors)
+    if assessment:
+        page = with_assessment(page)
     with replacing(path) as partial:
         partial.write_text(render(page), encoding="utf-8", newline="\n")
     claims = json.dumps(page.claims, indent=2, allow_nan=False)

@@ -1,9 +1,12 @@
 """The report on an estimate: the probability, its interval, the bound that rests on the prior."""
 
+from typing import Any
+
 from verifai_jax.core.text import format_percent
 from verifai_jax.estimation.result import METHODS, Estimate
+from verifai_jax.problem.model_digest import digest_of_model
 from verifai_jax.problem.problem import Problem
-from verifai_jax.reports.claims import Claim, claims_json
+from verifai_jax.reports.claims import Claim, about_json, claims_json
 from verifai_jax.reports.markup import Child, bullets, paragraph, picture, preformatted, table
 from verifai_jax.reports.page import Page, Section
 from verifai_jax.reports.provenance import Model, chained
@@ -135,6 +138,15 @@ def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> 
         headline=headline,
         tone="open",
         sections=sections,
-        claims=claims_json(estimate.name, claims, chain),
+        claims=claims_json(estimate.name, claims, chain, _about(estimate, model, problem)),
         warnings=model_warnings(model),
     )
+
+
+def _about(estimate: Estimate, model: Model, problem: Problem | None) -> dict[str, Any]:
+    """Return what the claims are about, as far as the problem says it."""
+    if problem is None:
+        return {}
+    formulas = {name: str(formula) for name, formula in problem.formulas.items()}
+    digest = "" if model.changes else digest_of_model(problem)
+    return about_json("estimate", formulas, problem.requirement_entries(), digest)

@@ -85,7 +85,7 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[Child]], caption: str = 
 
     **Arguments:**
 
-    - `heads`: of the columns.
+    - `heads`: the heads of the columns.
     - `rows`: their cells; the first of each is the head of its row.
     - `caption`: above the table, if any.
     """
@@ -117,7 +117,7 @@ def picture(content: bytes, alternative: str, caption: str = "", kind: str = "pn
 
     **Arguments:**
 
-    - `content`: of the file.
+    - `content`: the content of the file.
     - `alternative`: text for readers who cannot see the picture.
     - `caption`: below it; the words again when left out.
     - `kind`: `"png"` or `"gif"`.

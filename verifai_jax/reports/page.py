@@ -30,7 +30,7 @@ class Section:
 class Page:
     """A report before it is written.
 
-    - `title`: of the page.
+    - `title`: the title of the page.
     - `headline`: the finding in a sentence.
     - `tone`: `"fails"`, `"holds"` or `"open"`: how the headline is marked.
     - `sections`: in their order.

@@ -25,6 +25,10 @@ NO_REASON = "not stated"
 """Cell of a unit or a reason that nobody gave."""
 
 
+DEMANDED = ("text", "source", "severity", "rationale", "links")
+"""What is shown of a requirement."""
+
+
 @dataclass(frozen=True)
 class About:
     """Words of a person on the features: their `units` and the `reasons` of their ranges."""
@@ -37,7 +41,7 @@ def question(run: Run, about: About) -> Section:
     """Write what was asked."""
     space = space_of(run)
     content = [
-        *property_content(run.formulas, run.problem),
+        *property_content(run.formulas, run.problem, run.requirements),
         element("h3", "What was varied, and how likely it is"),
         _space(run, space, about),
         *_constraint(run, space),
@@ -62,13 +66,18 @@ def _unknown(features: Any) -> Any:
     raise ValueError("the constraint is code, which the record of a run does not hold")
 
 
-def property_content(texts: Mapping[str, str], problem: Problem | None) -> list[Markup]:
+def property_content(
+    texts: Mapping[str, str],
+    problem: Problem | None,
+    requirements: Mapping[str, Mapping[str, str]],
+) -> list[Markup]:
     """Write properties as formulas and in words.
 
     **Arguments:**
 
-    - `texts`: of the formulas by name.
+    - `texts`: the texts of the formulas by name.
     - `problem`: for what else is known; None if it is not.
+    - `requirements`: what the formulas stand for, by name.
     """
     rows = [
         (name, element("code", text), formula_words(parse(text))) for name, text in texts.items()
@@ -79,6 +88,12 @@ def property_content(texts: Mapping[str, str], problem: Problem | None) -> list[
         paragraph("Every simulation was to keep ", _all(len(rows)), "."),
         table(["property", "formula", "in words"], rows),
     ]
+    if requirements:
+        about = [
+            (name, *(requirements.get(name, {}).get(each, NO_REASON) for each in DEMANDED))
+            for name in texts
+        ]
+        content.append(table(["requirement", *DEMANDED], about, "The requirements they stand for"))
     if problem is not None:
         content.append(paragraph(ENDS[problem.end]))
         if problem.priority is not None:

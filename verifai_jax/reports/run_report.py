@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from verifai_jax.core.text import format_features
 from verifai_jax.evaluation.confirmations import UNDECIDED, describe_checks
 from verifai_jax.falsification.no_rate import why_no_rate
@@ -11,7 +13,7 @@ from verifai_jax.falsification.table import FINISHED
 from verifai_jax.falsification.tail import TAIL
 from verifai_jax.mtl import parse
 from verifai_jax.mtl.english import formula_words
-from verifai_jax.reports.claims import Claim, claims_json
+from verifai_jax.reports.claims import Claim, about_json, claims_json
 from verifai_jax.reports.commands import replay_command, report_command, run_command, run_python
 from verifai_jax.reports.markup import element, paragraph, preformatted
 from verifai_jax.reports.modes_section import mode_claims, modes_section
@@ -87,6 +89,7 @@ def run_page(
     traces: int | None = None,
     studies: bool | None = None,
     modes: int | None = None,
+    words: str | None = "",
 ) -> Page:
     """Make the report on a run.
 
@@ -95,14 +98,17 @@ def run_page(
     - `run`: the run.
     - `about`: units and reasons of the features.
     - `traces`, `studies`, `modes`: as in `write_report`.
+    - `words`: further ones of the command that builds the report again; None if there is no command
+      for all of it.
     """
     found = study(run, traces, studies, modes)
     now = None if run.problem is None else run.problem.sources()
     model = Model.of(run.sources, now)
     links = tuple(chained(_inputs(run, model)))
     command = None
-    if run.folder is not None:
+    if run.folder is not None and words is not None:
         command = report_command(run.folder, about.units, about.reasons, traces, studies, modes)
+        command += words
         if run.problem is None:
             command += " --without-problem"
         elif run.target is None:
@@ -128,7 +134,12 @@ def run_page(
         headline=headline(run),
         tone="fails" if run.table.counts.claimed else "open",
         sections=tuple(section for section in sections if section is not None),
-        claims=claims_json(run.name, claims, reproduction.chain),
+        claims=claims_json(
+            run.name,
+            claims,
+            reproduction.chain,
+            about_json("run", run.formulas, run.requirements, run.model, run.backend),
+        ),
         view=view if run.simulations else None,
         warnings=model_warnings(model, found.findings),
     )
@@ -224,7 +235,23 @@ def run_claims(run: Run, studies: Studies) -> list[Claim]:
     if without := counts.without_verdict:
         sentence = f"{without:,} of {run.simulations:,} simulations have no verdict."
         texts.append((sentence, (table_, "column status"), ()))
-    return [Claim(f"C{i + 1}", *entry) for i, entry in enumerate(texts)]
+    claims = [Claim(f"C{i + 1}", *entry) for i, entry in enumerate(texts)]
+    for name in run.requirements if run.simulations > counts.without_verdict else ():
+        column = f"rho.{name}" if len(run.formulas) > 1 else "rho"
+        rho = run.table.all[column].to_numpy(float)
+        sentence = (
+            f"{name}: the robustness is below zero in {np.sum(rho < 0):,} of {len(rho):,} "
+            f"simulations, and {np.nanmin(rho):z.4g} at the lowest."
+        )
+        number = f"C{len(claims) + 1}"
+        claims.append(Claim(number, sentence, (f"{table_}, column {column}",), common, (name,)))
+    return claims
+
+
+def chain_of(run: Run) -> str:
+    """Return the last hash of the chain that a report on the run would have now."""
+    links = chained(_inputs(run, Model.of(run.sources)))
+    return links[-1].chain if links else ""
 
 
 def _inputs(run: Run, model: Model) -> list[Input]:

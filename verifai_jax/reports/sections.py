@@ -152,7 +152,7 @@ def problem_content(problem: Problem, about: About) -> list[Markup]:
     nominal = dict(problem.nominal or {})
     texts = {name: str(formula) for name, formula in problem.formulas.items()}
     return [
-        *property_content(texts, problem),
+        *property_content(texts, problem, problem.requirement_entries()),
         element("h3", "What was varied, and how likely it is"),
         space_table(problem.space, nominal, about),
     ]

@@ -29,7 +29,7 @@ def read_result(file: Path, space: FeatureSpace | None = None) -> Estimate | Com
     **Arguments:**
 
     - `file`: the output of `verifai-jax estimate --json` or `verifai-jax compare --json`.
-    - `space`: of the problems that were compared, which the JSON does not have.
+    - `space`: the space of the problems that were compared, which the JSON does not have.
 
     **Returns:** the result; a comparison without its single pairs.
 

@@ -63,9 +63,9 @@ class Studies:
 
     - `failures`: a few, the worst first.
     - `traces`: data of rows that were simulated beforehand, by number.
-    - `animation`: of the first failure, a GIF; None without one.
+    - `animation`: the animation of the first failure, a GIF; None without one.
     - `explained`, `shrunk`: of the worst failure; None if that was not possible.
-    - `analysis`: of the table.
+    - `analysis`: the analysis of the table.
     - `modes`: ways of failing with their probabilities; None if they were not asked for.
     - `left_out`: what was not done and why, as whole sentences.
     - `findings`: rows that did not give their numbers when they were simulated again, likewise.

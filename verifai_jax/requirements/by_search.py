@@ -2,15 +2,19 @@
 
 simulated(problem)                                  # 64 traces from the prior
 mine_by_search(read_parametric("always x > ?d"), problem)
+distinguish_by_search(one, other, problem)
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.core.trace import Trace
 from verifai_jax.falsification import falsify
 from verifai_jax.falsification.run import Run
+from verifai_jax.mtl.distinguishing import Distinction, distinction
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.mining import Mined, mine_template
 from verifai_jax.mtl.parametric import Parametric
@@ -36,12 +40,14 @@ def simulated(problem: Problem, count: int = SIMULATED, seed: int = 0) -> tuple[
     return _traces(run, rows)
 
 
+@shows_progress("mining parameters")
 def mine_by_search(
     template: Parametric,
     problem: Problem,
     budget: int = 2000,
     seed: int = 0,
     confidence: float = 0.95,
+    progress: bool | None = None,
 ) -> Mined:
     """Find the tightest parameters that no search breaks: each counterexample loosens them.
 
@@ -58,7 +64,7 @@ def mine_by_search(
         left = budget - spent
         # Half of what is left, so that the values that a search moves are searched again.
         count = left if unbroken or left <= 2 * SIMULATED else left // 2
-        run = _searched(problem, mined.formula, count, seed + spent)
+        run = _searched(problem, {"asked": mined.formula}, count, seed + spent)
         spent += run.simulations
         failing = _failing(run)
         traces += _traces(run, failing[:TAKEN])
@@ -68,9 +74,38 @@ def mine_by_search(
     return replace(mined, searched=unbroken)
 
 
-def _searched(problem: Problem, formula: Formula, budget: int, seed: int) -> Run:
-    asking = replace(problem, spec={"asked": formula}, priority=None)
-    return falsify(asking, "auto", budget, seed=seed, confirm=False, progress=False)
+def distinguish_by_search(
+    one: Formula, other: Formula, problem: Problem, budget: int = 2000, seed: int = 0
+) -> Distinction:
+    """Search for a simulation on which one of two formulas holds and the other does not.
+
+    Simulations from the prior are looked at first. Then each formula is asked to imply the other:
+    what breaks that tells them apart.
+
+    **Raises:** as `falsify`.
+    """
+    source, end = f"a simulation of {problem.name}", problem.end
+    some = simulated(problem, min(SIMULATED, budget), seed)
+    found = distinction(one, other, some, source, end, len(some))
+    if found or budget <= len(some):
+        return found
+    spec = {"forth": one >> other, "back": other >> one}
+    run = _searched(problem, spec, budget - len(some), seed, stop_after=1)
+    traces = _traces(run, _failing(run)[:TAKEN])
+    return distinction(one, other, traces, source, end, len(some) + run.simulations)
+
+
+def _searched(
+    problem: Problem,
+    spec: Mapping[str, Formula],
+    budget: int,
+    seed: int,
+    stop_after: int | None = None,
+) -> Run:
+    asking = replace(problem, spec=spec, priority=None)
+    return falsify(
+        asking, "auto", budget, seed=seed, confirm=False, progress=False, stop_after=stop_after
+    )
 
 
 def _failing(run: Run) -> list[int]:

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.devices import Device, enable_compile_cache, spread_over_devices
 from verifai_jax.core.keys import IMPLEMENTATION
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.rl.batched_training import StaticTask, numbers_of
 from verifai_jax.rl.policy import Policy
 from verifai_jax.rl.task.task import State, Task
@@ -31,8 +32,14 @@ Totals = tuple[State, Float[Array, "..."], Bool[Array, "..."]]
 """States, rewards so far, and the episodes that are over."""
 
 
+@shows_progress("simulating episodes of", "episodes")
 def evaluate(
-    task: Task, policy: Policy, *, seed: int = 0, episodes: int = 100
+    task: Task,
+    policy: Policy,
+    *,
+    seed: int = 0,
+    episodes: int = 100,
+    progress: bool | None = None,
 ) -> Float[np.ndarray, " episodes"]:
     """Simulate episodes with the policy's most likely actions and return their returns.
 
@@ -40,8 +47,9 @@ def evaluate(
 
     - `task`: the task. An episode ends where it says so, or at its time limit.
     - `policy`: the policy to measure.
-    - `seed`: of the episodes' starts and of what is random in their steps.
+    - `seed`: the seed of the episodes' starts and of what is random in their steps.
     - `episodes`: their number.
+    - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     **Returns:** `[episodes]`, the sum of rewards of each episode.
     """

@@ -70,7 +70,7 @@ def train(
 
     - `task`: the task to learn; see `Task`.
     - `algorithm`: the algorithm with its hyper-parameters; `PPO()` when left out.
-    - `seed`: of all randomness of the training.
+    - `seed`: the seed of everything random in the training.
     - `steps`: environment steps, rounded up to whole updates.
     - `checkpoints`: environment steps at which to keep the policy too.
     - `callbacks`: functions called for each update, in groups every two seconds, with the

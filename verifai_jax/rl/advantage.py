@@ -33,8 +33,8 @@ def advantages(
     **Arguments:**
 
     - `reward`: of each step.
-    - `value`: of the state in which the action was taken.
-    - `next_value`: of the state it led to, *before* any reset.
+    - `value`: the value of the state in which the action was taken.
+    - `next_value`: the value of the state that the step led to, *before* any reset.
     - `ends`: the steps that ended an episode.
     - `discount`, `gae_lambda`: of future rewards, and of longer looks ahead, in `[0, 1]`.
 

@@ -54,7 +54,7 @@ class Configuration:
     - `task`: the task to learn.
     - `algorithm`: the algorithm with its hyper-parameters.
     - `steps`: environment steps, rounded up to whole updates; schedules end there.
-    - `seed`: of all randomness of the run.
+    - `seed`: the seed of everything random in the run.
     """
 
     task: Task

@@ -36,7 +36,7 @@ class Transition(NamedTuple):
     """One step of each environment, or several.
 
     - `reward`: of the step.
-    - `next_observation`: of the state that it led to, before any reset.
+    - `next_observation`: the observation of the state that the step led to, before any reset.
     - `ends`: the episodes that it ended.
     - `total`: the episode's return with this step in it.
     """
@@ -71,7 +71,7 @@ def advance(
     **Arguments:**
 
     - `episodes`: the episodes before it.
-    - `action`: of each environment, as `task.step` takes it.
+    - `action`: the action of each environment, as `task.step` takes it.
     - `key`: a random key, of this step of all environments.
 
     **Returns:** the episodes after it, new ones where it ended one; the transition.

@@ -40,7 +40,7 @@ from verifai_jax.rl.task.task import Action, Continuous, Discrete, State, Task
 class PPO:
     """Proximal policy optimisation, for discrete and continuous actions, by its hyper-parameters.
 
-    - `learning_rate`: of Adam; falls linearly to 0 over the training if `anneal`.
+    - `learning_rate`: the learning rate of Adam; falls linearly to 0 over the training if `anneal`.
     - `discount`, `gae_lambda`: of future rewards, and of longer looks ahead, in `[0, 1]`.
     - `clip`: how far the ratio of new to old probability may leave 1.
     - `entropy`, `value_weight`: weights in the loss.
@@ -159,7 +159,7 @@ class PPOState(NamedTuple):
     """The state between two updates.
 
     - `weights`, `moments`: what is learnt, and the optimizer's state.
-    - `statistics`: of the observations so far.
+    - `statistics`: the statistics of the observations so far.
     - `episodes`: the present episode of each environment.
     - `key`: the random key of the next update.
     - `done`, `updates`: updates so far, and in all.
@@ -179,7 +179,7 @@ class Experience(NamedTuple):
 
     - `observation`: the policy's input.
     - `action`: an index, or a vector in units of half its range.
-    - `outputs`: of the policy's network.
+    - `outputs`: the outputs of the policy's network.
     - `transition`: what the action led to.
     """
 
@@ -194,9 +194,9 @@ class Minibatch(NamedTuple):
 
     - `observation`: normalised, if the algorithm does so.
     - `action`: as in `Experience`.
-    - `log_probability`: of the action under the policy that took it.
-    - `advantage`: of the action.
-    - `target`: of the critic.
+    - `log_probability`: the log probability of the action under the policy that took it.
+    - `advantage`: the advantage of the action.
+    - `target`: the target of the critic.
     """
 
     observation: Float[Array, "*rows k"]

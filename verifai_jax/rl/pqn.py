@@ -46,7 +46,7 @@ from verifai_jax.rl.task.task import Discrete, Task
 class PQN:
     """Parallelised Q network, for discrete actions, by its hyper-parameters.
 
-    - `learning_rate`: of Adam; falls linearly to 0 over the training if `anneal`.
+    - `learning_rate`: the learning rate of Adam; falls linearly to 0 over the training if `anneal`.
     - `discount`, `q_lambda`: of future rewards, and of longer looks ahead, in `[0, 1]`.
     - `epsilon_start`, `epsilon_end`: part of the steps that explore; goes linearly from one to the
       other over the part `exploration` of the state.
@@ -150,7 +150,7 @@ class PQNState(NamedTuple):
     """The state between two updates.
 
     - `layers`, `moments`: the network that is learnt, and the optimizer's state.
-    - `statistics`: of the observations so far.
+    - `statistics`: the statistics of the observations so far.
     - `episodes`: the present episode of each environment.
     - `held`: the random action that an environment holds on to; -1 where it is greedy.
     - `key`: the random key of the next update.
@@ -205,7 +205,8 @@ def q_lambda_targets(
     **Arguments:**
 
     - `reward`: of each step.
-    - `next_value`: of the best action in the state that the step led to, *before* any reset.
+    - `next_value`: the value of the best action in the state that the step led to, *before*
+      any reset.
     - `ends`: the steps that ended an episode, `[time, *lanes]`.
     - `discount`, `q_lambda`: of future rewards, and of longer looks ahead, in `[0, 1]`.
 

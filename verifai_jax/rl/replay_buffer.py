@@ -34,7 +34,7 @@ class StoredTransitions(NamedTuple):
 
     - `observation`, `action`: the policy's input and output.
     - `reward`: of the step.
-    - `next_observation`: of the state that the step led to, before any reset.
+    - `next_observation`: the observation of the state that the step led to, before any reset.
     - `terminated`: 1.0 where the episode ended for good, else 0.0.
     """
 

@@ -50,14 +50,14 @@ Beyond them a Gaussian under tanh is a constant, or a coin that shows only the t
 class SAC:
     """Soft actor-critic, for continuous actions, by its hyper-parameters.
 
-    - `learning_rate`: of Adam, for the policy, the critics and the temperature; falls linearly to
-      0 over the training if `anneal`.
-    - `discount`: of future rewards, in `[0, 1]`.
+    - `learning_rate`: the learning rate of Adam, for the policy, the critics and the temperature;
+      falls linearly to 0 over the training if `anneal`.
+    - `discount`: the discount of future rewards, in `[0, 1]`.
     - `target_rate`: how far the slow critics move to the fast ones in a step of learning.
     - `temperature`: weight of entropy against reward at first; then it follows `target_entropy`,
       which is wanted on average for each number of an action (of units of half its range).
-    - `correlation`: of the noise between one step and the next, in `[0, 1)`; 0 is white noise.
-      0.9 and more reach what single random steps never do (the hill of mountain car).
+    - `correlation`: the correlation of the noise between one step and the next, in `[0, 1)`; 0 is
+      white noise. 0.9 and more reach what single random steps never do (the hill of mountain car).
     - `warmup`: environment steps before any learning.
     - `reward_scale`: rewards are multiplied by it; values of a few units are learnt best, and the
       first temperature is one for these.
@@ -220,9 +220,9 @@ class SACState(NamedTuple):
 
     - `weights`, `moments`: what is learnt, and the optimizer's state.
     - `slow`: the critics that targets are made of.
-    - `statistics`: of the observations so far.
+    - `statistics`: the statistics of the observations so far.
     - `episodes`: the present episode of each environment.
-    - `noise`: of the next actions, in units of the policy's deviation.
+    - `noise`: the noise of the next actions, in units of the policy's deviation.
     - `buffer`: the transitions that are remembered.
     - `key`: the random key of the next update.
     - `done`, `updates`: updates so far, and in all.

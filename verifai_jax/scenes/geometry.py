@@ -104,7 +104,7 @@ def box_inside(box: Rectangle, edges: Float[np.ndarray, "n 2 2"], convex: bool) 
     **Arguments:**
 
     - `box`: the rectangle.
-    - `edges`: of the polygons.
+    - `edges`: the edges of the polygons.
     - `convex`: True for one convex polygon, whose corners decide.
     """
     corners = box.corners

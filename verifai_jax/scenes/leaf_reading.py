@@ -40,7 +40,7 @@ def leaf_of(node: Any, name: str, options: Sequence[Any] | None = None) -> Leaf 
     **Arguments:**
 
     - `node`: in Scenic's graph.
-    - `name`: of the leaf.
+    - `name`: the name of the leaf.
     - `options`: what the node selects from, for a selector.
     """
     drawn = law(node)

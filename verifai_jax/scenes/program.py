@@ -141,7 +141,7 @@ class ScenicProgram:
 
         **Arguments:**
 
-        - `steps`: of a simulation at most.
+        - `steps`: the maximum number of steps of a simulation.
         - `records`: names of `record` statements, which become signals; all when left out.
         - `dt`: seconds of a step; the simulator's own when left out.
         - `workers`: processes, each of which compiles the program once; in this process when left
@@ -238,7 +238,7 @@ class ScenicProgram:
 
         **Arguments:**
 
-        - `scene`: of Scenic.
+        - `scene`: the scene of Scenic.
         - `path`: file to write the picture to.
         """
         return lazy_import("verifai_jax.plotting.scenes", "draw_scene")(self, scene, path)

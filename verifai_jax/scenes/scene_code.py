@@ -36,7 +36,7 @@ def scene_code(scene: Any, planar: bool) -> str:
 
     **Arguments:**
 
-    - `scene`: of Scenic.
+    - `scene`: the scene of Scenic.
     - `planar`: Scenic's `mode2D`, in which the code is meant to be compiled.
     """
     lines = [f"# One scene of a Scenic program{', in mode2D' if planar else ''}."]

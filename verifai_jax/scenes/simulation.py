@@ -24,7 +24,7 @@ from verifai_jax.scenes.sampling import LOCK, SEED, digest
 class OnScenes:
     """A function of Scenic's scenes as a function of features.
 
-    - `recipe`: of the program.
+    - `recipe`: the recipe of the program.
     - `function`: `(scene) -> Trace`, or `(scene, seed) -> Trace` with `seeded`.
     """
 
@@ -50,8 +50,8 @@ class SimulationRejected(RuntimeError):
 class ScenicSimulation:
     """A dynamic scenario in its simulator, and what it records as a trace.
 
-    - `recipe`: of the program.
-    - `steps`: of the simulation.
+    - `recipe`: the recipe of the program.
+    - `steps`: the number of steps of the simulation.
     - `records`: names of `record` statements; all when empty.
     - `dt`: seconds of a step; the simulator's own when None.
     """

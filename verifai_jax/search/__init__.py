@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from verifai_jax.search.gradient import Gradient as Gradient
     from verifai_jax.search.grid import Grid as Grid
     from verifai_jax.search.halton import Halton as Halton
+    from verifai_jax.search.likeliest import Likeliest as Likeliest
     from verifai_jax.search.mutation import Mutation as Mutation
     from verifai_jax.search.point_list import PointList as PointList
     from verifai_jax.search.portfolio import Portfolio as Portfolio
@@ -122,12 +123,14 @@ def to_json(search: "Search") -> dict[str, Any] | None:
         whole = rest is not None and all(part is not None for _, part in parts)
         return {"split": parts, "rest": rest} if whole else None
     options = {f.name: getattr(search, f.name) for f in fields(cast(Any, search))}
-    if kind.__name__ in ("Diverse", "Suggested"):
+    if kind.__name__ in ("Diverse", "Likeliest", "Suggested"):
         inner = to_json(options.pop("search"))
         if inner is None:
             return None
         if kind.__name__ == "Diverse":
             return {"diverse": inner, "options": options}
+        if kind.__name__ == "Likeliest":
+            return {"likeliest": inner}
         del options["suggest"]
         options["units"] = dict(options["units"])
         return {"suggested": inner, "source": cast("Suggested", search).source, "options": options}
@@ -152,6 +155,10 @@ def from_json(data: Mapping[str, Any]) -> "Search":
         from verifai_jax.search.diverse import Diverse
 
         return Diverse(from_json(data["diverse"]), **data.get("options", {}))
+    if "likeliest" in data:
+        from verifai_jax.search.likeliest import Likeliest
+
+        return Likeliest(from_json(data["likeliest"]))
     if "suggested" in data:
         from verifai_jax.search.suggested import Absent, Suggested
 

@@ -38,7 +38,7 @@ class Observations(NamedTuple):
     - `rho`: robustness; negative is a failure.
     - `valid`: False for padding and for simulations without a verdict: such a row must not
       influence the search, whatever its other entries are (NaN included).
-    - `gradient`: of the smooth robustness with respect to `u`.
+    - `gradient`: the gradient of the smooth robustness with respect to `u`.
     - `clauses`: values of the clauses to violate together, without unit, all negative in a failure;
       very low where there are fewer than `CLAUSES`.
     - `clause_gradients`: their gradients with respect to `u`; zero in rounds whose plan does not
@@ -77,7 +77,7 @@ class TraceOptions:
     **Arguments:**
 
     - `initial`: points of the prior before the model has a say.
-    - `share`: of the points that the model proposes; the others are those of the search.
+    - `share`: the share of the points that the model proposes; the others are those of the search.
     - `capacity`: maximum number of rows that the model knows, the best half and the last ones.
     - `starts`: descents for each proposal, the best one of which is simulated.
     - `steps`: steps of a descent.
@@ -113,6 +113,8 @@ class Wants:
     - `no_verdict_rows`: simulations without a verdict as valid rows whose robustness is NaN, so
       that a model of the robustness learns to stay away from them.
     - `traces`: a model of the traces that proposes some of the points, with these options.
+    - `likelihood`: an objective by which failures are the better the likelier they are, in the
+      place of the robustness.
     - `max_batch`: points in a round beyond which more rounds are worth more than larger ones. The
       default is a size at which compiled simulators run at three quarters of their greatest speed
       or more (`benchmarks/RESULTS.md`, "The engine on real dynamics").
@@ -125,6 +127,7 @@ class Wants:
     outcomes: bool = False
     no_verdict_rows: bool = False
     traces: TraceOptions | None = None
+    likelihood: bool = False
     max_batch: int = 1024
 
     @property
@@ -184,7 +187,8 @@ class Plan(NamedTuple):
       that are not valid.
     - `differentiate`: whether to compute the gradients of the clauses too, which costs as much as
       another simulation or two.
-    - `temperature`: of the smooth robustness to differentiate, row by row, without unit.
+    - `temperature`: the temperature of the smooth robustness to differentiate, row by row, without
+      unit.
     """
 
     rows: Int[Array, ""]

@@ -33,7 +33,7 @@ roundings of float32, as a constant robustness may have from the arithmetic of a
 class SeenBehaviour(NamedTuple):
     """Outcomes seen so far, and the ranges of signals in them.
 
-    - `archive`: of archived failures.
+    - `archive`: the archive of failures.
     - `best`: of the points to begin afresh from.
     - `memory`: the last outcomes, whatever the robustness; not finite where there is none.
     - `index`: row of the memory that the next one takes.
@@ -77,7 +77,7 @@ class SeenBehaviour(NamedTuple):
 
         **Arguments:**
 
-        - `outcomes`: of a round.
+        - `outcomes`: the outcomes of a round.
         - `safe`: the robustness of safe points, NaN of others.
         """
         known = is_known(outcomes)[:, None, None]

@@ -44,7 +44,7 @@ class CECompat(Search[CECompatState]):
 
     **Arguments:**
 
-    - `buckets`: of a continuous coordinate.
+    - `buckets`: the buckets of a continuous coordinate.
     - `alpha`: share that a histogram keeps of itself at each failure.
     - `threshold`: robustness below which a point is a failure; at it, it is none.
 

@@ -213,7 +213,7 @@ class CMAES(Search[CMAESState]):
         cell = jnp.sum(draw.reshape(batch, -1, 1) > limits, axis=-1).astype(jnp.int32)
         levels = np.array([cube.levels[i] for i in codes], np.int32)
         among = np.searchsorted(cube.discrete, codes)
-        cells = cube.cells(u).at[:, among].set(jnp.minimum(cell, levels - 1))
+        cells = jnp.asarray(cube.cells(u)).at[:, among].set(jnp.minimum(cell, levels - 1))
         return u.at[:, codes].set(cube.centres(cells)[:, among])
 
     def _next(self, state: CMAESState, cube: Cube) -> CMAESState:

@@ -178,7 +178,7 @@ class CrossEntropy(Search[CrossEntropyState]):
         limits = jnp.cumsum((counts + prior) / (count + 1), axis=1)
         drawn = jnp.sum(draw[:, :, None] > limits, axis=-1)
         # Inherited as often as keeps the correlation that a continuous coordinate has.
-        inherited = cube.cells(parent)
+        inherited = jnp.asarray(cube.cells(parent))
         cell = jnp.where(inherit < self.focus**2, inherited[:, narrow], drawn)
         cell = inherited.at[:, narrow].set(jnp.clip(cell, 0, levels - 1).astype(jnp.int32))
         return u.at[:, cells].set(cube.centres(cell)[:, narrow])

@@ -334,7 +334,7 @@ def learn(
 
     **Arguments:**
 
-    - `observations`: of the round, whoever proposed its points.
+    - `observations`: the observations of the round, of all its points.
     - `score`: robustness of each row, 0 for all failures, infinite for rows not to learn from.
     - `spent`: simulations of the round, one with gradients counted as two.
     - `best`: the best points of all so far and their scores.

@@ -73,7 +73,7 @@ class Diverse(Wrapper[DiverseState]):
     - `min_radius`: the radius shrinks no further.
     - `shrink`: factor on the radius, and a new beginning for the search inside, after
     - `patience` rounds that brought no new failure and came no nearer to one.
-    - `capacity`: of the archive, and so the maximum number of distinct failures.
+    - `capacity`: the capacity of the archive, and so the maximum number of distinct failures.
     - `by`: what distinct failures are far from each other in: `"inputs"`, or `"behaviour"`, for
       which the radius is a share of what can differ (`search.behaviour.unlike`).
 

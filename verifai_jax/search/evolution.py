@@ -57,7 +57,7 @@ class Evolution(NamedTuple):
 
         **Arguments:**
 
-        - `points`: of a generation.
+        - `points`: the points of a generation.
         - `weights`: recombination weights, which sum to one.
         - `worse`: weights of the points that the covariance is to shrink along, which sum to one
           or are all zero.

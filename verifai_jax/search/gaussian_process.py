@@ -259,8 +259,8 @@ def finite_factor(
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
     """Return the Cholesky factor of a covariance with as much noise as makes it finite, and that.
 
-    - `variance`: of a value; the noise is none at first, then a millionth of it, and ten times more
-      each time.
+    - `variance`: the variance of a value; the noise is zero at first, then a millionth of this
+      variance, and ten times more in each further attempt.
     """
 
     def extra(jitter: Array) -> Array:

@@ -115,9 +115,9 @@ class Gradient(Search[GradientState]):
     - `min_radius`: size of the box below which a descent ends, once it has made a step.
     - `flips`: coordinates of a corner tried the other way before a descent ends.
     - `patience`: steps in a row that are little better after which a descent ends.
-    - `temperatures`: of the smooth robustness, in units of the spread of the predicates: of the
-      first descent, which halves it with every step, then of the others in turn, where it falls
-      more slowly. A single one is that of all.
+    - `temperatures`: the temperatures of the smooth robustness, in units of the spread of the
+      predicates: of the first descent, which halves it with every step, then of the others in turn,
+      where it falls more slowly. A single one is that of all.
     - `coldest`: temperature below which it does not fall.
 
     **Raises:** `ValueError` for values out of range; `check` for a space without continuous

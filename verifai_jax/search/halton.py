@@ -102,7 +102,7 @@ def halton_points(
 
     - `index`: of the points, from 1 on (point 0 is the corner at the origin).
     - `dim`: number of coordinates.
-    - `key`: of the random permutations of digits; the sequence is plain without.
+    - `key`: the key of the random permutations of digits; the sequence is plain without.
     - `skip_bases`: number of primes left out before the base of the first coordinate.
     """
     bases = np.array(primes(skip_bases + dim)[skip_bases:], np.uint32)

@@ -150,7 +150,7 @@ class Proposals:
 
         - `rho`: robustness of each point.
         - `valid`: False for simulations without a verdict.
-        - `gradient`: of the smooth robustness, for a search that wants it.
+        - `gradient`: the gradient of the smooth robustness, for a search that wants it.
         - `clauses`, `clause_gradients`: for a search that wants clauses; see `Observations`.
         - `coverage_ids`: for a search that wants them, as many as the constructor was given.
         - `outcomes`: for a search that wants them.

@@ -43,7 +43,7 @@ class Suggested(Wrapper[PyTree]):
     - `rows`: maximum number of rows of the table that a question holds, the last ones.
     - `worst`: rows with the lowest robustness that a question holds with their traces. Each is
       simulated once more for it.
-    - `units`: of features, by name, such as `{"mass": "kg"}`; for the question alone.
+    - `units`: the units of features, by name, such as `{"mass": "kg"}`; for the question alone.
     - `context`: whatever else the function should know; for the question alone.
     - `strict`: end the run at a suggestion that cannot be simulated. Otherwise it is left out, the
       notes of the run say so, and so does the next question.

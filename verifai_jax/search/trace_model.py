@@ -68,7 +68,7 @@ class TraceModel(NamedTuple):
     - `hyper`: hyper-parameters.
     - `x`: points of the rows, about zero.
     - `mask`: which rows are present.
-    - `coefficients`: of the components, by row.
+    - `coefficients`: the coefficients of the components, by row.
     - `factor`: Cholesky factor of the covariance of the rows.
     - `scale`: standard deviations of the components under the process.
     - `mean`, `components`: the mean trace, and the components as traces.
@@ -166,7 +166,7 @@ def draw(
 
     **Arguments:**
 
-    - `count`: of simulators.
+    - `count`: the number of simulators.
     - `guess`: whether the first one is the posterior's mean.
     - `spread`: factor on the posterior's standard deviations; more than 1 where the model has been
       too sure of itself. The mean, and the rows that it goes through, stay.

@@ -21,7 +21,7 @@ from verifai_jax.core.checks import check_fraction
 class PairedDifference:
     """The mean of differences of pairs, with an interval.
 
-    - `mean`: of the differences; NaN without a pair.
+    - `mean`: the mean of the differences; NaN without a pair.
     - `low`, `high`: bounds of the expected difference; NaN with fewer than two pairs, which say
       nothing of how much a difference varies.
     - `pairs`: differences in the mean.

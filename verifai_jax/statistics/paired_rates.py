@@ -14,9 +14,11 @@ percentages, Psychometrika 12, 1947, with a test that may be looked at after eve
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from verifai_jax.core.checks import check_fraction
+from verifai_jax.statistics.binomial import Rate, clopper_pearson
 from verifai_jax.statistics.confidence_sequences import anytime_interval
 
 
@@ -26,7 +28,8 @@ class PairedRates:
 
     - `only_first`, `only_second`: pairs in which only one of the two fails.
     - `pairs`: in all.
-    - `low`, `high`: bounds of the difference; they hold whatever decided when sampling ended.
+    - `low`, `high`: bounds of the difference.
+    - `at_any_time`: whether they hold whatever decided when sampling ended.
     - `confidence`: probability with which they do.
     - `undecided`: further pairs without both verdicts, among `pairs`; the lower bound takes them
       for failures of the first alone, and the upper bound for failures of the second alone.
@@ -39,6 +42,7 @@ class PairedRates:
     high: float
     confidence: float
     undecided: int = 0
+    at_any_time: bool = True
 
     @property
     def estimate(self) -> float:
@@ -52,7 +56,7 @@ class PairedRates:
         ends = sorted(100 * end if points >= 0 else -100 * end for end in (self.low, self.high))
         return (
             f"{abs(points):z.3g} points {more} ({100 * self.confidence:zg} % interval "
-            f"{ends[0]:z.3g} to {ends[1]:z.3g}, whenever stopped)"
+            f"{ends[0]:z.3g} to {ends[1]:z.3g}{', whenever stopped' if self.at_any_time else ''})"
         )
 
 
@@ -62,6 +66,7 @@ def paired_rates(
     pairs: int,
     confidence: float = 0.95,
     undecided: int = 0,
+    at_any_time: bool = True,
 ) -> PairedRates:
     """Compute the interval of a difference of failure rates on paired samples.
 
@@ -71,6 +76,8 @@ def paired_rates(
     - `pairs`: in all; anything may have decided their number.
     - `confidence`: probability with which the interval is to hold at all times together.
     - `undecided`: further pairs without both verdicts.
+    - `at_any_time`: False for a number of pairs that was fixed beforehand, of which the interval is
+      narrower.
 
     **Returns:** the `PairedRates`.
 
@@ -84,19 +91,29 @@ def paired_rates(
             f"at least one; got {only_first}, {only_second} and {undecided} of {pairs}"
         )
     check_fraction("confidence", confidence)
-    low = _bound(only_first + undecided, only_second, pairs, confidence, -1)
-    high = _bound(only_first, only_second + undecided, pairs, confidence, 1)
-    return PairedRates(only_first, only_second, pairs, low, high, confidence, undecided)
+    interval = anytime_interval if at_any_time else clopper_pearson
+    low = _bound(interval, only_first + undecided, only_second, pairs, confidence, -1)
+    high = _bound(interval, only_first, only_second + undecided, pairs, confidence, 1)
+    return PairedRates(
+        only_first, only_second, pairs, low, high, confidence, undecided, at_any_time
+    )
 
 
-def _bound(first: int, second: int, pairs: int, confidence: float, side: int) -> float:
+def _bound(
+    interval: Callable[[int, int, float], Rate],
+    first: int,
+    second: int,
+    pairs: int,
+    confidence: float,
+    side: int,
+) -> float:
     """Return the least (-1) or greatest (1) difference that is not rejected."""
     each = 1 - (1 - confidence) / 2
     discordant = first + second
-    often = anytime_interval(discordant, pairs, each)
+    often = interval(discordant, pairs, each)
     share = float(side > 0)
     if discordant:
-        part = anytime_interval(second, discordant, each)
+        part = interval(second, discordant, each)
         share = part.high if side > 0 else part.low
     lean = 2 * share - 1
     return lean * (often.high if lean * side > 0 else often.low)

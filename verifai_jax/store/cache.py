@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from verifai_jax.core.atomic_files import reason
 from verifai_jax.core.sources import Sources, list_changes
 from verifai_jax.store.files import DamagedError
 from verifai_jax.store.locks import write_lock
@@ -114,7 +115,7 @@ class Cache:
     def note(self, name: str, value: object = None) -> Any:
         """Return the plain data stored under a name, after storing `value` where one is given."""
         if value is not None:
-            with self._writing():
+            with self.writing():
                 self._log.put_json(f"{_NOTE}{name}", value)
         return self._log.get_json(f"{_NOTE}{name}")
 
@@ -127,7 +128,7 @@ class Cache:
 
     def put(self, entries: Mapping[str, Arrays]) -> None:
         """Store finished computations, all or none of them."""
-        with self._writing():
+        with self.writing():
             self._log.put(entries)
         self.computed += len(entries)
         self._own.update(entries)
@@ -174,13 +175,16 @@ class Cache:
         return sorted(name for name in self._log.names() if not name.startswith(_NOTE))
 
     @contextlib.contextmanager
-    def _writing(self) -> Iterator[None]:
+    def writing(self, path: str | Path | None = None) -> Iterator[None]:
+        """Raise `CacheError` where the file system refuses the cache, or results at `path`."""
         try:
             yield
         except OSError as error:
+            where = self.path if path is None else path
             raise CacheError(
-                f"{self.path} cannot be written: {error.strerror or error}; what was finished is "
-                "in it: make room if the disk is full, and begin again"
+                f"{where} cannot be written: {reason(error)}; what was finished is in "
+                f"{'it' if path is None else self.path}: make room if the disk is full, and begin "
+                "again"
             ) from error
 
 

@@ -7,11 +7,14 @@ read_record(path)                               # DamagedError, where it has cha
 
 import contextlib
 import json
+import shutil
+import tempfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from verifai_jax.core.atomic_files import replacing, unwritable
 from verifai_jax.core.text import one_line
 
 if TYPE_CHECKING:
@@ -33,30 +36,60 @@ def checksum(content: "bytes | memoryview | pa.Buffer", before: int = 0) -> int:
     return zlib.crc32(content, before)
 
 
-def write_complete(path: Path, content: "pa.Buffer | bytes") -> Path:
+def write_complete(path: Path, content: "pa.Buffer | bytes", locked: bool = True) -> Path:
     """Write a file such that a reader never meets a half of it; return its path.
 
-    **Raises:** `OSError` where it cannot be written; what was at `path` stays.
+    - `locked`: as of `replacing`. A folder that is gone stays so then: the files of a run are of
+      use together.
+
+    **Raises:** `OSError` where it cannot be written, as `replacing`; what was at `path` stays.
     """
-    partial = path.with_name(f".{path.name}.part")  # Readers of a folder leave it out.
-    try:
-        with open(partial, "wb") as file:
-            file.write(content)
-        partial.replace(path)
-    except OSError:
-        with contextlib.suppress(OSError):  # What little room there is, others need.
-            partial.unlink(missing_ok=True)
-        raise
+    with replacing(path, locked=locked) as partial:
+        partial.write_bytes(content)
     return path
 
 
-def write_record(path: Path, record: Mapping[str, Any]) -> dict[str, Any]:
+@contextlib.contextmanager
+def replacing_all(folder: Path, names: Sequence[str]) -> Iterator[Path]:
+    """Yield a folder for files that take the place of those in `folder` once all are whole.
+
+    So a full disk leaves what was there, and nothing of what was to come.
+
+    **Arguments:**
+
+    - `folder`: which is there, and has no other writer.
+    - `names`: the names of all files and folders that belong together, also those that may be
+      missing. The last one is that without which the others are worth nothing: it goes first and
+      comes last.
+
+    **Raises:** `OSError` that names `folder`, for whatever the file system refuses.
+    """
+    *others, last = names
+    try:
+        with tempfile.TemporaryDirectory(prefix=".part-", dir=folder) as made:
+            yield Path(made)
+            for name in (last, *others):
+                old = folder / name
+                if old.is_dir() and not old.is_symlink():
+                    shutil.rmtree(old)
+                else:
+                    old.unlink(missing_ok=True)
+            for name in (*others, last):
+                if (new := Path(made) / name).exists():
+                    new.replace(folder / name)
+    except OSError as error:
+        raise unwritable(folder, error, "The results are in memory all the same") from error
+
+
+def write_record(path: Path, record: Mapping[str, Any], locked: bool = True) -> dict[str, Any]:
     """Write plain data as JSON with a checksum, whole; return it as it is read back.
+
+    - `locked`: as of `write_complete`.
 
     **Raises:** `OSError` where it cannot be written.
     """
     stored = json.loads(json.dumps(record))
-    write_complete(path, f"{json.dumps(sealed(stored), indent=2)}\n".encode())
+    write_complete(path, f"{json.dumps(sealed(stored), indent=2)}\n".encode(), locked)
     return stored
 
 

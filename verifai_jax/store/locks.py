@@ -17,6 +17,8 @@ from collections.abc import Iterator
 from io import FileIO
 from pathlib import Path
 
+from verifai_jax.core.atomic_files import reason
+
 try:
     import fcntl
 except ImportError:
@@ -72,7 +74,7 @@ def writing(folder: Path | None) -> Iterator[None]:
         yield
     except OSError as error:
         raise ValueError(
-            f"folder {str(folder)!r} cannot be written ({error.strerror or error}); give one that "
+            f"folder {str(folder)!r} cannot be written ({reason(error)}); give one that "
             "can be, or none to keep the results in memory"
         ) from error
 

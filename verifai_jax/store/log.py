@@ -26,6 +26,7 @@ from typing import IO, Any, TypeAlias
 
 import numpy as np
 
+from verifai_jax.core.atomic_files import append_to, unwritable
 from verifai_jax.store.files import DamagedError, checksum, write_complete
 
 Arrays: TypeAlias = Mapping[str, np.ndarray]
@@ -73,16 +74,9 @@ class Log:
                 self._file = FileIO(self.path, "a")
                 # Not `__del__`: in a cycle of references the file may be collected before the log.
                 self._close_file = weakref.finalize(self, self._file.close)
-            begin, rest = self._file.seek(0, os.SEEK_END), memoryview(frame)
-            try:
-                while rest:
-                    rest = rest[self._file.write(rest) :]
-            except OSError:
-                with contextlib.suppress(OSError):  # What little room there is, others need.
-                    self._file.truncate(begin)
-                raise
+            begin = append_to(self._file, frame)
         except OSError as error:
-            raise type(error)(error.errno, error.strerror, str(self.path)) from error
+            raise unwritable(self.path or "", error) from error
         if self._extents is not None:
             self._extents.update(_extents(frame, begin))
 

@@ -66,9 +66,9 @@ def sweep(
       worst robustness, then the return.
     - `configurations`: number of configurations at most; each is trained once for each of the
       study's seeds.
-    - `seed`: of the search and of the samples; training seeds are the study's.
+    - `seed`: the seed of the search and of the samples; training seeds are the study's.
     - `samples`: samples of each policy in its certification, at least.
-    - `confidence`: of all verdicts together, between 0 and 1.
+    - `confidence`: the confidence of all verdicts together, between 0 and 1.
     - `budget`: samples of the certification in all; see `certify`.
     - `attack`, `attack_simulations`: the search that tries to make each policy fail first, and its
       simulations of each policy; the failures that it finds enter no rate.

@@ -28,7 +28,7 @@ class Clock:
 
     **Arguments:**
 
-    - `name`: of the sweep, before the progress bar.
+    - `name`: the name of the sweep, before the progress bar.
     - `max_seconds`: after which `check` raises `OutOfTime`; None for no limit.
     - `show`: whether to draw a bar; None draws one on a terminal and in a notebook.
     """
@@ -53,9 +53,9 @@ class Clock:
 
         **Arguments:**
 
-        - `name`: of the stage.
+        - `name`: the name of the stage.
         - `total`: units of work in it, and `unit`, their name.
-        - `share`: of `max_seconds`, after which the stage is out of time.
+        - `share`: the share of `max_seconds`, after which the stage is out of time.
         """
         began, compiling = time.perf_counter(), self.seconds[COMPILING]
         if self._until is not None:

@@ -53,7 +53,7 @@ def curve_trace(
     **Arguments:**
 
     - `steps`: environment steps taken by the end of each update.
-    - `mean_return`: of the episodes that ended in each update; NaN where none did.
+    - `mean_return`: the mean return of the episodes that ended in each update; NaN where none did.
 
     **Returns:** the trace, whose time is environment steps.
 

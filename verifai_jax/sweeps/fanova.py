@@ -34,8 +34,8 @@ class Shares(NamedTuple):
     """Shares of a function's variance; NaN for a constant function.
 
     - `first`: of each input, the share that goes away when the input is known.
-    - `total`: of each input, the share that stays when all other inputs are known.
-    - `variance`: of the function.
+    - `total`: for each input, the share that stays when all other inputs are known.
+    - `variance`: the variance of the function.
     """
 
     first: Float[np.ndarray, " d"]
@@ -50,7 +50,7 @@ def leaf_boxes(
 
     **Arguments:**
 
-    - `forest`: of scikit-learn, fitted.
+    - `forest`: the forest of scikit-learn, fitted.
     - `edges`: borders of the cells of each input, to the nearest of which thresholds move; None for
       a continuous input.
     """

@@ -49,7 +49,8 @@ class Halving:
 
         **Arguments:**
 
-        - `objective`: of each configuration, by its number; the least is best, and NaN is worst.
+        - `objective`: the objective of each configuration, by its number; the least is best, and
+          NaN is worst.
 
         **Returns:** numbers of the configurations, in ascending order; of equal ones the first
         continue.

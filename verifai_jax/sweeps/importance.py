@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.core.lazy import lazy_import
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.statistics.confidence_sequences import verdict_kind
@@ -58,7 +59,7 @@ MAX_CELLS = 8
 
 
 @dataclass(frozen=True, eq=False)
-class HyperparameterImportance:
+class HyperparameterImportance(InNotebook):
     """The importance of each hyper-parameter for failing and for the return.
 
     **Fields:**
@@ -73,7 +74,7 @@ class HyperparameterImportance:
     - `missing`: reasons for a missing model, by target.
     - `unsafe`, `safe`: principal components of these configurations; None for fewer than five.
     - `configurations`: their number.
-    - `name`: of the study.
+    - `name`: the name of the study.
     """
 
     table: "pd.DataFrame"
@@ -170,7 +171,7 @@ class HyperparameterImportance:
 class _Input:
     """One hyper-parameter as the models see it.
 
-    - `name`: of the hyper-parameter.
+    - `name`: the name of the hyper-parameter.
     - `values`: coordinates in [0, 1].
     - `edges`: borders of the cells of a discrete one; None for a continuous one.
     - `ordered`: True for numbers, False for choices.
@@ -201,10 +202,10 @@ def hyperparameter_importance(
       and the hyper-parameters.
     - `hyperparameters`: names of their columns; those that do not vary are left out. `steps` is
       one of them where it varies.
-    - `space`: of the study; None scales columns between their least and greatest entries.
-    - `name`: of the study.
+    - `space`: the space of the study; None scales columns between their least and greatest entries.
+    - `name`: the name of the study.
     - `repeats`: number of times that the folds are drawn and each column is shuffled.
-    - `seed`: of folds, shuffles and forests.
+    - `seed`: the seed of folds, shuffles and forests.
     """
     import pandas as pd
 

@@ -62,8 +62,8 @@ class OptunaSampler:
 
         **Arguments:**
 
-        - `space`: of the hyper-parameters.
-        - `seed`: of the sampler.
+        - `space`: the space of the hyper-parameters.
+        - `seed`: the seed of the sampler.
         - `batch`: configurations in a round.
 
         **Raises:** `MissingExtra` without Optuna or a package that the sampler needs; `TypeError`
@@ -86,7 +86,7 @@ class OptunaProposer:
 
     - `description`: the sampler by name and options.
     - `sampler`: Optuna's own object.
-    - `space`: of the hyper-parameters.
+    - `space`: the space of the hyper-parameters.
     - `batch`: configurations in a round.
     """
 

@@ -57,10 +57,10 @@ def export_to_optuna(
 
     - `configurations`: one row for each, as `Sweep.configurations`.
     - `hyperparameters`: names of their columns.
-    - `space`: of the hyper-parameters, where it is known.
+    - `space`: the space of the hyper-parameters, where it is known.
     - `used`: names of the hyper-parameters of each algorithm; empty if all have all.
-    - `name`: of the study.
-    - `storage`: of the study; in memory when left out.
+    - `name`: the name of the study.
+    - `storage`: the storage of the study; in memory when left out.
 
     **Raises:** `MissingExtra` without Optuna.
     """

@@ -67,9 +67,9 @@ def make_proposer(
     **Arguments:**
 
     - `search`: a name, `"optuna:NAME"`, a `Search`, or an `OptunaSampler`.
-    - `space`: of the hyper-parameters.
+    - `space`: the space of the hyper-parameters.
     - `configurations`: number of proposals in all.
-    - `seed`: of the proposals.
+    - `seed`: the seed of the proposals.
     - `batch`: configurations in a round.
 
     **Returns:** the proposer.

@@ -66,18 +66,18 @@ class SweepRecord:
     """The table of a sweep and everything that belongs to its rows. A row is one policy.
 
     - `study`: name of the study.
-    - `seed`: of the sweep.
+    - `seed`: the seed of the sweep.
     - `columns`: the table, name -> column `[rows]`, in order: `BEFORE`, the hyper-parameters,
       `AFTER`. Unknown numbers are NaN, unknown texts empty. `steps` are the wanted ones.
     - `hyperparameters`: columns that the space of the study gave; `steps` is that of `BEFORE`.
-    - `policies`: of each row, on the host; None if there is none.
+    - `policies`: the policies of each row, on the host; None if there is none.
     - `worst`: features of each row with the least robustness, as `space.rows` writes them; None
       where nothing was simulated.
     - `curves`: learning curve of each training run, by `(configuration, seed)`.
     - `certificates`: result of the certification; None if nothing was certified.
     - `certified`: rows of the certified policies, in the order of the certification.
     - `options`: options of the sweep, plain data.
-    - `version`: of verifai_jax.
+    - `version`: the version of verifai_jax.
     - `seconds`: wall-clock time of each stage, such as `training` and `certifying`.
     - `complete`: False where the sweep was interrupted or out of time.
     - `sources`: what the study was made of when the sweep began, and again where it went on with
@@ -112,6 +112,6 @@ def algorithm_uses(used: Mapping[str, Sequence[str]], algorithm: object, name: s
 
     - `used`: names of the hyper-parameters of each algorithm; one that is missing has all.
     - `algorithm`: name of the algorithm; None has all.
-    - `name`: of the hyper-parameter.
+    - `name`: the name of the hyper-parameter.
     """
     return name in used.get(str(algorithm), (name,))

@@ -58,7 +58,7 @@ class Sweep(Drawn):
 
     - `record`: everything that was trained and certified, as plain data.
     - `study`: the study that was swept; None for a loaded sweep without it.
-    - `space`: of the hyper-parameters; the study's if left out, None if it is not known.
+    - `space`: the space of the hyper-parameters; the study's if left out, None if it is not known.
     - `folder`: place on disk of a loaded sweep.
     - `failing`: counterexamples of each row of a loaded sweep, by its number; others have
       certificates.
@@ -224,7 +224,7 @@ class Sweep(Drawn):
         **Arguments:**
 
         - `repeats`: number of times that the folds are drawn and each column is shuffled.
-        - `seed`: of folds, shuffles and forests.
+        - `seed`: the seed of folds, shuffles and forests.
         """
         table = self.table
         if self.used:
@@ -359,8 +359,9 @@ class Sweep(Drawn):
 
         **Arguments:**
 
-        - `path`: of the HTML file.
-        - `options`: of `reports.write_report`: `units` and `reasons` of hyper-parameters.
+        - `path`: the path of the HTML file.
+        - `options`: the options of `reports.write_report`: `units` and `reasons` of
+          hyper-parameters.
 
         **Returns:** the path.
         """
@@ -394,7 +395,7 @@ class Sweep(Drawn):
 
         - `storage`: place where Optuna stores it, such as `"sqlite:///sweep.db"`; memory when left
           out.
-        - `name`: of the study there; the sweep's own when left out.
+        - `name`: the name of the study there; the sweep's own when left out.
 
         **Raises:** `MissingExtra` without the package.
         """

@@ -27,7 +27,7 @@ class Row:
     - `entry`: numbers of the training run and of its checkpoint.
     - `checkpoint`: the run there; None if it did not train.
     - `nominal_return`: mean return on the nominal task; NaN where it is not known.
-    - `safety`: of the policy; None if it was not certified.
+    - `safety`: the safety of the policy; None if it was not certified.
     """
 
     configuration: int

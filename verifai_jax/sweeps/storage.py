@@ -54,7 +54,7 @@ class StoredSweep(NamedTuple):
     """The contents of a sweep's folder.
 
     - `record`: table, policies, curves and options; without certificates once it was read.
-    - `space`: of the hyper-parameters, where it is known.
+    - `space`: the space of the hyper-parameters, where it is known.
     - `used`: names of the hyper-parameters of each algorithm; empty if all have all.
     - `failing`: counterexamples of all rows, with a column `row`.
     """
@@ -76,20 +76,19 @@ def write_sweep(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> Pat
 
     **Returns:** the folder.
 
-    **Raises:** `FolderInUse` where another process writes it.
+    **Raises:** `FolderInUse` where another process writes it; `OSError` for what the file system
+    refuses, which leaves what was there.
     """
-    with write_lock(folder):
-        _write_files(stored, table, folder)
+    # The record comes last: a folder without it holds no sweep.
+    names = (TABLE, FAILING, CURVES, POLICIES, RECORD)
+    with write_lock(folder), files.replacing_all(folder, names) as made:
+        _write_files(stored, table, made)
     return folder
 
 
 def _write_files(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> None:
     record = stored.record
-    # The record is written last: a folder without it holds no sweep.
-    (folder / RECORD).unlink(missing_ok=True)
-    (folder / POLICIES).mkdir(exist_ok=True)
-    for old in (folder / POLICIES).glob("*.npz"):
-        old.unlink()
+    (folder / POLICIES).mkdir()
     mixed = _mixed_columns(table)
     texts = {name: [json.dumps(plain(v)) for v in table[name]] for name in mixed}
     table.assign(**texts).to_parquet(folder / TABLE)
@@ -169,7 +168,7 @@ def read_sweep(description: Mapping[str, Any], folder: Path) -> StoredSweep:
 
     **Arguments:**
 
-    - `description`: of the folder, as `read_description` returns it.
+    - `description`: the description of the folder, as `read_description` returns it.
     - `folder`: the folder.
 
     **Raises:** `SweepFileError` where a file is missing or damaged.

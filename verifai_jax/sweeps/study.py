@@ -17,6 +17,7 @@ from typing import Any
 
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.source_collection import made_here, sources_of
 from verifai_jax.core.sources import Maker, Sources
 from verifai_jax.features import FeatureSpace
@@ -30,13 +31,13 @@ from verifai_jax.sweeps.trainer import STEPS, StudyError, Trainer
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class Study:
+class Study(InNotebook):
     """A sweep to be made: hyper-parameters, their trainer, and the safety of a policy.
 
     **Arguments:**
 
     - `name`: name on the command line and in results.
-    - `space`: of the hyper-parameters; a `FeatureSpace`, or a dictionary of domains.
+    - `space`: the space of the hyper-parameters; a `FeatureSpace`, or a dictionary of domains.
     - `trainer`: the task and the algorithms.
     - `problem`: from a policy to the problem of its closed loop. JAX may trace the policy's
       weights.

@@ -40,7 +40,7 @@ class RunCheckpoint:
     - `policy`: the policy, on the host.
     - `finite`: False where one of its numbers is not finite.
     - `curve`: learning curve from the beginning up to the checkpoint.
-    - `seconds`: of one core, without compilation.
+    - `seconds`: the processor time in seconds on one core, without compilation.
     """
 
     policy: TrainedPolicy

@@ -84,7 +84,7 @@ def attack(
     - `limits`: simulations at most.
     - `search`: over the environment.
     - `batch`: environments that the search proposes at once.
-    - `seed`: of the search.
+    - `seed`: the seed of the search.
     - `region`: where the environment is attacked.
     - `enough`: environments after which the search stops.
     - `scale`: size of ordinary robustnesses, to which temperatures are relative.

@@ -32,7 +32,7 @@ class HeldOut:
     - `without_verdict`: simulations that did not end properly; the upper end of the rate's interval
       takes them for failures.
     - `lowest` robustness, None without a verdict.
-    - `rate`: of failures, with its 95 % interval; None without any verdict.
+    - `rate`: the rate of failures, with its 95 % interval; None without any verdict.
     """
 
     simulations: int

@@ -68,7 +68,7 @@ class FeatureParameters:
     **Arguments:**
 
     - `problem`: on the backend that it is to run on.
-    - `names`: of the features that are parameters; all that vary when left out.
+    - `names`: the names of the features that are parameters; all that vary when left out.
     - `batch`: simulations at once.
     - `gradient`: whether gradients may be asked for.
 

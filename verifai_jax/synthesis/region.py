@@ -32,7 +32,7 @@ class Region:
 
     - `parameters`, `features`: names of what is chosen, and of what the environment varies.
     - `tailed`: of each coordinate, whether its feature has tails.
-    - `names`: of the features that have.
+    - `names`: the names of the features with tails.
     - `mass`: probability of the region, 1 for the whole cube.
     """
 

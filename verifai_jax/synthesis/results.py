@@ -163,7 +163,7 @@ class RepairEstimates(NamedTuple):
 
     **Fields:**
 
-    - `name`: of the problem.
+    - `name`: the name of the problem.
     - `before`, `after`: an `Estimate` each.
     """
 

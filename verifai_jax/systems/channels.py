@@ -28,7 +28,7 @@ class Instant(NamedTuple):
     """The instant at which something passes.
 
     - `time`: in seconds; `period`: between two of them.
-    - `features`: of the simulation.
+    - `features`: the features of the simulation.
     - `xp`: `jax.numpy`, or `numpy` on the host.
     """
 
@@ -158,7 +158,7 @@ class Passing(NamedTuple):
 
     - `observation`, `action`: forms, as `jax.ShapeDtypeStruct`s.
     - `period`: seconds between two decisions; `duration`: of a simulation.
-    - `names`: of numbers with a name of their own, in addition to the names of the parts.
+    - `names`: the names of single numbers, in addition to the names of the parts.
     - `hidden`: parts of an observation that the whole of it does not include, such as the time.
     """
 
@@ -229,7 +229,7 @@ class Entries(NamedTuple):
     """Numbers within an observation or an action: of some leaves, the entries at flat indices.
 
     - `whole`: whether they are whole numbers, such as choices.
-    - `names`: of the leaves, where single ones were named.
+    - `names`: the names of the leaves, where single ones were named.
     """
 
     side: Side

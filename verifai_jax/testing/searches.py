@@ -28,7 +28,7 @@ def check_search(
     - `cube`: that it searches.
     - `batch`: points in a round.
     - `rounds`: number of rounds.
-    - `seed`: of its random key.
+    - `seed`: the seed of its random key.
 
     **Raises:** `AssertionError` naming the broken law.
     """

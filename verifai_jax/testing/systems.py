@@ -21,9 +21,9 @@ def check_system(
     **Arguments:**
 
     - `system`: to check, as `Problem` takes it.
-    - `space`: of the features that it takes.
+    - `space`: the space of the features that it takes.
     - `samples`: number of random features.
-    - `seed`: of features and keys.
+    - `seed`: the seed of features and keys.
     - `tolerance`: difference of signals between the ways to simulate, relative to their largest
       value.
 

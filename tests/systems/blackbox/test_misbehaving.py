@@ -88,6 +88,15 @@ def test_every_exception_is_the_same_row_in_every_path(pooled):
         said.encode()
 
 
+def test_codes_of_many_simulations_are_an_error_of_the_row():
+    def simulate(features):
+        return Trace({"x": np.ones(5)}, dt=1.0, valid=np.array([3, 4]))
+
+    outcome = outcome_of(lambda: blackbox(simulate)({"a": 1.0}))
+    assert outcome.status == Status.ERROR
+    assert "valid must be one number for a simulation; got shape [2]" in outcome.message
+
+
 def test_ctrl_c_is_no_row():
     def interrupted(features):
         raise KeyboardInterrupt

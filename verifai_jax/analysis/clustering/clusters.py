@@ -32,6 +32,7 @@ from verifai_jax.analysis.data.samples import (
 )
 from verifai_jax.core.checks import check_count, check_positive
 from verifai_jax.core.figure import Drawn
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_features, format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
@@ -46,7 +47,7 @@ _STARTS = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Clusters(Drawn):
+class Clusters(Drawn, InNotebook):
     """A partition of `samples`.
 
     **Fields:** `assigned` `[n]`: cluster of each row looked at, 0 the largest, -1 noise; `method`;
@@ -182,8 +183,8 @@ def clusters(
     - `count`: number of clusters; by default that from 2 to `max_clusters` with the greatest
       silhouette (Rousseeuw, Journal of Computational and Applied Mathematics 20, 1987), or 1 if
       none is above 0.25, or there are less than three rows. It is chosen on at most 5000 rows.
-    - `radius`: of DBSCAN, by default the knee of the distances to the k-th neighbour, where k is
-      twice the number of columns, and 4 at least.
+    - `radius`: the radius of DBSCAN, by default the knee of the distances to the k-th neighbour,
+      where k is twice the number of columns, and 4 at least.
     - `seed`: an integer, a NumPy generator or a `jax.random` key.
     - `scale`: as in `Samples.scaling`.
     - `max_clusters`: clusters at most, where `count` is left out.

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from verifai_jax.analysis.data.marginals import Marginal
 from verifai_jax.analysis.data.samples import Samples
@@ -26,7 +26,8 @@ class Cells(NamedTuple):
     """One feature cut into cells.
 
     **Fields:** `name` of the feature; `ids` `[n]`: cell of each row, -1 where absent; `prior` of
-    the cells; `marginal` of the feature; `single_values`: whether each cell is one value.
+    the cells; `marginal` of the feature; `single_values`: whether each cell is one value; `volume`:
+    shares of the range that the cells take.
     """
 
     name: str
@@ -34,6 +35,7 @@ class Cells(NamedTuple):
     prior: Float[np.ndarray, " cells"]
     marginal: Marginal
     single_values: bool
+    volume: Float[np.ndarray, " cells"]
 
 
 def cut(samples: Samples, parts: Sequence[Marginal], count: int) -> list[Cells]:
@@ -43,12 +45,16 @@ def cut(samples: Samples, parts: Sequence[Marginal], count: int) -> list[Cells]:
         name = part.column.name
         if part.edges is not None and (part.count <= MAX_VALUES or not part.column.ordered):
             ids, prior = part.cells(samples), np.diff(part.edges)
-            found.append(Cells(name, ids, prior, part, True))
+            volume = np.full(len(prior), 1 / len(prior))
+            found.append(Cells(name, ids, prior, part, True, volume))
         else:
             ids = np.clip(np.floor(part.unit(samples) * count), 0, count - 1).astype(np.int64)
             absent = samples.frame[name].isna().to_numpy()
             prior = np.full(count, 1 / count)
-            found.append(Cells(name, np.where(absent, -1, ids), prior, part, False))
+            inner = [float(part.value(k / count)) for k in range(1, count)]
+            ends = np.array([part.column.near, *inner, part.column.far], float)
+            volume = np.diff(ends) / (ends[-1] - ends[0])
+            found.append(Cells(name, np.where(absent, -1, ids), prior, part, False, volume))
     return found
 
 
@@ -82,6 +88,7 @@ def count_occupied(
         prior = one.prior if allowed is None else _shares(_count(allowed[i], len(one.prior)))
         real = seen | (prior > 0)
         table[i, :3] = real.sum(), np.mean(seen[real]), np.mean(_chance(prior[real], n))
+        table[i, 5:7] = _part(seen, prior), _part(seen, one.volume * real)
         if one.single_values:
             never = np.flatnonzero(real & ~seen)
             missing += len(never)
@@ -95,7 +102,15 @@ def count_occupied(
             pair = np.outer(one.prior, other.prior)
             pair = pair if allowed is None else _shares(possible[block])
             real = both | (pair > 0)
-            shares.append((np.mean(both[real]), np.mean(_chance(pair[real], n))))
+            volume = np.outer(one.volume, other.volume) * real
+            shares.append(
+                (
+                    np.mean(both[real]),
+                    np.mean(_chance(pair[real], n)),
+                    _part(both, pair),
+                    _part(both, volume),
+                )
+            )
             if i < j and one.single_values and other.single_values:
                 # A value that was never tried is not listed again with all of its partners.
                 alive = np.outer(both.any(axis=1), both.any(axis=0))
@@ -105,7 +120,7 @@ def count_occupied(
                     first = (one.name, one.marginal.shown(a))
                     untried.append((*first, other.name, other.marginal.shown(b)))
         if shares:
-            table[i, 3:] = np.mean(shares, axis=0)
+            table[i, [3, 4, 7, 8]] = np.mean(shares, axis=0)
     untried.sort(key=lambda entry: entry[2] != "")
     index = pd.Index([c.name for c in rows], name="feature")
     heads = ["feature", "value", "other", "other_value"]
@@ -116,7 +131,15 @@ def count_occupied(
     )
 
 
-_COLUMNS = ("cells", "occupied", "expected", "pairs", "expected_pairs")
+_COLUMNS = (
+    *("cells", "occupied", "expected", "pairs", "expected_pairs"),
+    *("mass", "volume", "pairs_mass", "pairs_volume"),
+)
+
+
+def _part(seen: Bool[np.ndarray, "*cells"], size: Float[np.ndarray, "*cells"]) -> float:
+    """Return the share of the size of all cells that those with rows have."""
+    return float(size[seen].sum() / max(size.sum(), 1e-300))
 
 
 def _ids(rows: list[Cells]) -> Int[np.ndarray, "n d"]:

@@ -33,9 +33,9 @@ def gradient_sensitivity(
     a chaotic system suffice for. `slope` is the mean gradient, whose sign tells which way is worse;
     `typical` the median of its size. NaN for discrete coordinates, which have no gradient.
 
-    - `temperature`: of the smooth robustness that is differentiated; by default a hundredth of the
-      standard deviation of the robustness. The bound holds for the smooth robustness, and as far
-      as the gradients of the system are its true ones.
+    - `temperature`: the temperature of the smooth robustness that is differentiated; by default a
+      hundredth of the standard deviation of the robustness. The bound holds for the smooth
+      robustness, and as far as the gradients of the system are its true ones.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
     Source: Sobol and Kucherenko, Derivative based global sensitivity measures and their link with

@@ -70,6 +70,10 @@ class TraceForm:
         """
         if not isinstance(trace, Trace):
             raise TypeError(f"the system must return a Trace; it returned {type(trace).__name__}")
+        for code, value in (("valid", trace.valid), ("status", trace.status)):
+            shape = [] if value is None else list(np.asarray(value).shape)
+            if shape:
+                raise ValueError(f"{code} must be one number for a simulation; got shape {shape}")
         signals = {name: np.asarray(signal) for name, signal in trace.signals.items()}
         for name, signal in signals.items():
             if signal.dtype.kind not in "biuf":

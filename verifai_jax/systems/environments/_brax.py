@@ -165,9 +165,9 @@ def brax(
     - `policy`: `observation -> action`, or `(observation, key) -> action` for a random one; a
       function, or an object with a method `act`, such as an `rl.Policy`. An argument `features`
       gets the features of the instant.
-    - `steps`: of the episode at most, or `duration` in seconds. The trace has a sample after the
-      reset and after each step, and its last valid sample is the one at which the environment is
-      done.
+    - `steps`: the maximum number of steps of the episode, or `duration` in seconds. The trace has a
+      sample after the reset and after each step, and its last valid sample is the one at which the
+      environment is done.
     - `backend`: `"generalized"`, `"spring"`, `"positional"` or `"mjx"`, for an environment by name;
       its own default when left out.
     - `features`: which feature sets which part of the environment's `sys`, by attributes joined by

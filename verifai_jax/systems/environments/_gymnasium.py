@@ -2,7 +2,6 @@
 
     gymnasium("CartPole-v1", policy, steps=200, signals=("x", "x_dot", "theta", "theta_dot"),
               features=("masspole", "length"), reset=start)
-    gymnasium("Pendulum-v1", policy, steps=200, workers=4, timeout=10.0)
     gymnasium(make_my_environment, policy, steps=500, configure=place_obstacles)
 
 One trace is one episode: it is never reset within.
@@ -29,16 +28,26 @@ from verifai_jax.systems.base import KnownSignals
 from verifai_jax.systems.blackbox._blackbox import BlackBox, PooledBlackBox, blackbox
 from verifai_jax.systems.channels import Channels, Link, Passing
 from verifai_jax.systems.delays import NO_DELAY, Delay, DelayOption, as_delay
+from verifai_jax.systems.environments.derived_attributes import DERIVED
 from verifai_jax.systems.environments.episode import (
     Moment,
     check_features,
-    check_signals_option,
     features_at,
     first_memory,
-    names_of_entries,
     policy_that_sees,
-    read_signals,
     sampling_period,
+)
+from verifai_jax.systems.environments.episode_signals import (
+    check_signals_option,
+    names_of_entries,
+    read_signals,
+)
+from verifai_jax.systems.environments.episode_values import (
+    as_arrays,
+    entry_form,
+    host_policy_function,
+    named_entries,
+    single_picture,
 )
 from verifai_jax.systems.environments.spaces import (
     Fitted,
@@ -51,18 +60,9 @@ from verifai_jax.systems.environments.spaces import (
     named_numbers,
     no_action,
 )
-from verifai_jax.systems.pytree_checks import outline
 
 Env: TypeAlias = Any
 """A `gymnasium.Env`; Gymnasium is an optional package, so its types cannot be imported here."""
-
-# What environments compute once from their attributes, and would not follow a feature.
-DERIVED: dict[str, dict[str, Callable[[Any], Any]]] = {
-    "CartPoleEnv": {
-        "total_mass": lambda env: env.masspole + env.masscart,
-        "polemass_length": lambda env: env.masspole * env.length,
-    }
-}
 
 
 @dataclasses.dataclass(eq=False)
@@ -122,7 +122,7 @@ class EpisodeFunction:
         finally:
             if callable(close := getattr(drawing._env, "close", None)):
                 close()
-        return {k: _picture(image, self.name) for k, image in drawing._drawn.items()}
+        return {k: single_picture(image, self.name) for k, image in drawing._drawn.items()}
 
     def __repr__(self) -> str:
         return self.name
@@ -172,7 +172,7 @@ class EpisodeFunction:
                 self._set(features, k * dt)
             overshoots += actions[k].outside
             observation, reward, terminated, truncated, _ = env.step(action)
-            self._check_observation(env, observation)
+            self._check_observation(env, observation, "step must return an", ValueError)
             over = bool(terminated or truncated)
         signals = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
         finite = all(bool(np.all(np.isfinite(signal))) for signal in signals.values())
@@ -280,26 +280,19 @@ class EpisodeFunction:
         started = env.reset(seed=seed) if self.reset is None else self.reset(env, features, seed)
         if isinstance(started, tuple) and len(started) == 2 and isinstance(started[1], dict):
             started = started[0]
-        space = getattr(env, "observation_space", None)
-        try:
-            if started is None:
-                raise Misfit("got None")
-            check_observation(space, started)
-        except Misfit as misfit:
-            raise TypeError(
-                f"reset must return the first observation of {self.name}, {describe(space)}; "
-                f"{misfit}"
-            ) from None
+        self._check_observation(env, started, "reset must return the first", TypeError)
         return started
 
-    def _check_observation(self, env: Env, observation: object) -> None:
+    def _check_observation(
+        self, env: Env, observation: object, must: str, error: type[Exception]
+    ) -> None:
         space = getattr(env, "observation_space", None)
         try:
+            if observation is None:
+                raise Misfit("got None")
             check_observation(space, observation)
         except Misfit as misfit:
-            raise ValueError(
-                f"step must return an observation of {self.name}, {describe(space)}; {misfit}"
-            ) from None
+            raise error(f"{must} observation of {self.name}, {describe(space)}; {misfit}") from None
 
     def _overshoot(self, env: Env) -> str:
         """Say that actions lay outside their space, and what became of them."""
@@ -313,7 +306,7 @@ class EpisodeFunction:
         """Return the forms of observations and actions; the names are those of `signals`."""
         env = self.environment
         observation, action = (
-            jax.tree.map(_form, getattr(env, f"{name}_space").sample())
+            jax.tree.map(entry_form, getattr(env, f"{name}_space").sample())
             for name in ("observation", "action")
         )
         names = names_of_entries(self.signals)
@@ -327,7 +320,7 @@ class EpisodeFunction:
         self, env: Env, observation: object, features: Mapping[str, Any], time: float
     ) -> Fitted:
         if self._decide is None:
-            self._decide = _policy_function(self.policy)
+            self._decide = host_policy_function(self.policy)
         sees = policy_that_sees(self.policy) is not None
         options = {"features": features_at(features, time)} if sees else {}
         if self._memory is None:
@@ -351,10 +344,10 @@ class EpisodeFunction:
         features: Mapping[str, Any],
     ) -> dict[str, np.ndarray]:
         custom = callable(self.signals)
-        seen = _arrays(observation)
+        seen = as_arrays(observation)
         if isinstance(seen, Mapping | tuple) and not custom:
-            seen = _named_entries(seen)
-        taken = _arrays(action) if custom else np.zeros(())
+            seen = named_entries(seen)
+        taken = as_arrays(action) if custom else np.zeros(())
         moment = Moment(env, seen, np.asarray(reward, float), np.array(False))
         samples = read_signals(self.signals, moment, taken, features, {}, self.name)
         if not custom:
@@ -392,10 +385,10 @@ def gymnasium(
     - `policy`: `observation -> action`, or an object with a method `act` that is one, such as an
       `rl.Policy`. An argument `features` gets the features of the instant. One that remembers
       something has a method `reset()`, called before each episode.
-    - `steps`: of the episode at most. The trace has a sample after the reset and after each step;
-      the last valid one is that at which the environment terminates or is truncated (by its own
-      time limit, too). Each sample has the action that is taken there, and the reward of the step
-      that led there.
+    - `steps`: the maximum number of steps of the episode. The trace has a sample after the reset
+      and after each step; the last valid one is that at which the environment terminates or is
+      truncated (by its own time limit, too). Each sample has the action that is taken there, and
+      the reward of the step that led there.
     - `signals`: names of all entries of the observation, or `{name: index or key of it}`; `action`
       and `reward` come along. Or a function `(env, observation, action, reward, features) -> dict`.
       When left out: `observation`, `action` and `reward`.
@@ -428,7 +421,7 @@ def gymnasium(
             raise unknown_name("environment of Gymnasium", env, package.registry)
     elif not callable(env):
         raise ValueError(f"env must be an id or a function that makes one; got {env!r}")
-    decide = _policy_function(policy, compiled=False)
+    decide = host_policy_function(policy, compiled=False)
     if policy_that_sees(policy) is not None:
         decide = functools.partial(decide, features=None)
     check_called_with("policy", decide, ("observation",))
@@ -455,61 +448,3 @@ def gymnasium(
     )
     options: Any = {"workers": workers, "timeout": timeout, "retries": retries}
     return cast("BlackBox | PooledBlackBox", blackbox(episode, seeded=True, **options))
-
-
-def _form(leaf: object) -> Any:
-    """Return the form of an entry of a space, itself where it holds no numbers."""
-    array = np.asarray(leaf)
-    return jax.ShapeDtypeStruct(array.shape, array.dtype) if array.dtype.kind in "biuf" else leaf
-
-
-def _picture(image: Any, name: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Return what an environment drew, a single picture.
-
-    **Raises:** `ValueError` for anything else.
-    """
-    image = image[-1] if isinstance(image, list) and image else image
-    array = np.asarray(image)
-    if array.ndim != 3 or array.shape[2] not in (3, 4) or array.dtype != np.uint8:
-        raise ValueError(
-            f"render of {name} must return a picture [height, width, 3] of bytes; got "
-            f"{outline(image)}"
-        )
-    return array[..., :3]
-
-
-def _arrays(value: object) -> Any:
-    """Return an observation or action with its numbers as arrays, in its own form."""
-    if isinstance(value, Mapping):
-        return {name: _arrays(part) for name, part in value.items()}
-    if isinstance(value, tuple):
-        return tuple(_arrays(part) for part in value)
-    return value if isinstance(value, str) else np.asarray(with_gaps("observation", value))
-
-
-def _named_entries(observation: Mapping[str, Any] | tuple[Any, ...]) -> dict[str, Any]:
-    """Return the parts of a nested observation by name: `height`, `arm.angle`, `observation.0`."""
-    entries: dict[str, Any] = {}
-    several = isinstance(observation, Mapping)
-    parts = observation.items() if several else enumerate(observation)
-    for key, part in parts:
-        name = str(key) if several else f"observation.{key}"
-        if isinstance(part, Mapping | tuple):
-            inner = _named_entries(part)
-            stem = "observation." if isinstance(part, tuple) else ""
-            entries |= {f"{name}.{k.removeprefix(stem)}": v for k, v in inner.items()}
-        else:
-            entries[name] = part
-    return entries
-
-
-def _policy_function(policy: object, compiled: bool = True) -> Callable[..., Any]:
-    act = getattr(policy, "act", None)
-    function = act if callable(act) else policy
-    if not callable(function):
-        raise ValueError(
-            f"policy must be a function of the observation, or have a method act; got {policy!r}"
-        )
-    # A network in JAX costs a hundred times less a step when it is compiled as a whole.
-    network = function is not policy and jax.tree.leaves(policy) != [policy]
-    return jax.jit(function) if network and compiled else function

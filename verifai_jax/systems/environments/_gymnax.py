@@ -136,9 +136,9 @@ def gymnax(
     - `policy`: `observation -> action`, or `(observation, key) -> action` for a random one; a
       function, or an object with a method `act`, such as an `rl.Policy`. An argument `features`
       gets the features of the instant.
-    - `steps`: of the episode at most, or `duration` in seconds; the environment's own
-      `max_steps_in_episode` when left out. The trace has a sample after the reset and after each
-      step, and its last valid sample is the one at which the environment is over.
+    - `steps`: the maximum number of steps of the episode, or `duration` in seconds; the
+      environment's own `max_steps_in_episode` when left out. The trace has a sample after the reset
+      and after each step, and its last valid sample is the one at which the environment is over.
     - `features`: which feature sets which parameter of the environment, `{"mass": "masspole"}`, or
       names that are the same in both. What `CartPole-v1` derives from its parameters follows.
     - `configure(params, features) -> params`: for anything else.

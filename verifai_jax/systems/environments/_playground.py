@@ -120,9 +120,9 @@ def playground(
     - `env`: the name of an environment, or an `MjxEnv` of your own without training wrappers.
     - `policy`: `observation -> action`, or `(observation, key) -> action` for a random one; a
       function, or an object with a method `act`, such as what `vj.policy` returns.
-    - `steps`: of the episode at most, or `duration` in seconds. The trace has a sample after the
-      reset and after each step, and its last valid sample is the one at which the environment is
-      done.
+    - `steps`: the maximum number of steps of the episode, or `duration` in seconds. The trace has a
+      sample after the reset and after each step, and its last valid sample is the one at which the
+      environment is done.
     - `bind`: for a feature's name the path of what it sets in the model or in the initial state, as
       in `mujoco`: `"body/torso/mass"`, `"geom/floor/friction[0]"`, `"joint/hinge/qpos"`.
     - `configure(env, features) -> env`: for anything else; it gets a copy of the environment.

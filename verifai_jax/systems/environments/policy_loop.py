@@ -23,20 +23,22 @@ from verifai_jax.systems.delays import DelayOption, as_delay, joined, links_of
 from verifai_jax.systems.environments.episode import (
     Episode,
     Moment,
-    SignalsOption,
     Time,
     check_features,
-    check_signals_option,
     features_at,
     first_memory,
     fold,
     has_waveforms,
-    names_of_entries,
     policy_function,
     policy_that_sees,
-    read_signals,
     rollout,
     sampling_period,
+)
+from verifai_jax.systems.environments.episode_signals import (
+    SignalsOption,
+    check_signals_option,
+    names_of_entries,
+    read_signals,
 )
 from verifai_jax.systems.pytree_checks import in_working_precision
 
@@ -199,7 +201,7 @@ def loop_options(
 
     **Arguments:**
 
-    - `delays`: of observations and of actions.
+    - `delays`: the delays of observations and of actions.
     - `configured`, `started`: what `configure`, and a function `initial`, is called with first.
 
     **Raises:** `ValueError` for an option that cannot be used.

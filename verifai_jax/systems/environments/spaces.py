@@ -44,7 +44,7 @@ def check_space(space: Space, name: str, delayed: bool) -> None:
 
     **Arguments:**
 
-    - `name`: of the environment.
+    - `name`: the name of the environment.
     - `delayed`: whether actions arrive late, so that one has to stand for none.
 
     **Raises:** `ValueError`.

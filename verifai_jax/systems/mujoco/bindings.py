@@ -44,7 +44,7 @@ Bound = Mapping[str, "str | Scaled | Sequence[str | Scaled]"]
 class Scaled:
     """A location whose value the feature multiplies: at 1 the model's value stays as it is.
 
-    - `path`: of the location, as in `bind`: `"body/torso/mass"`.
+    - `path`: the path of the location, as in `bind`: `"body/torso/mass"`.
     """
 
     path: str

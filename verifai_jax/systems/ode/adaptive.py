@@ -30,7 +30,8 @@ def adaptive(
     - `solver`: the name of a solver of diffrax: `"Tsit5"` and `"Dopri8"` where the equations are
       not stiff, `"Kvaerno3"` and `"Kvaerno5"` (implicit) where they are.
     - `rtol`, `atol`: relative and absolute tolerance of a step's error.
-    - `max_steps`: of diffrax in one step of `ode`; what needs more becomes `NONFINITE`.
+    - `max_steps`: the maximum number of steps of diffrax in one step of `ode`; what needs more
+      becomes `NONFINITE`.
 
     **Raises:** `MissingExtra` without diffrax, `UnknownNameError` for an unknown solver, and
     `ValueError` for tolerances that are not positive.

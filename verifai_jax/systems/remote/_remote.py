@@ -170,7 +170,7 @@ def remote(
       status `error`; waits, and says so in the log, when left out.
     - `signals`, `dt`, `length`: the form of every trace; see `blackbox.TraceForm`. A client that
       sends another gets an error, and the row has status `error`.
-    - `max_bytes`: of one message from a client.
+    - `max_bytes`: the maximum number of bytes of one message from a client.
     - `max_memory`: bytes of unfinished messages of all clients together, at least `max_bytes`;
       beyond it the client whose message began first is sent away, and may come back.
 

@@ -1,0 +1,142 @@
+"""FMUs of a mass on a spring, in C for FMI 2 and 3, compiled by the system's compiler."""
+
+import shutil
+import subprocess
+import zipfile
+
+import pytest
+
+VARIABLES = {
+    # name: reference, causality, variability, start, range, unit
+    "m": (0, "parameter", "fixed", "1.0", (0.5, 2.0), "kg"),
+    "k": (1, "parameter", "tunable", "4.0", (1.0, 9.0), "N/m"),
+    "x0": (2, "parameter", "fixed", "1.0", None, "m"),
+    "force": (3, "input", "continuous", "0.0", None, "N"),
+    "body.x": (4, "output", "continuous", None, None, "m"),
+    "v": (5, "output", "continuous", None, None, "m/s"),
+}
+
+MODEL = r"""
+#include <stdlib.h>
+#include <string.h>
+#include <stdint.h>
+#include <stdbool.h>
+typedef struct { double r[8]; int32_t mode; } Model;
+static void reset(Model *m) {
+  double start[] = {1, 4, 1, 0, 0, 0}; memcpy(m->r, start, sizeof start); m->mode = 0;
+}
+static int advance(Model *m, double h) {
+  /* Crashes, hangs, ends and errors on purpose. */
+  if (m->mode == 1) abort();
+  if (m->mode == 2) return 3;
+  if (m->mode == 3) return 2;
+  int n = 100;
+  for (int i = 0; i < n; i++) {
+    m->r[5] += h / n * (m->r[3] - m->r[1] * m->r[4]) / m->r[0];
+    m->r[4] += h / n * m->r[5];
+  }
+  return 0;
+}
+"""
+
+TWO = r"""
+typedef void (*Log)(void*, const char*, int, const char*, const char*, ...);
+typedef struct { Log log; void *a, *f, *s, *e; } Calls;
+typedef struct { Model m; Calls c; } C2;
+void *fmi2Instantiate(const char *n, int t, const char *g, const char *r, Calls *c, int v, int l) {
+  if (strcmp(g, "token")) return 0;
+  C2 *x = calloc(1, sizeof(C2)); x->c = *c; reset(&x->m); return x; }
+void fmi2FreeInstance(void *c) { free(c); }
+int fmi2SetupExperiment(void *c, int a, double b, double d, int e, double f) { return 0; }
+int fmi2EnterInitializationMode(void *c) { return 0; }
+int fmi2ExitInitializationMode(C2 *c) { c->m.r[4] = c->m.r[2]; return 0; }
+int fmi2Terminate(void *c) { return 0; }
+int fmi2Reset(C2 *c) { reset(&c->m); return 0; }
+int fmi2SetReal(C2 *c, const unsigned *v, size_t n, const double *x) {
+  for (size_t i = 0; i < n; i++) c->m.r[v[i]] = x[i]; return 0; }
+int fmi2GetReal(C2 *c, const unsigned *v, size_t n, double *x) {
+  for (size_t i = 0; i < n; i++) x[i] = c->m.r[v[i]]; return 0; }
+int fmi2SetInteger(C2 *c, const unsigned *v, size_t n, const int *x) { c->m.mode = x[0]; return 0; }
+int fmi2DoStep(C2 *c, double t, double h, int p) {
+  int s = advance(&c->m, h);
+  if (s == 3) c->c.log(0, "spring", 3, "error", "the spring broke");
+  return s; }
+"""
+
+THREE = r"""
+typedef void (*Log)(void*, int, const char*, const char*);
+void *fmi3InstantiateCoSimulation(const char *n, const char *g, const char *r, bool v, bool l,
+    bool e, bool a, const unsigned *q, size_t nq, void *env, Log log, void *u) {
+  if (strcmp(g, "token")) return 0;
+  Model *x = calloc(1, sizeof(Model)); reset(x); return x; }
+void fmi3FreeInstance(void *c) { free(c); }
+int fmi3EnterInitializationMode(void *c, bool a, double b, double d, bool e, double f) { return 0; }
+int fmi3ExitInitializationMode(Model *c) { c->r[4] = c->r[2]; return 0; }
+int fmi3Terminate(void *c) { return 0; }
+int fmi3Reset(Model *c) { reset(c); return 0; }
+int fmi3SetFloat64(Model *c, const uint32_t *v, size_t n, const double *x, size_t m) {
+  for (size_t i = 0; i < n; i++) c->r[v[i]] = x[i]; return 0; }
+int fmi3GetFloat64(Model *c, const uint32_t *v, size_t n, double *x, size_t m) {
+  for (size_t i = 0; i < n; i++) x[i] = c->r[v[i]]; return 0; }
+int fmi3SetInt32(Model *c, const uint32_t *v, size_t n, const int32_t *x, size_t m) {
+  c->mode = x[0]; return 0; }
+int fmi3DoStep(Model *c, double t, double h, bool p, bool *e, bool *end, bool *r, double *last) {
+  int s = advance(c, h); *e = *r = false; *end = s == 2; return s == 2 ? 0 : s; }
+"""
+
+
+def description(version, types=True, doctype=""):
+    real = "Real" if version == 2 else "Float64"
+    rows = []
+    for name, (reference, causality, variability, start, ends, unit) in VARIABLES.items():
+        more = "" if start is None else f' start="{start}"'
+        if ends:
+            more += f' declaredType="T{name}"'
+        common = f'name="{name}" valueReference="{reference}" causality="{causality}"'
+        common += f' variability="{variability}"'
+        more += f' unit="{unit}"'
+        if version == 2:
+            rows.append(f"<ScalarVariable {common}><{real}{more}/></ScalarVariable>")
+        else:
+            rows.append(f"<{real} {common}{more}/>")
+    common = 'name="mode" valueReference="6" causality="parameter" variability="fixed"'
+    if version == 2:
+        rows.append(f'<ScalarVariable {common}><Integer start="0"/></ScalarVariable>')
+    else:
+        rows.append(f'<Int32 {common} start="0"/>')
+        rows.append(
+            '<Float64 name="table" valueReference="9" causality="parameter" start="0 0">'
+            '<Dimension start="2"/></Float64>'
+        )
+    kinds = []
+    for name, (*_, ends, _) in VARIABLES.items():
+        if ends:
+            span = f'min="{ends[0]}" max="{ends[1]}"'
+            kinds.append(
+                f'<SimpleType name="T{name}"><Real {span}/></SimpleType>'
+                if version == 2
+                else f'<Float64Type name="T{name}" {span}/>'
+            )
+    token = 'guid="token"' if version == 2 else 'instantiationToken="token"'
+    return (
+        f'<?xml version="1.0"?>{doctype}<fmiModelDescription fmiVersion="{version}.0" '
+        f'modelName="spring" {token}><CoSimulation modelIdentifier="spring"/>'
+        f"<TypeDefinitions>{''.join(kinds)}</TypeDefinitions>"
+        f"<ModelVariables>{''.join(rows)}</ModelVariables></fmiModelDescription>"
+    )
+
+
+def build(folder, version):
+    """Compile the FMU, and return its file."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("there is no C compiler")
+    source, binary = folder / "spring.c", folder / "spring.so"
+    source.write_text(MODEL + (TWO if version == 2 else THREE))
+    subprocess.run([compiler, "-O1", "-w", "-shared", "-fPIC", source, "-o", binary], check=True)
+    file = folder / f"spring{version}.fmu"
+    place = "linux64" if version == 2 else "x86_64-linux"
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("modelDescription.xml", description(version))
+        archive.write(binary, f"binaries/{place}/spring.so")
+    return file

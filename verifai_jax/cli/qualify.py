@@ -1,0 +1,35 @@
+"""`verifai-jax qualify`: the tool's own oracles, run here."""
+
+from pathlib import Path
+
+import click
+
+from verifai_jax.cli.exit_codes import BROKEN
+from verifai_jax.cli.json_output import command, give_result
+
+
+@command()
+@click.option(
+    "--folder",
+    type=click.Path(path_type=Path),
+    default=Path("qualification"),
+    show_default=True,
+    help="Folder for qualification.html and qualification.json.",
+)
+@click.option("--only", multiple=True, help="Name of an oracle, several times for several.")
+def qualify(folder: Path, only: tuple[str, ...]) -> None:
+    """Run the tool's own oracles on this machine, and write the record to be signed.
+
+    Formulas against definitions, rates against closed forms, gradients against differences, kills,
+    replays bit for bit. It ends with code 3 if one falls.
+    """
+    from verifai_jax.core.text import printable
+    from verifai_jax.qualification import qualify as run
+
+    found = run(only)
+    path = found.save(folder)
+    click.echo(printable(str(found)))
+    click.echo(f"  written      {path}")
+    give_result(passed=found.passed, complete=found.complete, outcomes=found.outcomes, report=path)
+    if not found.passed:
+        raise click.exceptions.Exit(BROKEN)

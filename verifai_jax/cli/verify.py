@@ -1,0 +1,53 @@
+"""`verifai-jax verify FILE.py:NAME`: which parts of the feature space are proved, or broken."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from verifai_jax.cli import arguments
+from verifai_jax.cli.gates import Gate, check_gate, fail_on
+from verifai_jax.cli.json_output import command, give_result, show_result
+
+
+@command()
+@arguments.TARGET
+@click.option("--budget", type=float, help="Seconds, about.  [default: 60]")
+@click.option("--boxes", type=int, help="Boxes to look at, at most.")
+@click.option("--samples", type=int, default=4096, show_default=True, help="Of what is undecided.")
+@click.option("--confidence", type=float, default=0.95, show_default=True)
+@arguments.SEED
+@arguments.ONLY
+@arguments.PRECISION
+@click.option(
+    "--into", type=click.Path(path_type=Path), help="File for the result, or to go on with."
+)
+@arguments.PLOT
+@fail_on(
+    counterexample="if any box contains a point that fails for certain",
+    undecided="unless the whole space is proved",
+)
+def verify(
+    target: str,
+    only: str | None,
+    into: Path | None,
+    plot: Path | None,
+    fail_on: Gate | None,
+    **options: Any,
+) -> None:
+    """Divide the features of TARGET (FILE.py:NAME) into proved, broken and undecided boxes."""
+    from verifai_jax.verification import verify as run
+
+    problem = arguments.load_problem(target, only)
+    before = into if into is not None and into.exists() else None
+    found = run(problem, resume=before, **options)
+    show_result(found, plot, "name", "looked_at", "simulations", "seconds", "stopped", "notes")
+    low, high = found.probability
+    parts = {name: getattr(found, name)._asdict() for name in ("proved", "broken", "undecided")}
+    give_result(**parts, failing_at_least=low, failing_at_most=high, formulas=found.formulas)
+    if into is not None:
+        click.echo(f"  result       {found.save(into)}")
+    check_gate(
+        fail_on,
+        {"counterexample": found.broken.mass > 0, "undecided": found.proved.mass < 1},
+    )

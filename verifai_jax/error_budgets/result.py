@@ -1,0 +1,158 @@
+"""The error of a probability: its parts, their sum, and how far the prior may be wrong.
+
+budget = vj.error_budget(problem, vj.estimate(problem))
+print(budget)
+budget.low, budget.high; budget["step"].low; budget.prior.radius
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from verifai_jax.core.notebook import InNotebook, frame_html
+from verifai_jax.core.text import format_percent
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class ErrorPart:
+    """A part of the error of a number.
+
+    - `name`: `"sampling"`, `"step"`, `"precision"`, `"solver"` or a solver's name, `"seeds"`,
+      `"randomness"`.
+    - `low`, `high`: by how much the number may be greater on account of it; of `"sampling"` the
+      ends of its interval, less the number. NaN for what was not measured.
+    - `text`: a sentence on how that was found, or why not.
+    - `counted`: whether it is in the sum.
+    """
+
+    name: str
+    low: float
+    high: float
+    text: str
+    counted: bool = True
+
+    @property
+    def measured(self) -> bool:
+        """True if it has a number."""
+        return math.isfinite(self.low) and math.isfinite(self.high)
+
+
+@dataclass(frozen=True)
+class PriorError:
+    """The error of the prior that makes a claim fall.
+
+    - `limit`: that the claim says the number is at most.
+    - `bound`: the upper end of the number, all parts of the error together.
+    - `radius`: the least Kullback-Leibler divergence, in nats, at which another prior makes the
+      number `limit`; 0 if the claim is not shown under this prior.
+    - `worst`: the greatest number within 0.01, 0.1 and 1 nat, by the radius.
+    """
+
+    limit: float
+    bound: float
+    radius: float
+    worst: tuple[tuple[float, float], ...]
+
+    @property
+    def shift(self) -> float:
+        """By so many standard deviations the mean of one normal feature moves at `radius`."""
+        return math.sqrt(2 * self.radius)
+
+    def __str__(self) -> str:
+        worst = ", ".join(f"{value:z.3g} within {radius:zg}" for radius, value in self.worst)
+        if not self.radius:
+            return (
+                f"That it is at most {self.limit:z.3g} is not shown under this prior, so that no "
+                f"other prior is needed for the claim to fall. The worst within a divergence in "
+                f"nats: {worst}."
+            )
+        return (
+            f"The claim that it is at most {self.limit:z.3g} needs the prior to be right within "
+            f"{self.radius:z.3g} nats of divergence, which the mean of one normal feature spends "
+            f"by moving {self.shift:z.2g} standard deviations. The worst within a divergence in "
+            f"nats: {worst}."
+        )
+
+
+@dataclass(frozen=True)
+class ErrorBudget(InNotebook):
+    """The error of a number by its parts, as `error_budget` returns it.
+
+    - `name`: the name of the problem; `what`: the number in words.
+    - `value`: the number as simulated; NaN where there is no estimate.
+    - `parts`: the parts of its error; each interval holds with its share of the error that is
+      allowed.
+    - `confidence`: with which all of them hold together.
+    - `prior`: how far the prior may be wrong.
+    - `simulations`: that it took.
+    """
+
+    name: str
+    what: str
+    value: float
+    parts: tuple[ErrorPart, ...]
+    confidence: float
+    prior: PriorError
+    simulations: int
+
+    def __getitem__(self, name: str) -> ErrorPart:
+        """Return the part of this name."""
+        return {part.name: part for part in self.parts}[name]
+
+    @property
+    def low(self) -> float:
+        """The lower end of the number, the parts added."""
+        floor = -1.0 if self.what == DIFFERENCE else 0.0
+        return max(floor, self._base + sum(part.low for part in self._counted))
+
+    @property
+    def high(self) -> float:
+        """The upper end of the number, the parts added."""
+        return min(1.0, self._base + sum(part.high for part in self._counted))
+
+    @property
+    def _base(self) -> float:
+        return 0.0 if math.isnan(self.value) else self.value
+
+    @property
+    def _counted(self) -> list[ErrorPart]:
+        return [part for part in self.parts if part.counted and part.measured]
+
+    @property
+    def table(self) -> "pd.DataFrame":
+        """A row for each part."""
+        import pandas as pd
+
+        rows = [(p.name, p.low, p.high, p.counted and p.measured, p.text) for p in self.parts]
+        return pd.DataFrame(rows, columns=["part", "low", "high", "counted", "how"])
+
+    @property
+    def total(self) -> str:
+        """The sum in a sentence."""
+        sure = format_percent(self.confidence)
+        left_out = [part.name for part in self.parts if not part.measured]
+        text = (
+            f"With {', '.join(part.name for part in self._counted)} together, {self.what} of "
+            f"{self.name} lies between {self.low:z.3g} and {self.high:z.3g}, at {sure}."
+        )
+        if left_out:
+            text += f" Not measured, and not in it: {', '.join(left_out)}."
+        return text
+
+    def __str__(self) -> str:
+        lines = [self.total]
+        for part in self.parts:
+            ends = f"{part.low:+z.2g} to {part.high:+z.2g}" if part.measured else "not measured"
+            lines.append(f"  {part.name:<12} {ends}\n    {part.text}")
+        return "\n".join([*lines, f"  prior\n    {self.prior}"])
+
+    def _notebook_parts(self) -> Iterable[str]:
+        yield frame_html(self.table)
+
+
+PROBABILITY = "the failure probability"
+DIFFERENCE = "the difference of the failure probabilities"

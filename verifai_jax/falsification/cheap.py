@@ -1,0 +1,71 @@
+"""Rows of a cheap model that a run of a slow model of the same features begins with.
+
+check_same_features(slow, cheap)
+rows = gravest_rows(run_of_cheap, 16)               # features to simulate first
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.falsification.run import Run
+from verifai_jax.problem.problem import Problem, ProblemError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+TIMES, MAX_CHEAP = 20, 50_000
+"""Simulations of a cheap model for each one of the slow one, and at most."""
+MAX_ROWS = 16
+"""Rows that a cheap model proposes at most: beyond these its failures are alike."""
+MAX_CANDIDATES = 4096
+"""Rows of the cheap run at most among which those to simulate are chosen, the lowest ones."""
+LOWEST = 0.02
+"""Share of the rows that are candidates, where fewer fail."""
+
+
+def check_same_features(slow: Problem, cheap: Problem) -> None:
+    """Check that two problems have the same features.
+
+    **Raises:** `TypeError` for something that is no problem; `ProblemError` that names the first
+    feature in which they differ.
+    """
+    if not isinstance(cheap, Problem):
+        raise TypeError(f"cheap must be a Problem; got {type(cheap).__name__}")
+    ours, theirs = slow.space.domains, cheap.space.domains
+    for name in dict.fromkeys((*ours, *theirs)):
+        one, other = ours.get(name), theirs.get(name)
+        if one != other:
+            there = "missing" if other is None else repr(other)
+            here = "missing" if one is None else repr(one)
+            raise ProblemError(
+                f"a cheap model has the same features as the slow one; {name} is {here}, and in "
+                f"the cheap one {there}"
+            )
+    if list(ours) != list(theirs):
+        raise ProblemError("a cheap model has its features in the same order as the slow one")
+
+
+def gravest_rows(run: Run, budget: int) -> "pd.DataFrame":
+    """Choose rows of a run: its gravest failure, then failures that are far from those before.
+
+    Where few rows fail, those of the lowest robustness count as failures.
+
+    **Arguments:**
+
+    - `run`: the run of the cheap model.
+    - `budget`: simulations of the slow one, of which these take a quarter at most.
+    """
+    count = max(1, min(budget // 4, MAX_ROWS))
+    rows = run.table.all.dropna(subset=["rho"]).sort_values("rho", kind="stable")
+    failing = int(rows["violated"].sum())
+    wanted = max(failing, int(LOWEST * len(rows)), count)
+    candidates = rows.iloc[: min(wanted, MAX_CANDIDATES)]
+    points: Float[np.ndarray, "n d"] = run.problem.space.points(candidates)
+    chosen = [0]
+    gaps = np.linalg.norm(points - points[0], axis=1)
+    while len(chosen) < min(count, len(points)) and gaps.max() > 0:
+        chosen.append(int(gaps.argmax()))
+        gaps = np.minimum(gaps, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return candidates.iloc[chosen][list(run.problem.space.columns)]

@@ -1,0 +1,286 @@
+"""Monitors that learn from runs, and whose alarms are false with a chosen probability at most.
+
+    ahead = predictive_monitor("always gap > 2", traces, horizon=1.0)    # of simulations
+    step = ahead.start()
+    step({"gap": 4.0, "speed": 9.0})      # Forecast(robustness, low, p_value, alarm)
+
+    known = domain_monitor(traces)        # is this input unlike all that was tested?
+    known.start()({"gap": 4.0, "speed": 9.0})
+
+Half of the runs teach, the other half calibrate. The guarantees are for a further run of the same
+distribution (independent samples of one feature space, not the rows of a search that learns), over
+all its samples at once, and over the calibrating runs and the further one together.
+
+Source: L. Lindemann et al., "Conformal prediction for STL runtime verification", ICCPS 2023.
+"""
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.core.errors import missing_name
+from verifai_jax.core.trace import Trace
+from verifai_jax.mtl import formula as ast
+from verifai_jax.mtl._parse import parse
+from verifai_jax.mtl.formula import Formula, Interval
+from verifai_jax.mtl.host_values import HostValues
+from verifai_jax.statistics.binomial import Rate, clopper_pearson
+from verifai_jax.statistics.conformal import conformal_p_value, conformal_threshold
+
+Rows = Float[np.ndarray, "time columns"]
+TAUGHT = 20_000
+"""Samples that a model learns from at most: quadratic models gain nothing from more."""
+
+
+class Model(Protocol):
+    """A regressor that learns and predicts, as those of scikit-learn."""
+
+    def fit(self, x: np.ndarray, y: np.ndarray) -> object:
+        """Learn from rows `[n, d]` and values `[n]`."""
+        ...
+
+    def predict(self, x: np.ndarray) -> np.ndarray:
+        """Return the values of rows."""
+        ...
+
+
+class Forecast(NamedTuple):
+    """A prediction at one sample.
+
+    - `robustness`: the least robustness expected within the horizon.
+    - `low`: with probability `1 - alpha` it is no lower than this, at any sample of the run.
+    - `p_value`: share of the runs without violation in which a prediction was once as low.
+    - `alarm`: whether the p-value is at most `alpha`. In a further run without violation an alarm
+      is raised with probability `alpha` at most.
+    """
+
+    robustness: float
+    low: float
+    p_value: float
+    alarm: bool
+
+
+class Distance(NamedTuple):
+    """A sample beside those that were tested.
+
+    - `distance`: from the nearest of them, in standard deviations of the signals.
+    - `p_value`: share of the tested runs that were once as far from the others.
+    - `alarm`: whether it is at most `alpha`. In a further run like the tested ones an alarm is
+      raised with probability `alpha` at most.
+    """
+
+    distance: float
+    p_value: float
+    alarm: bool
+
+
+@dataclass(frozen=True)
+class PredictiveMonitor:
+    """Foretells violations; made by `predictive_monitor`.
+
+    - `horizon`: seconds that it looks ahead.
+    - `slack`: by how much a prediction is too high in at most a share `alpha` of runs.
+    - `caught`: the caught of the calibrating runs that violated the formula, those with an alarm
+      before that; None if there was none.
+    """
+
+    formula: Formula
+    horizon: float
+    alpha: float
+    slack: float
+    caught: Rate | None
+    _columns: "_Columns"
+    _model: Model
+    _lowest: np.ndarray
+
+    def forecasts(self, trace: Trace) -> list[Forecast]:
+        """Return a forecast at every sample of a run."""
+        return self._forecasts(self._columns.rows(trace))
+
+    def start(self) -> Callable[[Mapping[str, Any]], Forecast]:
+        """Return what takes one sample of a run after another and gives its forecast."""
+        return self._columns.follow(lambda row: self._forecasts(row)[0])
+
+    def _forecasts(self, rows: Rows) -> list[Forecast]:
+        predicted = self._model.predict(rows)
+        p_values = conformal_p_value(-self._lowest, -predicted)
+        return [
+            Forecast(float(y), float(y) - self.slack, float(p), bool(p <= self.alpha))
+            for y, p in zip(predicted, p_values, strict=True)
+        ]
+
+
+def predictive_monitor(
+    formula: Formula | str,
+    traces: Sequence[Trace],
+    horizon: float,
+    *,
+    alpha: float = 0.05,
+    lags: Sequence[int] = (0, 1, 4),
+    model: Model | None = None,
+    seed: int = 0,
+) -> PredictiveMonitor:
+    """Learn to foretell a violation of a requirement within the next seconds.
+
+    **Arguments:**
+
+    - `formula`: a requirement; of `always f` the robustness of `f` at each instant is foretold.
+    - `traces`: runs of one system on one clock.
+    - `horizon`: seconds ahead, a multiple of the sampling period.
+    - `alpha`: probability of a false alarm in a run, and of a bound that is too high.
+    - `lags`: samples ago that a prediction sees.
+    - `model`: a regressor of scikit-learn's kind; a quadratic function if None.
+    - `seed`: the seed of the division into runs that teach and runs that calibrate.
+
+    **Raises:** `ValueError` for too few runs without violation; `IntervalError` for a horizon that
+    is not a multiple of the sampling period.
+    """
+    formula = parse(formula) if isinstance(formula, str) else formula
+    within = formula.operand if isinstance(formula, ast.Always) else formula
+    columns = _Columns.of(traces, formula.signals(), tuple(lags))
+    ahead = ast.Always(within, Interval(0.0, horizon))
+    rows = [columns.rows(trace) for trace in traces]
+    values = [HostValues.of(trace) for trace in traces]
+    margins, worst = ([np.broadcast_to(v(f), v.length) for v in values] for f in (within, ahead))
+    order = np.random.default_rng(seed).permutation(len(traces))
+    teach, calibrate = np.split(order, [len(traces) // 2])
+    x, y = (np.concatenate([each[k] for k in teach]) for each in (rows, worst))
+    if not np.isfinite(y).all():
+        raise ValueError(f"the robustness of {within} is infinite or NaN, and cannot be foretold")
+    kept = np.random.default_rng(seed).permutation(len(x))[:TAUGHT]
+    taught: Model = model or _quadratic()
+    taught.fit(x[kept], y[kept])
+    predicted = {int(k): taught.predict(rows[k]) for k in calibrate}
+    slack = conformal_threshold([np.max(p - worst[k]) for k, p in predicted.items()], alpha)
+    safe = [k for k in predicted if np.min(margins[k]) >= 0]
+    lowest = np.sort([np.min(predicted[k]) for k in safe])
+    conformal_threshold(lowest, alpha)  # Refuses too few runs without violation.
+    caught: list[bool] = []
+    for k in predicted.keys() - safe:
+        before = predicted[k][: np.argmax(margins[k] < 0) + 1]
+        caught.append(bool(np.any(conformal_p_value(-lowest, -before) <= alpha)))
+    rate = clopper_pearson(sum(caught), len(caught)) if caught else None
+    return PredictiveMonitor(formula, horizon, alpha, slack, rate, columns, taught, lowest)
+
+
+def _quadratic() -> Any:
+    from sklearn.linear_model import Ridge
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import PolynomialFeatures, StandardScaler
+
+    return make_pipeline(StandardScaler(), PolynomialFeatures(2), Ridge(1e-3))
+
+
+@dataclass(frozen=True)
+class DomainMonitor:
+    """Tells inputs that are unlike all that was tested; made by `domain_monitor`.
+
+    - `reach`: distance beyond which it raises an alarm.
+    """
+
+    alpha: float
+    reach: float
+    _columns: "_Columns"
+    _tree: Any
+    _mean: np.ndarray
+    _scale: np.ndarray
+    _farthest: np.ndarray
+
+    def distances(self, trace: Trace) -> list[Distance]:
+        """Return the distance of every sample of a run."""
+        return self._distances(self._columns.rows(trace))
+
+    def start(self) -> Callable[[Mapping[str, Any]], Distance]:
+        """Return what takes one sample of a run after another and gives its distance."""
+        return self._columns.follow(lambda row: self._distances(row)[0])
+
+    def _distances(self, rows: Rows) -> list[Distance]:
+        far = np.asarray(self._tree.query((rows - self._mean) / self._scale)[0])
+        p_values = conformal_p_value(self._farthest, far)
+        return [
+            Distance(float(d), float(p), bool(p <= self.alpha))
+            for d, p in zip(far, p_values, strict=True)
+        ]
+
+
+def domain_monitor(
+    traces: Sequence[Trace],
+    *,
+    signals: Sequence[str] | None = None,
+    alpha: float = 0.05,
+    lags: Sequence[int] = (0,),
+    seed: int = 0,
+) -> DomainMonitor:
+    """Learn which samples were tested, to tell later ones that are unlike any of them.
+
+    **Arguments:**
+
+    - `traces`: the tested runs; for inputs without time, traces of one sample.
+    - `signals`: names of those that are compared; all if None.
+    - `alpha`: probability of an alarm in a run that is like the tested ones.
+    - `lags`: samples ago that are compared too.
+    - `seed`: the seed of the division into runs that are compared with and runs that calibrate.
+
+    **Raises:** `ValueError` for too few runs, and for a NaN.
+    """
+    from scipy.spatial import KDTree
+
+    columns = _Columns.of(traces, tuple(signals or traces[0].signals), tuple(lags))
+    rows = [columns.rows(trace) for trace in traces]
+    teach, calibrate = np.split(
+        np.random.default_rng(seed).permutation(len(rows)), [len(rows) // 2]
+    )
+    known = np.concatenate([rows[k] for k in teach])
+    mean, scale = known.mean(axis=0), known.std(axis=0)
+    scale[scale == 0] = 1.0
+    tree = KDTree((known - mean) / scale)
+    farthest = np.sort([np.max(tree.query((rows[k] - mean) / scale)[0]) for k in calibrate])
+    reach = conformal_threshold(farthest, alpha)
+    return DomainMonitor(alpha, reach, columns, tree, mean, scale, farthest)
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """The numbers of a sample and of earlier ones; before the first sample it stands for them."""
+
+    signals: tuple[str, ...]
+    lags: tuple[int, ...]
+
+    @classmethod
+    def of(
+        cls, traces: Sequence[Trace], signals: tuple[str, ...], lags: tuple[int, ...]
+    ) -> "_Columns":
+        if len(traces) < 2:
+            raise ValueError(
+                f"two runs or more are needed, to teach and to calibrate; got {len(traces)}"
+            )
+        return cls(signals, lags)
+
+    def rows(self, trace: Trace) -> Rows:
+        values = HostValues.of(trace).signals
+        for name in self.signals:
+            if name not in values:
+                raise missing_name("the trace", "signal", name, values)
+        now = np.column_stack([values[name] for name in self.signals])
+        if np.isnan(now).any():
+            raise ValueError("a signal is NaN; leave out the runs with gaps")
+        ago = [now[np.maximum(np.arange(len(now)) - lag, 0)] for lag in self.lags]
+        return np.concatenate(ago, axis=1)
+
+    def follow(self, result: Callable[[Rows], Any]) -> Callable[[Mapping[str, Any]], Any]:
+        last: deque[np.ndarray] = deque(maxlen=max(self.lags) + 1)
+
+        def step(sample: Mapping[str, Any]) -> Any:
+            for name in self.signals:
+                if name not in sample:
+                    raise missing_name("the sample", "signal", name, sample)
+            one = Trace({name: np.asarray(sample[name])[None] for name in self.signals}, dt=1.0)
+            last.appendleft(_Columns(self.signals, (0,)).rows(one)[0])
+            ago = [last[min(lag, len(last) - 1)] for lag in self.lags]
+            return result(np.concatenate(ago)[None])
+
+        return step

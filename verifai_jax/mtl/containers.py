@@ -1,0 +1,234 @@
+"""Recordings of several clocks: MCAP, NetCDF, Zarr and HDF5 as Arrow tables, LeRobot's episodes.
+
+A table is what has one clock: a topic of MCAP, the variables of one dimension, a group with its own
+times. Its column of times is called as the caller says. Nothing in a file is unpickled.
+"""
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+
+from verifai_jax.core.errors import require
+
+Table: TypeAlias = Any
+"""An Arrow table, whose package has no types."""
+Decoder: TypeAlias = Callable[[bytes], Any]
+
+EXTRA = "recordings"
+UNIT = b"unit"
+"""Key of Arrow's metadata of a field under which its unit stands."""
+MAX_ENTRIES = 64
+"""Numbers of a list in a message that is a vector signal; longer ones are images and clouds."""
+EPISODE, FRAME, STAMP = "episode_index", "frame_index", "timestamp"
+"""Columns of a LeRobot data set."""
+
+
+class Episode(NamedTuple):
+    """An episode of a LeRobot data set: a file, and its number."""
+
+    path: Path
+    number: int
+
+
+def table_of(columns: Mapping[str, Any], units: Mapping[str, str] | None = None) -> Table:
+    """Return columns by name as an Arrow table with the units of some of them."""
+    import pyarrow
+
+    arrays = {name: pyarrow.array(column) for name, column in columns.items()}
+    fields = [
+        pyarrow.field(name, array.type, metadata={UNIT: (units or {}).get(name, "")})
+        for name, array in arrays.items()
+    ]
+    return pyarrow.Table.from_arrays(list(arrays.values()), schema=pyarrow.schema(fields))
+
+
+def matrix_column(array: np.ndarray) -> Any:
+    """Return an array `[time]` or `[time, k]` as a column of numbers or of lists."""
+    import pyarrow
+
+    flat = pyarrow.array(np.ascontiguousarray(array).reshape(-1))
+    wide = array.ndim == 2
+    return pyarrow.FixedSizeListArray.from_arrays(flat, array.shape[1]) if wide else flat
+
+
+def read_mcap(path: Path, time: str) -> list[Table]:
+    """Read the topics of an MCAP file, each with the log times of its messages.
+
+    Fields of messages are columns, `/odom` and `twist.linear.x` as `odom.twist.linear.x`. Messages
+    may be JSON, ROS 2's or Protobuf's; topics of others are left out.
+
+    **Raises:** `MissingExtra`; `ValueError` for a file that is damaged or has no such topic.
+    """
+    import pyarrow
+
+    require("mcap", EXTRA)
+    reader = require("mcap.reader", EXTRA)
+    decoders: dict[int, Decoder | None] = {}
+    topics: dict[str, dict[int, dict[str, Any]]] = {}
+    try:
+        with open(path, "rb") as file:
+            for schema, channel, message in reader.make_reader(file).iter_messages():
+                if channel.id not in decoders:
+                    decoders[channel.id] = _decoder(channel.message_encoding, schema)
+                decode = decoders[channel.id]
+                if decode is not None:
+                    topic = channel.topic.strip("/").replace("/", ".")
+                    # Of two messages at one instant the later one counts.
+                    row = topics.setdefault(topic, {}).setdefault(message.log_time, {})
+                    _flatten(topic, decode(message.data), row)
+    except require("mcap.exceptions", EXTRA).McapError as error:
+        raise ValueError(f"{path} cannot be read: {error}") from None
+    if not topics:
+        raise ValueError(f"{path} has no topic of JSON, ROS 2 or Protobuf messages")
+    tables = []
+    for rows in topics.values():
+        names = dict.fromkeys(name for row in rows.values() for name in row)
+        stamps = pyarrow.array(sorted(rows), pyarrow.timestamp("ns"))
+        columns = {name: _cells([rows[at].get(name) for at in sorted(rows)]) for name in names}
+        tables.append(table_of({time: stamps, **columns}))
+    return tables
+
+
+def _decoder(encoding: str, schema: Any) -> Decoder | None:
+    if encoding == "json":
+        return json.loads
+    package = {"cdr": "mcap_ros2.decoder", "protobuf": "mcap_protobuf.decoder"}.get(encoding)
+    if package is None:
+        return None
+    return require(package, EXTRA).DecoderFactory().decoder_for(encoding, schema)
+
+
+def _flatten(prefix: str, value: Any, row: dict[str, Any]) -> None:
+    """Put the numbers of a message, and its short lists of numbers, into a row."""
+    if isinstance(value, bool | int | float):
+        row[prefix] = value
+    elif isinstance(value, str | bytes | None):
+        return
+    elif isinstance(value, Mapping):
+        for name, part in value.items():
+            _flatten(f"{prefix}.{name}", part, row)
+    elif hasattr(value, "DESCRIPTOR"):
+        for part in value.DESCRIPTOR.fields:
+            _flatten(f"{prefix}.{part.name}", getattr(value, part.name), row)
+    elif hasattr(value, "__len__"):
+        entries = list(value) if len(value) <= MAX_ENTRIES else []
+        if entries and all(isinstance(entry, bool | int | float) for entry in entries):
+            row[prefix] = entries
+    else:
+        for name in getattr(value, "__slots__", vars(value)):
+            _flatten(f"{prefix}.{name}", getattr(value, name), row)
+
+
+def _cells(cells: list[Any]) -> Any:
+    """Return cells of one kind as they are, and others as texts, which are no signal."""
+    import pyarrow
+
+    try:
+        return pyarrow.array(cells)
+    except (pyarrow.ArrowInvalid, pyarrow.ArrowTypeError):
+        return pyarrow.array([None if cell is None else str(cell) for cell in cells])
+
+
+def read_dataset(path: Path, time: str) -> list[Table]:
+    """Read the variables of a NetCDF file or a Zarr store, a table for each first dimension.
+
+    **Raises:** `MissingExtra`; `ValueError` for a file that cannot be read.
+    """
+    xarray = require("xarray", EXTRA)
+    store = path.suffix.lower() == ".zarr"
+    try:
+        with (xarray.open_zarr if store else xarray.open_dataset)(path) as dataset:
+            return list(_dimensions(dataset, time))
+    except (ImportError, ValueError) as error:
+        require("netCDF4", EXTRA)
+        raise ValueError(f"{path} cannot be read: {error}") from None
+
+
+def _dimensions(dataset: Any, time: str) -> Iterator[Table]:
+    tables: dict[str, dict[str, np.ndarray]] = {}
+    units: dict[str, str] = {}
+    for name, variable in dataset.data_vars.items():
+        if variable.ndim in (1, 2):
+            tables.setdefault(variable.dims[0], {})[str(name)] = variable.values
+            units[str(name)] = str(variable.attrs.get("units", ""))
+    for dimension, columns in tables.items():
+        clock = dataset.variables.get(dimension)
+        times = {} if clock is None else {time: matrix_column(clock.values)}
+        own = {name: matrix_column(array) for name, array in columns.items() if name != time}
+        yield table_of({**times, **own}, units)
+
+
+def read_hdf5(path: Path, time: str) -> list[Table]:
+    """Read the data sets of an HDF5 file, each by the times of the nearest group around it.
+
+    Groups are parts of a name, `imu/gyro` as `imu.gyro`.
+
+    **Raises:** `MissingExtra`; `ValueError` for a file that cannot be read.
+    """
+    found: dict[str, Any] = {}
+    units: dict[str, str] = {}
+
+    def visit(name: str, item: Any) -> None:
+        if getattr(item, "ndim", 0) in (1, 2) and item.dtype.kind in "biuf":
+            found[name] = item[()]
+            said = item.attrs.get("units", "")
+            units[name.replace("/", ".")] = said.decode() if isinstance(said, bytes) else str(said)
+
+    with require("h5py", EXTRA).File(path, "r") as file:
+        file.visititems(visit)
+    tables: dict[str, dict[str, Any]] = {}
+    for name, array in found.items():
+        group, _, last = name.rpartition("/")
+        while group and f"{group}/{time}" not in found:
+            group = group.rpartition("/")[0]
+        column = time if last == time else name.replace("/", ".")
+        tables.setdefault(group, {})[column] = matrix_column(array)
+    return [table_of(columns, units) for columns in tables.values()]
+
+
+def lerobot_files(folder: Path) -> list[Path]:
+    """Return the data files of a LeRobot data set; none for any other folder."""
+    if not (folder / "meta" / "info.json").is_file():
+        return []
+    return sorted((folder / "data").rglob("*.parquet"))
+
+
+def episodes_of(files: Sequence[Path]) -> Iterator[Episode]:
+    """Yield the episodes in data files of a LeRobot data set."""
+    from pyarrow import parquet
+
+    for file in files:
+        numbers = parquet.read_table(file, columns=[EPISODE]).column(EPISODE).unique()
+        yield from (Episode(file, number) for number in sorted(numbers.to_pylist()))
+
+
+def read_parquet(path: Path, time: str, episode: int | None) -> list[Table]:
+    """Read a Parquet file; of a LeRobot data set one episode, with its own stamps as times.
+
+    **Raises:** `ValueError` for a file of several episodes where none is named, and for an episode
+    that it does not have.
+    """
+    from pyarrow import compute, parquet
+
+    table = parquet.read_table(path)
+    if not {EPISODE, FRAME, STAMP} <= set(table.column_names):
+        if episode is not None:
+            raise ValueError(f"{path} has no episodes: it lacks the columns of a LeRobot data set")
+        return [table]
+    numbers = sorted(table.column(EPISODE).unique().to_pylist())
+    if episode is None and len(numbers) > 1:
+        raise ValueError(
+            f"{path} has episodes {numbers[0]} to {numbers[-1]}: name one, as in episode="
+            f"{numbers[0]}, or judge all of them"
+        )
+    if episode is not None and episode not in numbers:
+        raise ValueError(f"{path} has no episode {episode}, but {numbers[0]} to {numbers[-1]}")
+    if episode is not None:
+        table = table.filter(compute.field(EPISODE) == episode)
+    if time not in table.column_names:
+        names = [time if name == STAMP else name for name in table.column_names]
+        table = table.rename_columns(names)
+    return [table]

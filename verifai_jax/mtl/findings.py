@@ -1,0 +1,84 @@
+"""Findings on formulas that are suspicious, as sentences and as a table."""
+
+import functools
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+from verifai_jax.core.notebook import InNotebook, frame_html
+from verifai_jax.core.text import counted, listed
+from verifai_jax.mtl.requirements import Requirement
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+class Finding(NamedTuple):
+    """Something suspicious about a formula.
+
+    - `requirement`: its identifier.
+    - `kind`: `"signal"`, `"window"`, `"vacuous"`, `"never near"`, `"never holds"`, `"until"`,
+      `"units"`, `"no effect"`, `"always true"`, `"always false"`, or `"no verdict"`.
+    - `part`: the part of the formula that it is about.
+    - `sentence`: what is so.
+    - `advice`: what was probably meant.
+    """
+
+    requirement: str
+    kind: str
+    part: str
+    sentence: str
+    advice: str = ""
+
+
+@dataclass(frozen=True)
+class Findings(InNotebook):
+    """Findings on formulas; `str()` writes them, and they are false where there are none.
+
+    - `recordings`: how many were looked at.
+    - `unread`: signals of the recordings that no formula reads.
+    """
+
+    requirements: tuple[Requirement, ...] = field(repr=False)
+    findings: tuple[Finding, ...]
+    recordings: int
+    unread: tuple[str, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.findings)
+
+    def __iter__(self) -> Iterator[Finding]:
+        return iter(self.findings)
+
+    def __len__(self) -> int:
+        return len(self.findings)
+
+    @functools.cached_property
+    def table(self) -> "pd.DataFrame":
+        """A row for each finding; its columns are the fields of `Finding`."""
+        import pandas as pd
+
+        return pd.DataFrame(list(self.findings), columns=list(Finding._fields))
+
+    def summary(self) -> str:
+        """Write each finding as a sentence, below the formula that it is about."""
+        lines = [
+            f"{counted(len(self.findings), 'finding')} on "
+            f"{counted(len(self.requirements), 'formula')}, "
+            f"with {counted(self.recordings, 'recording')}"
+        ]
+        for each in self.requirements:
+            own = [finding for finding in self.findings if finding.requirement == each.id]
+            lines += ["", f"{each.id}  {each.formula}"] if own else []
+            for finding in own:
+                lines.append(f"  {finding.kind}: {finding.sentence}")
+                lines += [f"    {finding.advice}"] if finding.advice else []
+        if self.unread:
+            lines += ["", f"No formula reads {listed(self.unread)}."]
+        return "\n".join(lines)
+
+    __str__ = summary
+
+    def _notebook_parts(self) -> Iterable[str]:
+        if self.findings:
+            yield frame_html(self.table)

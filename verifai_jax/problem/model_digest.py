@@ -1,0 +1,28 @@
+"""The identity of what a problem simulates, apart from the formulas that judge it."""
+
+import jax
+
+from verifai_jax.core.fingerprint import fingerprint, identity, stable_text
+from verifai_jax.core.precision import truncate_silently
+from verifai_jax.problem.problem import Problem
+
+
+@truncate_silently()
+def digest_of_model(problem: Problem) -> str:
+    """Return a hash of the system, the features and the constraint of a problem.
+
+    It is taken from what JAX traces, so that other text in the same file leaves it as it is.
+
+    **Returns:** hexadecimal digits; nothing for a black box, and where JAX cannot look into a part.
+    """
+    if problem.black_box:
+        return ""
+    space, system = problem.space, problem.system
+    features, key = space.feature_form, jax.eval_shape(lambda: jax.random.key(0))
+    programs = [jax.make_jaxpr(lambda f, k: system(f, k))(features, key)]
+    programs += [] if space.where is None else [jax.make_jaxpr(space.accepts)(features)]
+    hashes = [fingerprint(each, derivatives=False) for each in programs]
+    if None in hashes:
+        return ""
+    domains = {name: stable_text(each) for name, each in space.domains.items()}
+    return identity(*hashes, domains, stable_text(problem.form()), problem.end) or ""

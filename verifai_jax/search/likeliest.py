@@ -1,0 +1,43 @@
+"""Failures as likely as they come: a search that learns how likely what it found is.
+
+    Likeliest(CrossEntropy())
+    vj.falsify(problem, objective="likelihood")         # the same, around the default search
+
+The loop gives it another objective than the robustness (`falsification/likelihood.py`); the search
+inside goes on as ever.
+"""
+
+from dataclasses import dataclass, replace
+
+from jaxtyping import PyTree
+
+from verifai_jax.search.base import Search, Wants
+from verifai_jax.search.wrapper import Wrapper
+
+
+@dataclass(frozen=True)
+class Likeliest(Wrapper[PyTree]):
+    """Another search, which learns of likely failures that they are the best.
+
+    **Arguments:**
+
+    - `search`: the one inside; it must learn.
+
+    **Raises:** `TypeError` for anything that is not a search; `ValueError` for one that does not
+    learn, or of whose failures the objective says nothing.
+    """
+
+    search: Search
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.search.learns or self.search.wants.outcomes or self.search.wants.coverage_ids:
+            raise ValueError(
+                "only a search that learns from the robustness alone can look for likely failures, "
+                f"such as 'portfolio' or 'cross_entropy'; got {self.search!r}"
+            )
+
+    @property
+    def wants(self) -> Wants:
+        # A model of the traces would propose what fails by most.
+        return replace(self.search.wants, likelihood=True, traces=None)

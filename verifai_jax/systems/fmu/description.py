@@ -1,0 +1,210 @@
+"""The description of an FMU: its variables with types, units and ranges, and what it can do.
+
+description = read_description("model.fmu")
+description.variables["m"].unit, description.identifier
+
+Nothing is trusted: a document type declaration, by which XML could read files or grow without
+bound, is refused.
+"""
+
+import math
+import platform
+import sys
+import zipfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.parsers import expat
+
+from verifai_jax.core.errors import missing_name
+
+MAX_BYTES = 64 << 20
+"""Bytes of a description at most."""
+TYPES = {
+    "Real": "Real", "Integer": "Integer", "Boolean": "Boolean", "String": "String",
+    "Enumeration": "Integer",
+}  # fmt: skip
+"""Types of variables of FMI 2, and by which functions their values are set and read."""
+TYPES3 = {
+    **{name: name for name in ("Float64", "Float32", "Boolean", "String")},
+    **{f"{sign}Int{bits}": f"{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64)},
+    "Enumeration": "Int64",
+}
+"""The same of FMI 3."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A scalar variable of an FMU.
+
+    - `name`, `reference`, `description`: as the FMU gives them.
+    - `type`: name of the functions that set and read it, such as `Real` or `Float64`.
+    - `causality`: `parameter`, `input`, `output`, `local` ...
+    - `variability`: `constant`, `fixed`, `tunable`, `discrete` or `continuous`.
+    - `unit`: empty if there is none.
+    - `start`: its start value as text; None without one.
+    - `low`, `high`: declared range; infinite where it has no end.
+    - `scalar`: whether it is no array.
+    """
+
+    name: str
+    reference: int
+    type: str
+    causality: str
+    variability: str
+    unit: str = ""
+    start: str | None = None
+    low: float = -math.inf
+    high: float = math.inf
+    description: str = ""
+    scalar: bool = True
+
+    @property
+    def settable(self) -> bool:
+        """True where a value can be given before a simulation begins."""
+        return self.causality == "input" or (
+            self.variability != "constant" and self.start is not None
+        )
+
+
+@dataclass(frozen=True)
+class Description:
+    """The description of an FMU, read from its archive.
+
+    - `file`: the FMU.
+    - `version`: the version of FMI, 2 or 3.
+    - `name`: the name of the model.
+    - `identifier`: the identifier of the binary for co-simulation.
+    - `token`: by which the binary knows its description.
+    - `variables`: by name.
+    """
+
+    file: Path
+    version: int
+    name: str
+    identifier: str
+    token: str
+    variables: dict[str, Variable] = field(repr=False)
+
+    def variable(self, name: str) -> Variable:
+        """Return a scalar variable.
+
+        **Raises:** `ValueError` for one that does not exist, or that is an array or a text.
+        """
+        if name not in self.variables:
+            raise missing_name(f"the FMU {self.file.name}", "variable", name, list(self.variables))
+        found = self.variables[name]
+        if not found.scalar or found.type == "String":
+            kind = "a text" if found.scalar else "an array"
+            raise ValueError(f"{name} of the FMU {self.file.name} is {kind}, not one number")
+        return found
+
+    @property
+    def binary(self) -> str:
+        """Path within the archive of the binary for this machine.
+
+        **Raises:** `ValueError` where there is none.
+        """
+        system = {"linux": "linux", "darwin": "darwin", "win32": "win"}.get(sys.platform, "linux")
+        ending = {"linux": "so", "darwin": "dylib", "win": "dll"}[system]
+        machine = {"AMD64": "x86_64", "arm64": "aarch64"}.get(
+            platform.machine(), platform.machine()
+        )
+        folder = f"{system}64" if self.version == 2 else f"{machine}-{system}"
+        if self.version == 3 and system == "win":
+            folder = f"{machine}-windows"
+        wanted = f"binaries/{folder}/{self.identifier}.{ending}"
+        with zipfile.ZipFile(self.file) as archive:
+            names = archive.namelist()
+        if wanted not in names:
+            there = sorted({n.split("/")[1] for n in names if n.startswith("binaries/")} - {""})
+            raise ValueError(
+                f"the FMU {self.file.name} has no binary for this machine ({wanted}); it has "
+                f"{', '.join(there) or 'none'}. Export it for this platform, or simulate where "
+                "it runs (vj.remote)"
+            )
+        return wanted
+
+
+def read_description(file: str | Path) -> Description:
+    """Read the description of an FMU.
+
+    **Raises:** `FileNotFoundError`; `ValueError` for a file that is no FMU of FMI 2 or 3, has no
+    co-simulation, or declares a document type.
+    """
+    path = Path(file).absolute()
+    if not path.exists():
+        raise FileNotFoundError(f"there is no FMU {path}")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if archive.getinfo("modelDescription.xml").file_size > MAX_BYTES:
+                raise ValueError(
+                    f"the modelDescription.xml of {path.name} is over {MAX_BYTES} bytes"
+                )
+            root = _parsed(archive.read("modelDescription.xml"), path)
+    except (zipfile.BadZipFile, KeyError) as error:
+        raise ValueError(
+            f"{path.name} is no FMU: an archive with modelDescription.xml is expected ({error})"
+        ) from error
+    version = root.get("fmiVersion", "").split(".")[0]
+    if version not in ("2", "3"):
+        raise ValueError(
+            f"{path.name} is of FMI {root.get('fmiVersion', 'without a version')}; 2 and 3 can be "
+            "simulated"
+        )
+    simulation = root.find("CoSimulation")
+    if simulation is None:
+        raise ValueError(
+            f"the FMU {path.name} has no co-simulation, so that it lacks a solver of its own; "
+            "export it again for co-simulation"
+        )
+    token = root.get("guid") if version == "2" else root.get("instantiationToken")
+    return Description(
+        path, int(version), root.get("modelName", path.stem),
+        simulation.get("modelIdentifier", ""), token or "", _variables(root, int(version)),
+    )  # fmt: skip
+
+
+def _parsed(text: bytes, path: Path) -> ElementTree.Element:
+    def refuse(*_: object) -> None:
+        raise ValueError(
+            f"the modelDescription.xml of {path.name} declares a document type (DTD), which no FMU "
+            "needs and which could read files"
+        )
+
+    scanner = expat.ParserCreate()
+    scanner.StartDoctypeDeclHandler = refuse
+    try:
+        scanner.Parse(text, True)
+        return ElementTree.fromstring(text)
+    except (expat.ExpatError, ElementTree.ParseError) as error:
+        raise ValueError(f"the modelDescription.xml of {path.name} is no XML: {error}") from error
+
+
+def _variables(root: ElementTree.Element, version: int) -> dict[str, Variable]:
+    declared: dict[str, dict[str, str]] = {}
+    for each in root.iterfind("TypeDefinitions/*"):
+        inner = each if version == 3 else next(iter(each), each)
+        declared[each.get("name", "")] = dict(inner.attrib)
+    found = {}
+    for element in root.iterfind("ModelVariables/*"):
+        value = element if version == 3 else next(iter(element), element)
+        attributes = {**declared.get(value.get("declaredType", ""), {}), **value.attrib}
+        kind = (TYPES3 if version == 3 else TYPES).get(value.tag)
+        if kind is None:  # Clocks and binary data.
+            continue
+        name = element.get("name", "")
+        continuous = value.tag in ("Real", "Float64", "Float32")
+        start = value.get("start")
+        texts = value.find("Start")
+        if start is None and texts is not None:
+            start = texts.get("value")
+        found[name] = Variable(
+            name, int(element.get("valueReference", "0")), kind,
+            element.get("causality", "local"),
+            element.get("variability", "continuous" if continuous else "discrete"),
+            attributes.get("unit", ""), start, float(attributes.get("min", "-inf")),
+            float(attributes.get("max", "inf")), element.get("description", ""),
+            value.find("Dimension") is None,
+        )  # fmt: skip
+    return found

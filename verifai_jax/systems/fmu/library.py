@@ -1,0 +1,210 @@
+"""The binary of an FMU, called through ctypes: instances of FMI 2 and 3 for co-simulation.
+
+instance = Instance(description, folder)            # folder: where the FMU is unpacked
+instance.begin({"m": 2.0}, duration=4.0)
+instance.set({"force": 1.0}); instance.step(0.0, 0.02); instance.get(["x", "v"])
+
+An FMU is a program of this process: what it does to the process it does to the simulation's worker.
+"""
+
+import ctypes
+from collections.abc import Mapping, Sequence
+from ctypes import byref, c_bool, c_char_p, c_double, c_int, c_size_t, c_uint32, c_void_p
+from pathlib import Path
+from typing import Any
+
+from verifai_jax.systems.fmu.description import Description, Variable
+
+OK, WARNING, DISCARD = 0, 1, 2
+"""Statuses of FMI after which a simulation may go on, and the one of a step that was cut short."""
+C_TYPES: dict[str, Any] = {
+    "Real": c_double, "Integer": c_int, "Boolean": c_int, "Float64": c_double,
+    "Float32": ctypes.c_float, "Int8": ctypes.c_int8, "Int16": ctypes.c_int16,
+    "Int32": ctypes.c_int32, "Int64": ctypes.c_int64, "UInt8": ctypes.c_uint8,
+    "UInt16": ctypes.c_uint16, "UInt32": ctypes.c_uint32, "UInt64": ctypes.c_uint64,
+}  # fmt: skip
+"""C types of the values; Boolean is one byte in FMI 3."""
+MESSAGES = 5
+"""Last messages of an FMU that an error repeats."""
+
+Logger2 = ctypes.CFUNCTYPE(None, c_void_p, c_char_p, c_int, c_char_p, c_char_p)
+Logger3 = ctypes.CFUNCTYPE(None, c_void_p, c_int, c_char_p, c_char_p)
+
+
+class _Callbacks(ctypes.Structure):
+    """The functions that an FMU of FMI 2 is given."""
+
+    _fields_ = (
+        ("logger", Logger2),
+        ("allocate", c_void_p),
+        ("free", c_void_p),
+        ("finished", c_void_p),
+        ("environment", c_void_p),
+    )
+
+
+class FMUError(RuntimeError):
+    """A function of an FMU failed; the message is what the FMU said."""
+
+
+class Instance:
+    """An instance of an FMU; `begin` may be called again after a simulation.
+
+    **Arguments:**
+
+    - `description`: the description of the FMU.
+    - `folder`: where the FMU is unpacked.
+
+    **Raises:** `FMUError` where the binary cannot be loaded or does not make an instance.
+    """
+
+    def __init__(self, description: Description, folder: Path) -> None:
+        self.description, self.messages = description, []
+        self._groups: dict[tuple[str, ...], list[tuple[str, list[int], Any, Any]]] = {}
+        three = description.version == 3
+        self._prefix = f"fmi{description.version}"
+        try:
+            self._library = ctypes.CDLL(str(folder / description.binary))
+        except OSError as error:
+            raise FMUError(f"{description.file.name} cannot be loaded: {error}") from error
+        # Kept, since the FMU calls them as long as it lives.
+        self._logger: Any = (Logger3 if three else Logger2)(self._log3 if three else self._log2)
+        resources = folder / "resources"
+        token, name = description.token.encode(), description.name.encode()
+        if three:
+            make = self._function("InstantiateCoSimulation", c_void_p)
+            path = f"{resources}/".encode()
+            self._component = make(
+                c_char_p(name), c_char_p(token), c_char_p(path), c_bool(False), c_bool(False),
+                c_bool(False), c_bool(False), c_void_p(), c_size_t(0), c_void_p(), self._logger,
+                c_void_p(),
+            )  # fmt: skip
+        else:
+            own = ctypes.CDLL(None)
+            pointers = (ctypes.cast(f, c_void_p) for f in (own.calloc, own.free))
+            self._callbacks = _Callbacks(self._logger, *pointers, None, None)
+            make = self._function("Instantiate", c_void_p)
+            self._component = make(
+                c_char_p(name), c_int(1), c_char_p(token), c_char_p(resources.as_uri().encode()),
+                byref(self._callbacks), c_int(0), c_int(0),
+            )  # fmt: skip
+        if not self._component:
+            raise FMUError(f"{description.file.name} made no instance{self._said()}")
+        self._begun = False
+
+    def begin(self, values: Mapping[str, float], duration: float) -> None:
+        """Set start values, and initialize; after an earlier simulation the instance is reset."""
+        if self._begun:
+            self._call("Terminate")
+            self._call("Reset")
+        self._begun = True
+        end = (c_bool(True), c_double(duration))
+        if self.description.version == 2:
+            rest = (c_int(0), c_double(0.0), c_double(0.0), c_int(1), c_double(duration))
+            self._call("SetupExperiment", *rest)
+            self.set(values)
+            self._call("EnterInitializationMode")
+        else:
+            self.set(values)
+            start = (c_bool(False), c_double(0.0), c_double(0.0))
+            self._call("EnterInitializationMode", *start, *end)
+        self._call("ExitInitializationMode")
+
+    def step(self, time: float, size: float) -> bool:
+        """Simulate one step; False if the FMU ended its simulation."""
+        if self.description.version == 2:
+            status = self._call("DoStep", c_double(time), c_double(size), c_int(1))
+            return status != DISCARD
+        flags = [c_bool(False) for _ in range(3)]
+        last = c_double(0.0)
+        pointers = (byref(flag) for flag in flags)
+        status = self._call(
+            "DoStep", c_double(time), c_double(size), c_bool(True), *pointers, byref(last)
+        )
+        return status != DISCARD and not flags[1].value
+
+    def set(self, values: Mapping[str, float]) -> None:
+        """Set variables by name."""
+        for kind, indices, references, buffer in self._grouped(tuple(values)):
+            numbers = list(values.values())
+            for i, index in enumerate(indices):
+                buffer[i] = numbers[index] if kind in FLOATS else round(numbers[index])
+            self._exchange("Set", kind, references, buffer)
+
+    def get(self, names: Sequence[str]) -> list[float]:
+        """Return the values of variables by name."""
+        found = [0.0] * len(names)
+        for kind, indices, references, buffer in self._grouped(tuple(names)):
+            self._exchange("Get", kind, references, buffer)
+            for i, index in enumerate(indices):
+                found[index] = float(buffer[i])
+        return found
+
+    def free(self) -> None:
+        """Give the instance back; it cannot be used any more."""
+        component, self._component = self._component, None
+        if component:
+            self._function("FreeInstance", None)(c_void_p(component))
+
+    def _grouped(self, names: tuple[str, ...]) -> list[tuple[str, list[int], Any, Any]]:
+        """Return variables by type: their indices, references, and a buffer for their values."""
+        if names not in self._groups:
+            by_type: dict[str, list[tuple[int, Variable]]] = {}
+            for index, name in enumerate(names):
+                variable = self.description.variable(name)
+                by_type.setdefault(variable.type, []).append((index, variable))
+            self._groups[names] = [
+                (
+                    kind,
+                    [index for index, _ in those],
+                    (c_uint32 * len(those))(*(variable.reference for _, variable in those)),
+                    (self._c_type(kind) * len(those))(),
+                )
+                for kind, those in by_type.items()
+            ]
+        return self._groups[names]
+
+    def _c_type(self, kind: str) -> Any:
+        return c_bool if kind == "Boolean" and self.description.version == 3 else C_TYPES[kind]
+
+    def _exchange(self, verb: str, kind: str, references: Any, buffer: Any) -> None:
+        count = c_size_t(len(references))
+        counts = (count,) if self.description.version == 3 else ()
+        self._call(f"{verb}{kind}", references, count, buffer, *counts)
+
+    def _call(self, name: str, *arguments: Any) -> int:
+        """Call a function of the instance.
+
+        **Raises:** `FMUError` where it fails.
+        """
+        status = self._function(name, c_int)(c_void_p(self._component), *arguments)
+        if status > DISCARD or (status == DISCARD and name != "DoStep"):
+            raise FMUError(
+                f"{self._prefix}{name} of {self.description.file.name} failed with status "
+                f"{status}{self._said()}"
+            )
+        return status
+
+    def _function(self, name: str, returns: Any) -> Any:
+        try:
+            function = getattr(self._library, f"{self._prefix}{name}")
+        except AttributeError:
+            raise FMUError(
+                f"the binary of {self.description.file.name} has no {self._prefix}{name}"
+            ) from None
+        function.restype = returns
+        return function
+
+    def _said(self) -> str:
+        return f": {'; '.join(self.messages[-MESSAGES:])}" if self.messages else ""
+
+    def _log2(self, _: Any, name: Any, status: int, category: Any, message: bytes | None) -> None:
+        self._log3(_, status, category, message)
+
+    def _log3(self, _: Any, status: int, category: Any, message: bytes | None) -> None:
+        if status > OK and message:
+            self.messages.append(message.decode(errors="replace").strip())
+
+
+FLOATS = ("Real", "Float64", "Float32")
+"""Types whose values are not rounded."""

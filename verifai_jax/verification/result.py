@@ -1,0 +1,243 @@
+"""The result of a verification: proved, broken and undecided parts of a feature space.
+
+result.proved, result.broken, result.undecided      # Part(mass, volume), which sum to one
+result.table                                        # a row for each box
+result.save("verified.json"); load_verification("verified.json")
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float
+
+from verifai_jax.core.figure import Drawn
+from verifai_jax.core.notebook import InNotebook, frame_html, picture_html
+from verifai_jax.core.text import counted, format_percent
+from verifai_jax.problem.problem import Problem
+from verifai_jax.statistics.confidence_sequences import anytime_interval
+from verifai_jax.store.files import DamagedError, read_record, write_record
+from verifai_jax.verification.boxes import BROKEN, OUTSIDE, PROVED, Boxes
+
+KIND = "verification"
+
+
+class Part(NamedTuple):
+    """A part of a feature space: its share of the prior, and of the volume of the features."""
+
+    mass: float
+    volume: float
+
+
+@dataclass(frozen=True, eq=False)
+class Verification(Drawn, InNotebook):
+    """The result of `verify`.
+
+    - `name`: the name of the problem; `columns`: its unit coordinates.
+    - `boxes`: the partition of the unit cube; `shares`, `upper_shares`: the corners of the boxes as
+      shares of the range of the features.
+    - `features`, `formulas`, `precision`: what was verified.
+    - `confidence`: the confidence of bounds by samples.
+    - `looked_at`: boxes that were looked at; `simulations`; `seconds`; `stopped`: why it ended.
+    - `notes` for people; `version`.
+    """
+
+    _picture = "verification", "plot_verification"
+
+    name: str
+    columns: tuple[str, ...]
+    boxes: Boxes = field(repr=False)
+    shares: Float[np.ndarray, "n dim"] = field(repr=False)
+    upper_shares: Float[np.ndarray, "n dim"] = field(repr=False)
+    features: Mapping[str, str]
+    formulas: Mapping[str, str]
+    precision: str
+    confidence: float
+    looked_at: int
+    simulations: int
+    seconds: float
+    stopped: str
+    notes: tuple[str, ...]
+    version: str
+
+    @cached_property
+    def verdicts(self) -> np.ndarray:
+        """`"proved"`, `"broken"`, `"undecided"` or `"outside"` (of the constraint), box by box."""
+        words = np.array(["undecided", "proved", "broken", "outside"])[self.boxes.state]
+        return np.where(self.boxes.confirmed, "broken", words)
+
+    def _part(self, rows: Bool[np.ndarray, " n"]) -> Part:
+        inside = self.boxes.state != OUTSIDE
+        shares = []
+        for weights in (self.boxes.mass, np.prod(self.upper_shares - self.shares, axis=1)):
+            whole = weights[inside].sum()
+            shares.append(float(weights[rows & inside].sum() / whole) if whole > 0 else 0.0)
+        return Part(*shares)
+
+    @property
+    def proved(self) -> Part:
+        """The part in which no point fails."""
+        return self._part(self.boxes.state == PROVED)
+
+    @property
+    def broken(self) -> Part:
+        """The boxes that contain a point which fails for certain."""
+        return self._part(self.verdicts == "broken")
+
+    @property
+    def throughout(self) -> Part:
+        """The part of `broken` in which every point fails."""
+        return self._part(self.boxes.state == BROKEN)
+
+    @property
+    def undecided(self) -> Part:
+        """The rest."""
+        return self._part(self.verdicts == "undecided")
+
+    @property
+    def failure_bound(self) -> float:
+        """An upper bound of the failure probability within the undecided part, by samples."""
+        rows = self.verdicts == "undecided"
+        count = int(self.boxes.samples[rows].sum())
+        if not rows.any():
+            return 0.0
+        if not count:
+            return 1.0
+        failures = int(self.boxes.failures[rows].sum())
+        return anytime_interval(failures, count, self.confidence).high
+
+    @property
+    def probability(self) -> tuple[float, float]:
+        """Bounds of the failure probability: certain below; above certain for what is decided."""
+        high = self.broken.mass + self.undecided.mass * self.failure_bound
+        return self.throughout.mass, min(1.0, high)
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """A row for each box, the largest first.
+
+        `verdict`, `throughout` (every point fails), `mass`, `volume`, bounds of the robustness,
+        `failure_bound` (of its failure probability by its own samples, at the confidence for each
+        box by itself), and the ends of each coordinate, as shares of the range of its feature.
+        """
+        boxes = self.boxes
+        bound = np.where(boxes.state == PROVED, 0.0, 1.0)
+        for i in np.flatnonzero((boxes.samples > 0) & (self.verdicts == "undecided")):
+            counts = int(boxes.failures[i]), int(boxes.samples[i])
+            bound[i] = anytime_interval(*counts, self.confidence).high
+        rows: dict[str, Any] = {
+            "verdict": self.verdicts, "throughout": boxes.state == BROKEN, "mass": boxes.mass,
+            "volume": np.prod(self.upper_shares - self.shares, axis=1), "lowest": boxes.lowest,
+            "highest": boxes.highest, "failure_bound": bound,
+        }  # fmt: skip
+        for j, column in enumerate(self.columns):
+            rows[f"{column} from"] = self.shares[:, j]
+            rows[f"{column} to"] = self.upper_shares[:, j]
+        return pd.DataFrame(rows).sort_values("mass", ascending=False, kind="stable")
+
+    def __str__(self) -> str:
+        def line(name: str, part: Part, text: str) -> str:
+            if not part.mass:
+                return f"  {name:<12} nothing"
+            mass, volume = map(format_percent, part)
+            return f"  {name:<12} {mass} of the prior, {volume} of the volume: {text}"
+
+        low, high = self.probability
+        proved, broken, undecided = self.proved, self.broken, self.undecided
+        shares = [format_percent(part.mass) for part in (proved, broken, undecided)]
+        sure = format_percent(self.confidence)
+        count = counted(int(self.boxes.samples.sum()), "sample")
+        lines = [
+            f"{self.name}: {shares[0]} of the prior is proved, {shares[1]} broken, {shares[2]} "
+            "undecided",
+            line("proved", proved, "no point of it fails"),
+            line(
+                "broken", broken, "boxes with a point that fails for certain; in "
+                f"{format_percent(self.throughout.mass)} of the prior every point does",
+            ),
+            line(
+                "undecided", undecided, f"at most {format_percent(self.failure_bound)} of it "
+                f"fails, at {sure} by {count}",
+            ),
+            f"  failing      {format_percent(low)} of the prior at least, "
+            f"{format_percent(high)} at most{f' at {sure}' * (undecided.mass > 0)}",
+            f"  boxes        {len(self.boxes):,} of {self.looked_at:,} that were looked at, "
+            f"{self.simulations:,} simulations in {self.seconds:z.1f} s, stopped: {self.stopped}",
+            "  verified     the system in discrete time as it is simulated, in real arithmetic and "
+            f"with the rounding of {self.precision}; no differential equation",
+        ]  # fmt: skip
+        return "\n".join([*lines, *(f"  note         {note}" for note in self.notes)])
+
+    __repr__ = __str__
+
+    def _notebook_parts(self) -> list[str]:
+        return [picture_html(self.plot()), frame_html(self.table)]
+
+    def check_same(self, problem: Problem, precision: str) -> None:
+        """Refuse to go on with the result of another problem.
+
+        **Raises:** `ValueError` that says what differs.
+        """
+        for what, now in {**described(problem), "precision": precision}.items():
+            then = getattr(self, what)
+            if then != now:
+                raise ValueError(
+                    f"verify cannot go on with the result of another problem: its {what} was "
+                    f"{then!r}, and is {now!r} now"
+                )
+
+    def save(self, path: str | Path) -> Path:
+        """Write the result as JSON; `load_verification` reads it.
+
+        **Arguments:**
+
+        - `path`: the path of the file, whose folder is made.
+
+        **Returns:** the path.
+
+        **Raises:** `OSError` that names the file, for whatever the file system refuses.
+        """
+        plain = {name: value for name, value in vars(self).items()
+                 if name in self.__dataclass_fields__}  # fmt: skip
+        for name in ("shares", "upper_shares"):
+            plain[name] = plain[name].tolist()
+        arrays = {name: array.tolist() for name, array in asdict(self.boxes).items()}
+        write_record(Path(path), {"kind": KIND, **plain, "boxes": arrays}, locked=False)
+        return Path(path)
+
+
+def described(problem: Problem) -> dict[str, Any]:
+    """Return what a result records of its problem."""
+    return {
+        "name": problem.name,
+        "features": {name: repr(domain) for name, domain in problem.space.domains.items()},
+        "formulas": {name: str(formula) for name, formula in problem.formulas.items()},
+    }
+
+
+def load_verification(path: str | Path) -> Verification:
+    """Read a result that `Verification.save` has written.
+
+    **Raises:** `FileNotFoundError`; `DamagedError` for a file that is not as it was written, or is
+    no such result.
+    """
+    record = read_record(Path(path))
+    if record.pop("kind", None) != KIND:
+        raise DamagedError(f"{path} is no result of verify")
+    dim = len(record["columns"])
+    types = {"state": int, "failures": int, "samples": int, "confirmed": bool}
+    arrays = {
+        name: np.array(values, types.get(name, float)) for name, values in record["boxes"].items()
+    }
+    for name in ("low", "high", "witness"):
+        arrays[name] = arrays[name].reshape(-1, dim)
+    record["boxes"] = Boxes(**arrays)
+    for name in ("shares", "upper_shares"):
+        record[name] = np.array(record[name], float).reshape(-1, dim)
+    for name in ("columns", "notes"):
+        record[name] = tuple(record[name])
+    return Verification(**record)
