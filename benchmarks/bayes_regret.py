@@ -130,7 +130,9 @@ def ours(search: Bayes, function: Callable, d: int, budget: int, batch: int, see
         return search.tell(state, cube, told), rho - RAISED
 
     def one(key):
-        return jax.lax.scan(play, search.init(key, cube, batch), None, length=-(-budget // batch))[1]
+        return jax.lax.scan(play, search.init(key, cube, batch), None, length=-(-budget // batch))[
+            1
+        ]
 
     keys = jnp.stack([jax.random.key(seed) for seed in seeds])
     return np.asarray(jax.jit(partial(jax.lax.map, one))(keys)).reshape(len(seeds), -1)[:, :budget]
@@ -141,9 +143,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--batches", type=int, nargs="+", default=[1, 8])
-    parser.add_argument(
-        "--rules", nargs="+", default=["thompson", "expected_improvement"]
-    )
+    parser.add_argument("--rules", nargs="+", default=["thompson", "expected_improvement"])
     parser.add_argument("--reference", type=Path, help="folder with regrets of the plain process")
     parser.add_argument("--cases", nargs="+", default=list(CASES))
     chosen = parser.parse_args()

@@ -6,9 +6,13 @@ Each round asks for a batch of points that might fail, by one of two rules.
   batches Hernandez-Lobato et al., Parallel and distributed Thompson sampling for large-scale
   accelerated exploration of chemical space, ICML 2017). The functions are whole ones, so the minima
   are sought in two steps: over candidates that all share, then around each function's best.
-- Expected improvement, with local penalization of the points already chosen for the batch
+- Expected improvement, whose maxima are sought by `curvature`, with local penalization of the points already chosen for the batch
   (Gonzalez, Dai, Hennig, Lawrence, Batch Bayesian optimization via local penalization,
   AISTATS 2016).
+
+While no failure is known, every fourth point refines the best one: by a process of the points near
+it alone, over the box around them, almost without regard to what it does not know. Where
+simulations had no verdict another process says how likely one is.
 
 All failures are equally good: below zero the target is flat. Above it is logarithmic in the
 robustness over its lower quartile, and capped, so that huge values do not hide the rest.
@@ -236,7 +240,7 @@ class Bayes(Search[BayesState]):
             chosen = _minima(drawing, posterior, risk, cube, shared, later, paths)[:batch]
         else:
             chosen = _improving(posterior, risk, cube, (0.0, 1.0), 1.0, shared, batch)
-        # Where no failure is known every second point refines the best ones.
+        # Where no failure is known every fourth point refines the best one.
         refined = _refined(state, risk, cube, anywhere, batch)
         row = jnp.arange(batch, dtype=jnp.uint32)
         turn = (jnp.min(state.score) > 0) & ((state.proposals + row) % 4 == 0)
