@@ -2,8 +2,8 @@
 
     python benchmarks/bayes_regret.py [--seeds 10] [--batch 1] [--reference FOLDER]
 
-Branin's function and Hartmann's of six dimensions, raised so that their minimum is 10:
-nothing fails. The regret is what the lowest robustness of all simulations lies above 10. `half` has no
+Branin's function and Hartmann's of six dimensions, raised so that their minimum is 10: nothing
+fails. The regret is what the lowest robustness of all simulations lies above 10. `half` has no
 verdict (NaN) in half of the space. The plain process is written here with NumPy and SciPy: Matern
 5/2, length scales by the greatest evidence from three starts, expected improvement maximized from
 the best of 2000 points by L-BFGS-B, one point a round; rows without a verdict it has with the

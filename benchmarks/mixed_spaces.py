@@ -2,15 +2,15 @@
 
     python benchmarks/paired_searches.py mixed
 
-The last five came after the default search was chosen, and no number of it was. `SHARES` has the share of samples that fail. Where the robustness leads nowhere, no search can do
-better than samples of the prior; where many coordinates are choices, descents move only the others.
+The last five came after the default search, whose numbers were chosen with the others. `SHARES` has
+the share of samples that fail. Where the robustness leads nowhere, no search can do better than
+samples of the prior; where many coordinates are choices, descents move only the others.
 """
 
 import jax.numpy as jnp
 import numpy as np
 
 import verifai_jax as vj
-
 
 DOORS, RECIPE_LIMIT, CAPPED, QUEUE = 0.938, 3.3, 0.2, 27.86
 SINGLE = np.random.default_rng(47).normal(size=(5, 4))

@@ -6,9 +6,7 @@ Each round asks for a batch of points that might fail, by one of two rules.
   batches Hernandez-Lobato et al., Parallel and distributed Thompson sampling for large-scale
   accelerated exploration of chemical space, ICML 2017). The functions are whole ones, so the minima
   are sought in two steps: over candidates that all share, then around each function's best.
-- Expected improvement, whose maxima are sought by `curvature`, with local penalization of the points already chosen for the batch
-  (Gonzalez, Dai, Hennig, Lawrence, Batch Bayesian optimization via local penalization,
-  AISTATS 2016).
+- Expected improvement (`improvement`).
 
 While no failure is known, every fourth point refines the best one: by a process of the points near
 it alone, over the box around them, almost without regard to what it does not know. Where
@@ -25,15 +23,15 @@ from typing import ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import log_ndtr, ndtr
-from jaxtyping import Array, Bool, Float, Int, Key, UInt32
+from jax.scipy.special import log_ndtr
+from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Search, Wants, draw_uniform, standard_normal
-from verifai_jax.search.curvature import Curvature, advance, begin
 from verifai_jax.search.gaussian_process import Hyper, Posterior, TrainingData
 from verifai_jax.search.halton import halton_points
+from verifai_jax.search.improvement import APART, PARENTS, already_simulated, improving
 from verifai_jax.search.process_data import (
     LARGEST,
     NO_VERDICT,
@@ -51,14 +49,9 @@ from verifai_jax.search.process_data import (
 MAX_PATHS = 32  # functions drawn for a batch; larger batches take several points from each
 WAVES = 256  # random waves of such a function
 FIT_POINTS, FIT_STEPS = 192, 8
-PARENTS = 8  # best points around which candidates are drawn
-APART = (
-    1e-4  # distance from an observation in some coordinate, below which a point says nothing new
-)
-CLIMBS, CLIMB = 24, 0.05  # steps to a maximum of the expected improvement; their first length
 MARGIN = 0.1  # of the box around the best points, on each side
-REFITS = 20
-GREEDY = 0.1
+REFITS = 20  # steps of its fit, from the first hyper-parameters on
+GREEDY = 0.1  # factor on its standard deviations: it is there to refine
 PATIENCE = 80  # points without progress, after which half of them are those of the prior
 
 
@@ -239,7 +232,7 @@ class Bayes(Search[BayesState]):
         if self.acquisition == "thompson":
             chosen = _minima(drawing, posterior, risk, cube, shared, later, paths)[:batch]
         else:
-            chosen = _improving(posterior, risk, cube, (0.0, 1.0), 1.0, shared, batch)
+            chosen = improving(posterior, risk, cube, (0.0, 1.0), 1.0, shared, batch)
         # Where no failure is known every fourth point refines the best one.
         refined = _refined(state, risk, cube, anywhere, batch)
         row = jnp.arange(batch, dtype=jnp.uint32)
@@ -304,7 +297,7 @@ def _refined(
     hyper = process.fit(process.first(), data, REFITS)
     posterior = process.condition(hyper, data)
     shared = jnp.concatenate([(points - box[0]) / box[1], anywhere])
-    return _improving(posterior, risk, cube, box, GREEDY, shared, batch)
+    return improving(posterior, risk, cube, box, GREEDY, shared, batch)
 
 
 # How far around its best candidate a function's minimum is sought, in two steps: the largest and
@@ -331,7 +324,7 @@ def _minima(
         x = encode(u, cube)
         basis = process.basis(posterior, paths, x)
         # Simulated already: to be chosen only if there is nothing else.
-        return basis, risk(u) + 100.0 * _already_simulated(x, posterior)
+        return basis, risk(u) + 100.0 * already_simulated(x, posterior)
 
     shared = snap(shared, cube)
     terms, penalty = basis(shared)
@@ -359,83 +352,6 @@ def _minima(
     return best
 
 
-def _improving(
-    posterior: Posterior,
-    risk: Callable[[Float[Array, "m d"]], Float[Array, " m"]],
-    cube: Cube,
-    box: tuple[Array | float, Array | float],
-    doubt: float,
-    shared: Float[Array, "m d"],
-    batch: int,
-) -> Float[Array, "batch d"]:
-    """Return points with the largest expected improvement, each away from those before it.
-
-    - `box`: its lowest corner and its sides; the process and the candidates have coordinates in it.
-    - `doubt`: factor on the standard deviations, which a search for more than improvement needs.
-    """
-    process, discrete = process_of(cube), np.array(cube.levels) > 0
-    predict = process.predictor(posterior)
-    lowest = jnp.min(posterior.residual, where=posterior.mask, initial=jnp.inf)
-
-    def seen(v: Float[Array, "m d"]) -> Float[Array, "m d"]:
-        return jnp.where(discrete, encode(v, cube), v)
-
-    def merit(v: Float[Array, "m d"]) -> tuple[Array, Array, Array]:
-        mean, std = predict(seen(v))
-        std = doubt * std
-        worth = jnp.log(std) + _log_gain((lowest - mean) / std) - risk(box[0] + box[1] * v)
-        known = _already_simulated(seen(v), posterior)
-        return jnp.where(known, worth - 1e6, worth), mean, std
-
-    def loss(v: Float[Array, "n d"]) -> tuple[Array, Array]:
-        worth = merit(v)[0]
-        return -jnp.sum(worth), -worth
-
-    def climb(carry: tuple[Curvature, Array, Array], _: None) -> tuple:
-        state, v, fresh = carry
-        (_, value), slope = jax.value_and_grad(loss, has_aux=True)(v)
-        ok = jnp.isfinite(value) & jnp.all(jnp.isfinite(slope), axis=1)
-        value, slope = jnp.where(ok, value, 1e9), jnp.where(ok[:, None], slope, 0.0)
-        state, v = advance(state, v, value, slope, fresh, jnp.full(len(v), CLIMB))
-        return (state, v, jnp.zeros_like(fresh)), None
-
-    shared = snap(shared, cube)
-    worth, mean, std = merit(shared)
-    _, best = jax.lax.top_k(worth, PARENTS)
-    climbing = (begin(PARENTS, cube.dim), shared[best], jnp.ones(PARENTS, bool))
-    (state, _, _), _ = jax.lax.scan(climb, climbing, None, length=CLIMBS)
-    v = jnp.concatenate([shared, state.point])
-    worth, mean, std = (
-        jnp.concatenate([one, two])
-        for one, two in zip((worth, mean, std), merit(state.point), strict=True)
-    )
-    x = seen(v)
-    gradient = jax.grad(lambda x: jnp.sum(predict(x)[0]))(x)
-    steepest = jnp.maximum(jnp.sqrt(jnp.max(jnp.sum(gradient**2, axis=1))), 1e-3)
-    codes = np.array(process.unordered)
-
-    def choose(worth: Float[Array, " m"], _: None) -> tuple[Array, Array]:
-        best = jnp.argmax(worth)
-        # Codes that differ are as far apart as the cube is wide.
-        apart = jnp.where(codes, x != x[best], x - x[best])
-        distance = jnp.sqrt(jnp.sum(apart**2, axis=1))
-        # Probability that no point so good lies between there and the one chosen.
-        z = (steepest * distance - mean[best] + lowest) / std[best]
-        return (worth + log_ndtr(z)).at[best].set(-jnp.inf), best
-
-    _, chosen = jax.lax.scan(choose, worth, None, length=batch)
-    return box[0] + box[1] * v[chosen]
-
-
-def _log_gain(z: Float[Array, " m"]) -> Float[Array, " m"]:
-    """Return the logarithm of the expected improvement of a value, in its standard deviations."""
-    near, far = jnp.maximum(z, -4.0), jnp.minimum(z, -4.0)
-    gain = near * ndtr(near) + jnp.exp(-0.5 * near**2) / np.sqrt(2 * np.pi)
-    # Far below zero the sum above is rounding errors; two terms of its series instead.
-    series = -0.5 * far**2 - 0.5 * np.log(2 * np.pi) - jnp.log(far**2 + 3)
-    return jnp.where(z > -4, jnp.log(gain), series)
-
-
 def _near(
     parent: Float[Array, "n d"],
     random: Float[Array, "n r"],
@@ -453,8 +369,3 @@ def _near(
     # An unordered choice has no neighbours: any other.
     codes = np.array(process_of(cube).unordered)
     return jnp.where(moves, jnp.where(codes, noise, moved), parent)
-
-
-def _already_simulated(x: Float[Array, "m d"], posterior: Posterior) -> Bool[Array, " m"]:
-    distance = jnp.max(jnp.abs(x[:, None] - posterior.x[None]), axis=2)
-    return jnp.any((distance < APART) & posterior.mask, axis=1)
