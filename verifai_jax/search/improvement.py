@@ -66,17 +66,19 @@ def improving(
         ok = jnp.isfinite(value) & jnp.all(jnp.isfinite(slope), axis=1)
         value, slope = jnp.where(ok, value, 1e9), jnp.where(ok[:, None], slope, 0.0)
         state, v = advance(state, v, value, slope, fresh, jnp.full(len(v), CLIMB))
-        return (state, v, jnp.zeros_like(fresh)), None
+        return (state, v, jnp.zeros_like(fresh)), v
 
     shared = snap(shared, cube)
     worth, mean, std = merit(shared)
     _, best = jax.lax.top_k(worth, PARENTS)
     climbing = (begin(PARENTS, cube.dim), shared[best], jnp.ones(PARENTS, bool))
-    (state, _, _), _ = jax.lax.scan(climb, climbing, None, length=CLIMBS)
-    v = jnp.concatenate([shared, state.point])
+    (state, _, _), trail = jax.lax.scan(climb, climbing, None, length=CLIMBS)
+    # A large batch takes points from the ways there too.
+    tops = state.point if batch <= PARENTS else trail.reshape(-1, cube.dim)
+    v = jnp.concatenate([shared, tops])
     worth, mean, std = (
         jnp.concatenate([one, two])
-        for one, two in zip((worth, mean, std), merit(state.point), strict=True)
+        for one, two in zip((worth, mean, std), merit(tops), strict=True)
     )
     x = seen(v)
     gradient = jax.grad(lambda x: jnp.sum(predict(x)[0]))(x)
