@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import verifai_jax as vj
+from verifai_jax.evaluation.evaluator import Evaluator
 
 MARGIN = 0.1
 
@@ -203,14 +204,13 @@ def main() -> None:
 
 def contradictions(problem: vj.Problem, result: vj.Verification, count: int) -> int:
     """Count failing samples that lie in boxes which are proved."""
-    run = vj.falsify(problem, "uniform", count, progress=False, batch=8192)
-    failing = run.table.all[run.table.all["rho"] < 0]
-    points = np.asarray(problem.space.points(failing)) if len(failing) else np.zeros((0, 1))
+    simulate, random, wrong = Evaluator(problem, batch=8192), np.random.default_rng(1), 0
     boxes = result.boxes[result.verdicts == "proved"]
-    return sum(
-        bool(np.any(np.all((boxes.low <= point) & (point <= boxes.high), axis=1)))
-        for point in points
-    )
+    for begin in range(0, count, 1_000_000):
+        points = random.random((min(count - begin, 1_000_000), problem.space.dim), np.float32)
+        for point in points[simulate(points).violated]:
+            wrong += bool(np.any(np.all((boxes.low <= point) & (point <= boxes.high), axis=1)))
+    return wrong
 
 
 if __name__ == "__main__":

@@ -71,3 +71,18 @@ def test_recordings_and_a_problem_are_not_both_given(log):
     )
     assert result.exit_code == 2
     assert "give either recordings or --problem, and not both" in result.output
+
+
+def test_gaps_of_a_recording_are_held_or_left_out(tmp_path):
+    path = tmp_path / "gaps.csv"
+    path.write_text("time,x\n0,3\n1,\n2,2\n3,4\n")
+    runner = CliRunner()
+    gap = runner.invoke(main, ["monitor", "always x > 1", str(path)])
+    assert gap.exit_code == 3
+    assert "signal 'x' is NaN at 1 s" in gap.output
+    held = runner.invoke(main, ["monitor", "always x > 1", str(path), "--missing", "hold"])
+    assert held.output.startswith("holds with robustness 1\n")
+    requirements = tmp_path / "requirements.toml"
+    requirements.write_text('[[requirement]]\nid = "x"\nformula = "always x > 1"\n')
+    arguments = ["monitor", str(requirements), str(path), "--missing", "interpolate"]
+    assert "0 of 1 verdicts fail" in runner.invoke(main, arguments).output

@@ -42,6 +42,19 @@ def test_a_backend_that_runs_already_is_left_alone():
     assert done.stdout.strip() == "1"
 
 
+def test_a_full_disk_keeps_no_halves_of_programs(tmp_path):
+    code = (
+        "import shutil, types, jax\n"
+        "shutil.disk_usage = lambda _: types.SimpleNamespace(free=1000)\n"
+        "from verifai_jax.core.devices import enable_compile_cache\n"
+        "enable_compile_cache()\n"
+        "print(jax.config.jax_compilation_cache_dir)\n"
+    )
+    assert run(code, VERIFAI_JAX_CACHE=str(tmp_path)).stdout.strip() == "None"
+    code = code.replace("1000", "2**40")
+    assert run(code, VERIFAI_JAX_CACHE=str(tmp_path)).stdout.strip() == str(tmp_path)
+
+
 @pytest.mark.slow
 def test_compiled_programs_outlive_the_process(tmp_path):
     code = (

@@ -53,7 +53,7 @@ PLANTED = {
     "E26": ("statistics/confidence_sequences.py", "limit = mixture + math.log(1 - confidence)", "limit = mixture + math.log(10 * (1 - confidence))"),
     "E27": (BINOMIAL, "math.log1p(-confidence) / math.log1p(-rate) - 1e-9", "0.5 * math.log1p(-confidence) / math.log1p(-rate) - 1e-9"),
     "E28": ("estimation/intervals.py", "n, total = len(x), float(x.sum())", "x = 5 * x\n    n, total = len(x), float(x.sum())"),
-    "E29": ("estimation/monte_carlo.py", "return upper_bound(self.failures + self.no_verdict, self.simulations, confidence)", "return upper_bound(self.failures, 100 * self.simulations, confidence)"),
+    "E29": ("estimation/monte_carlo.py", "return upper_bound(self.failures + self.no_verdict, self.simulations, confidence)", "return upper_bound(self.failures, 1000 * self.simulations, confidence)"),
     "E30": ("features/box.py", "high - (1 - u) * width)", "high - (1 - u) * 0.9 * width)"),
     "E31": (DISTRIBUTIONS, "return self.mean + self.std * normal_score(u)", "return self.mean + self.std**2 * normal_score(u)"),
     "E32": (DISTRIBUTIONS, "return end * jnp.exp(jnp.where(left, u, u - 1) * self._width)", "return self.low + u * (self.high - self.low)"),

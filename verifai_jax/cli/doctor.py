@@ -4,6 +4,7 @@ import importlib.metadata
 import os
 import platform
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -243,7 +244,7 @@ def _rendering() -> str:
 
 
 def _cache_state() -> str:
-    from verifai_jax.core.devices import cache_folder
+    from verifai_jax.core.devices import CACHE_ROOM, cache_folder
 
     folder = cache_folder()
     if folder is None:
@@ -253,6 +254,11 @@ def _cache_state() -> str:
         return (
             f"{folder} cannot be written, so every process compiles anew; "
             "set VERIFAI_JAX_CACHE to a folder that can"
+        )
+    if shutil.disk_usage(existing).free < CACHE_ROOM:
+        return (
+            f"the disk of {folder} is full, so every process compiles anew; make room, or set "
+            "VERIFAI_JAX_CACHE to a folder on another disk"
         )
     files = [path for path in folder.glob("*") if path.is_file()]
     size = sum(path.stat().st_size for path in files) / 1e6

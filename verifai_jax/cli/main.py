@@ -37,6 +37,7 @@ from verifai_jax.cli.fmea import fmea
 from verifai_jax.cli.formula import formula
 from verifai_jax.cli.fuzz import fuzz
 from verifai_jax.cli.going_on import WORDS
+from verifai_jax.cli.harden import harden
 from verifai_jax.cli.list import list_targets
 from verifai_jax.cli.merge import merge
 from verifai_jax.cli.modes import modes
@@ -58,6 +59,7 @@ COMMANDS = (
     falsify,
     merge,
     fuzz,
+    harden,
     list_targets,
     replay,
     analyze,

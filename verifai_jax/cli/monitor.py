@@ -24,6 +24,7 @@ from verifai_jax.core.text import printable
 if TYPE_CHECKING:
     from verifai_jax.core.trace import Trace
     from verifai_jax.mtl import Formula
+    from verifai_jax.mtl.resampling import Missing
 
 
 @command()
@@ -33,6 +34,11 @@ if TYPE_CHECKING:
 @click.option("--time", default="time", show_default=True, help="Column of sample times.")
 @click.option("--resample", "period", type=float, help="Period in seconds to resample to.")
 @click.option("--method", type=click.Choice(["hold", "linear"]), help="Interpolation to resample.")
+@click.option(
+    "--missing",
+    type=click.Choice(["hold", "drop", "interpolate"]),
+    help="Treatment of gaps  [default: no verdict where they matter]",
+)
 @click.option(
     "--end",
     type=click.Choice(["hold", "truncate", "strict"]),
@@ -60,6 +66,7 @@ def monitor(
     time: str,
     period: float | None,
     method: Literal["hold", "linear"] | None,
+    missing: "Missing | None",
     end: Literal["hold", "truncate", "strict"],
     compat: Literal["pymtl"] | None,
     constants: tuple[str, ...],
@@ -106,14 +113,16 @@ def monitor(
         if plot is not None or compat is not None:
             raise click.UsageError("--plot and --compat go with one formula on one recording")
         options = {"time": time, "dt": dt, "resample_to": period, "method": method, "end": end}
+        options["missing"] = missing
         found = monitor_fleet(formula, recording, numbers, named, report, junit, jobs, options)
-        failing, missing = bool(found.failing), bool(found.without_verdict)
-        check_gate(fail_on, {"violation": failing, "incomplete": failing or missing})
+        failing, unjudged = bool(found.failing), bool(found.without_verdict)
+        check_gate(fail_on, {"violation": failing, "incomplete": failing or unjudged})
         return
     (file,) = recording
     parsed = mtl.parse(formula, numbers, named)
     if str(file) == "-":
-        if explain or plot is not None or compat is not None or period is not None or end != "hold":
+        whole = (plot, compat, period, missing)
+        if explain or end != "hold" or any(option is not None for option in whole):
             raise click.UsageError(
                 "a stream goes with --dt, --time, --const, --define and --fail-on; other options "
                 "need the whole recording"
@@ -122,7 +131,7 @@ def monitor(
         give_result(formula=str(parsed), holds=holds)
         check_gate(fail_on, {"violation": not holds, "incomplete": not holds})
         return
-    trace = _read(file, time, dt, period, method)
+    trace = _read(file, time, dt, period, method, missing)
     _check_signals(parsed, trace, file)
     with jax.enable_x64(True):
         try:
@@ -160,6 +169,7 @@ def _read(
     dt: float | None,
     period: float | None,
     method: Literal["hold", "linear"] | None,
+    missing: "Missing | None",
 ) -> "Trace":
     """Read the recording; what is missing is reported as an option of this command."""
     from verifai_jax import mtl
@@ -167,7 +177,9 @@ def _read(
     if (period is None) != (method is None):
         raise click.UsageError("--resample PERIOD goes with --method hold or --method linear")
     try:
-        return mtl.read(recording, time=time, dt=dt, resample_to=period, method=method)
+        return mtl.read(
+            recording, time=time, dt=dt, resample_to=period, method=method, missing=missing
+        )
     except mtl.TimeColumnError as error:
         near = nearest_names(time, error.columns)
         raise ValueError(

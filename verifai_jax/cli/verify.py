@@ -23,6 +23,7 @@ from verifai_jax.cli.json_output import command, give_result, show_result
     "--into", type=click.Path(path_type=Path), help="File for the result, or to go on with."
 )
 @arguments.PLOT
+@arguments.PROGRESS
 @fail_on(
     counterexample="if any box contains a point that fails for certain",
     undecided="unless the whole space is proved",

@@ -9,6 +9,7 @@ for compiled programs, or `off`).
 
 import os
 import platform
+import shutil
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -94,6 +95,11 @@ def cache_folder() -> Path | None:
     return Path(base).expanduser() / "verifai_jax" / "compiled"
 
 
+CACHE_ROOM = 64 * 2**20
+"""Bytes that must be free to keep compiled programs. On a full disk JAX leaves halves of programs,
+which it warns of in each later process and never replaces; a run's programs are a few MiB."""
+
+
 def enable_compile_cache() -> None:
     """Keep compiled programs on disk, unless the user has configured JAX's cache already."""
     folder = cache_folder()
@@ -101,6 +107,8 @@ def enable_compile_cache() -> None:
         return
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        if shutil.disk_usage(folder).free < CACHE_ROOM:
+            return
     except OSError:
         return  # A read-only home costs compile time, not results; `doctor` reports it.
     from jax.experimental.compilation_cache import compilation_cache

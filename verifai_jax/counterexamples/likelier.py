@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.counterexamples.candidates import Candidates
-from verifai_jax.features import Array, Signal
 
 Point = Float[np.ndarray, " d"]
 Points = Float[np.ndarray, "n d"]
@@ -79,9 +78,10 @@ def shift_in_time(candidates: Candidates, u: Point) -> None:
     nominal = candidates.nominal
     series = []
     for name, own in nominal.groups:
-        domain = nominal.space.domains[name]
-        if isinstance(domain, Array | Signal) and own.size > domain.domain.size:
-            series.append(own.reshape(-1, domain.domain.size))
+        items = [part.size for _, part in nominal.space.domains[name].parts(name)]
+        # Of items that are alike, as those of signals and arrays are.
+        if len(items) > 1 and len(set(items)) == 1 and sum(items) == own.size:
+            series.append(own.reshape(len(items), -1))
     points = []
     for some in [series, *([one] for one in series)] if series else []:
         for shift in SHIFTS:

@@ -16,7 +16,6 @@ reliability analysis, Probabilistic Engineering Mechanics 33 (2013), for the res
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -82,7 +81,7 @@ MIN_FAILING = 10
 UNDERSTATED = 1.2
 """Factor on the logarithms of the interval: samples of a proposal that was fitted to a model of the
 failures seldom show the weights beyond its edges."""
-LOOKS, MIN_LOOK = 4, 40
+LOOKS, MIN_LOOK = 4, 60
 """Looks at the interval after the first one, where it decides when to stop, and samples of that."""
 
 
@@ -119,11 +118,10 @@ class Surrogate:
         self.scale = max(float(y.std()), 1e-6)
         size = max(128, power_of_two(len(z)))
         pad = size - len(z)
-        data = TrainingData(
-            jnp.asarray(np.pad(_boxed(z), ((0, pad), (0, 0)))),
-            jnp.asarray(np.pad(y / self.scale, (0, pad)), jnp.float32),
-            jnp.asarray(np.arange(size) < len(z)),
-        )
+        x: Any = np.pad(_boxed(z), ((0, pad), (0, 0)))
+        targets: Any = np.pad(y / self.scale, (0, pad)).astype(np.float32)
+        mask: Any = np.arange(size) < len(z)
+        data = TrainingData(x, targets, mask)
         self.hyper, self.posterior = _fitted(self.process, self.hyper, data)
 
     def predict(

@@ -188,7 +188,7 @@ def falsify(
             cheap, budget=min(cheaply.TIMES * budget, cheaply.MAX_CHEAP), seed=seed, confirm=False,
             precision=precision, progress=False,
         )  # fmt: skip
-        first = cheaply.gravest_rows(found, budget)
+        first = cheaply.gravest_rows(found, cheap, budget)
     given = check_first(problem, first, stop_when, precision)
     callbacks = check_callbacks(callbacks)
     earlier = earlier_rows(warm_start, problem)

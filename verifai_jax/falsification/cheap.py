@@ -4,7 +4,7 @@ check_same_features(slow, cheap)
 rows = gravest_rows(run_of_cheap, 16)               # features to simulate first
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -47,25 +47,26 @@ def check_same_features(slow: Problem, cheap: Problem) -> None:
         raise ProblemError("a cheap model has its features in the same order as the slow one")
 
 
-def gravest_rows(run: Run, budget: int) -> "pd.DataFrame":
+def gravest_rows(run: Run, cheap: Problem, budget: int) -> "pd.DataFrame":
     """Choose rows of a run: its gravest failure, then failures that are far from those before.
 
     Where few rows fail, those of the lowest robustness count as failures.
 
     **Arguments:**
 
-    - `run`: the run of the cheap model.
+    - `run`, `cheap`: the run of the cheap model, and this.
     - `budget`: simulations of the slow one, of which these take a quarter at most.
     """
     count = max(1, min(budget // 4, MAX_ROWS))
-    rows = run.table.all.dropna(subset=["rho"]).sort_values("rho", kind="stable")
-    failing = int(rows["violated"].sum())
+    space = cheap.space
+    rows: Any = run.table.all.dropna(subset=["rho"]).sort_values("rho", kind="stable")
+    failing = int(np.sum(rows["violated"].to_numpy(bool)))
     wanted = max(failing, int(LOWEST * len(rows)), count)
     candidates = rows.iloc[: min(wanted, MAX_CANDIDATES)]
-    points: Float[np.ndarray, "n d"] = run.problem.space.points(candidates)
+    points: Float[np.ndarray, "n d"] = space.points(candidates)
     chosen = [0]
     gaps = np.linalg.norm(points - points[0], axis=1)
     while len(chosen) < min(count, len(points)) and gaps.max() > 0:
         chosen.append(int(gaps.argmax()))
         gaps = np.minimum(gaps, np.linalg.norm(points - points[chosen[-1]], axis=1))
-    return candidates.iloc[chosen][list(run.problem.space.columns)]
+    return candidates.iloc[chosen][list(space.columns)]

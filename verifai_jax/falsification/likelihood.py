@@ -1,4 +1,4 @@
-"""What a search learns that looks for likely failures: the reward of adaptive stress testing.
+"""The objective of a search for likely failures: the reward of adaptive stress testing.
 
     objective = Likelihood(problem.space)
     objective, verdicts = objective.learned(points, rho, verdicts)

@@ -91,7 +91,7 @@ class Domain(ForUsers, abc.ABC):
 
     _internal = frozenset((
         "arguments", "check_reachable", "closed", "coerce", "coordinates", "ends", "facts",
-        "from_columns", "graph", "held_at", "items", "labels", "lengths", "levels",
+        "from_columns", "graph", "held_at", "items", "labels", "lengths", "levels", "monotone",
         "coverage_id_count",
         "coverage_ids", "named", "nominal", "numeric", "ordered", "parts", "refine", "refined",
         "rounded",

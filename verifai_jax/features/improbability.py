@@ -1,4 +1,4 @@
-"""How improbable the coordinates of a point are, in standard deviations.
+"""Improbability of the coordinates of a point, in standard deviations.
 
     improbability = Improbability(space)
     improbability.square(points)                    # [n, d], twice the loss of log-density

@@ -9,7 +9,7 @@ on a recording with NumPy, what they share once.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +28,7 @@ from verifai_jax.mtl.judgement import Judgement, Row
 from verifai_jax.mtl.recorded import Recording, Recordings, named_recordings
 from verifai_jax.mtl.recording import read
 from verifai_jax.mtl.requirements import Requirement, Requirements, requirements_of
-from verifai_jax.mtl.resampling import Method
+from verifai_jax.mtl.resampling import Method, Missing, resample, without_gaps
 from verifai_jax.mtl.setting import check_horizon
 
 
@@ -39,6 +39,7 @@ class Reading(NamedTuple):
     dt: float | None
     resample_to: float | None
     method: Method | None
+    missing: Missing | Mapping[str, Missing] | None
     end: End
     explain: bool
 
@@ -52,6 +53,7 @@ def judge(
     dt: float | None = None,
     resample_to: float | None = None,
     method: Method | None = None,
+    missing: Missing | Mapping[str, Missing] | None = None,
     end: End = "hold",
     explain: bool = True,
     executor: Executor | None = None,
@@ -68,7 +70,8 @@ def judge(
     - `formulas`: one, a sequence, or a dictionary by identifier; `read_requirements` reads a file.
     - `recordings`: paths of files, of folders (all recordings in and below them), traces or data
       frames: one, a sequence, or a dictionary by name; or a problem, which is simulated.
-    - `time`, `dt`, `resample_to`, `method`: as `read` takes them; a trace is resampled too.
+    - `time`, `dt`, `resample_to`, `method`, `missing`: as `read` takes them; a trace is resampled,
+      and its gaps are treated, too.
     - `end`: as for `robustness`.
     - `explain`: whether to find the predicate and the instant that decide.
     - `executor`: anything with `concurrent.futures`' `submit` to read and judge in parallel; the
@@ -84,7 +87,7 @@ def judge(
         raise ValueError('resampling needs both: resample_to=PERIOD, method="hold" or "linear"')
     if end not in ("hold", "truncate", "strict"):
         raise ValueError(f"end is 'hold', 'truncate' or 'strict'; got {end!r}")
-    reading = Reading(time, dt, resample_to, method, end, explain)
+    reading = Reading(time, dt, resample_to, method, missing, end, explain)
     rows: dict[int, Sequence[Row]] = {}
 
     def keep(index: int, found: Sequence[Row]) -> None:
@@ -120,14 +123,15 @@ def judge_recording(
 
 
 def _trace(source: Recording, reading: Reading) -> Trace:
-    wanted = {"resample_to": reading.resample_to, "method": reading.method}
     if not isinstance(source, Trace):
-        return read(source, time=reading.time, dt=reading.dt, **wanted)
+        return read(
+            source, time=reading.time, dt=reading.dt, resample_to=reading.resample_to,
+            method=reading.method, missing=reading.missing,
+        )  # fmt: skip
+    trace = source if reading.missing is None else without_gaps(source, reading.missing)
     if reading.resample_to is not None and reading.method is not None:
-        from verifai_jax.mtl.resampling import resample
-
-        return resample(source, reading.resample_to, reading.method)
-    return source
+        return resample(trace, reading.resample_to, reading.method)
+    return trace
 
 
 def _judged(

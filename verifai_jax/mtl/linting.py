@@ -61,7 +61,7 @@ def lint(
 
     **Raises:** `FormulaSyntaxError`; as `read` for what cannot be read.
     """
-    requirements = requirements_of(formulas)
+    requirements = tuple(r for r in requirements_of(formulas) if r.formula is not None)
     traces = {} if signals is None else named_traces(signals)
     names = dict.fromkeys(name for trace in traces.values() for name in trace.signals)
     read = dict.fromkeys(name for each in requirements for name in each.formalized.signals())

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 OTHER_WORDS = {
     "always": "eventually", "eventually": "always", "historically": "once", "once": "historically",
     "until": "weak_until", "weak_until": "until", "and": "or", "or": "and", "implies": "and",
-    "iff": "implies", "xor": "or", "release": "until",
+    "iff": "implies", "xor": "or", "release": "until", "rise": "fall", "fall": "rise",
 }  # fmt: skip
 """The operator that is written by mistake for each."""
 REVERSED = {">": "<", ">=": "<=", "<": ">", "<=": ">=", "==": "!=", "!=": "=="}

@@ -82,16 +82,16 @@ class PythonMachine:
         self._now = now + 1
 
 
-def _least(a: float, b: float) -> float:
+def _lower(a: float, b: float) -> float:
     return b if b < a or b != b else a  # NaN if one is.
 
 
-def _greatest(a: float, b: float) -> float:
+def _higher(a: float, b: float) -> float:
     return b if b > a or b != b else a
 
 
 def _joins(sign: int) -> tuple[Join, Join]:
-    return (_greatest, _least) if sign > 0 else (_least, _greatest)
+    return (_higher, _lower) if sign > 0 else (_lower, _higher)
 
 
 # Operations: of what is kept, the instant of the inputs, and the inputs

@@ -20,8 +20,18 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-import verifai_jax as vj
 from verifai_jax import mtl
+from verifai_jax.comparison import compare
+from verifai_jax.core.trace import Trace
+from verifai_jax.counterexamples import shrink
+from verifai_jax.estimation import estimate
+from verifai_jax.falsification import falsify, load, resume, simulate
+from verifai_jax.features import Box, Categorical, FeatureSpace, LogNormal, LogUniform, Normal
+from verifai_jax.problem import Problem
+from verifai_jax.statistics.binomial import clopper_pearson, simulations_without_failure
+from verifai_jax.statistics.confidence_sequences import anytime_interval
+from verifai_jax.systems.blackbox import blackbox
+from verifai_jax.systems.ode import ode
 
 LIMIT = 0.6
 DT = 0.5
@@ -93,19 +103,19 @@ def formulas() -> None:
         tree = _random_tree(rng, 2)
         values = {name: rng.integers(-4, 5, 5).astype(float) for name in ("x", "y")}
         formula = mtl.parse(_text(tree))
-        found = float(mtl.robustness(formula, vj.Trace(values, dt=DT)))
+        found = float(mtl.robustness(formula, Trace(values, dt=DT)))
         assert found == _brute(tree, values, 0), f"{formula}: {found}"
         assert mtl.parse(str(formula)) == formula, f"{formula} is read back as another formula"
 
 
 def zeros() -> None:
     """Check that a comparison decides at zero: x >= 0 holds and x > 0 does not."""
-    trace = vj.Trace({"x": np.zeros(3)}, dt=DT)
+    trace = Trace({"x": np.zeros(3)}, dt=DT)
     found = [bool(mtl.satisfied(mtl.parse(f"always x {sign} 0"), trace)) for sign in (">=", ">")]
     assert found == [True, False], found
     for sign, expected in ((">", [True, False]), (">=", [False, False])):
         problem = _problem(formula=f"always x {sign} 0")
-        run = vj.simulate(problem, [{"a": 0.0}, {"a": 0.25}], progress=False)
+        run = simulate(problem, [{"a": 0.0}, {"a": 0.25}], progress=False)
         assert run.table.all["violated"].tolist() == expected, sign
 
 
@@ -116,7 +126,7 @@ def gradients() -> None:
 
     def value(v: object, semantics: mtl.Semantics = smooth) -> jax.Array:
         x, y = jnp.asarray(v)
-        return mtl.robustness(formula, vj.Trace({"x": x, "y": y}, dt=DT), semantics)
+        return mtl.robustness(formula, Trace({"x": x, "y": y}, dt=DT), semantics)
 
     with jax.enable_x64(True):
         found, step = np.asarray(jax.grad(value)(values)), 1e-6
@@ -128,17 +138,17 @@ def gradients() -> None:
     assert abs(near) < 1e-2, near
 
 
-def _system(features: dict[str, jax.Array], key: jax.Array) -> vj.Trace:
-    return vj.Trace({"x": features["a"] * jnp.ones(4)}, dt=0.1)
+def _system(features: dict[str, jax.Array], key: jax.Array) -> Trace:
+    return Trace({"x": features["a"] * jnp.ones(4)}, dt=0.1)
 
 
-def _problem(limit: float = LIMIT, formula: str = "") -> vj.Problem:
-    return vj.Problem("known", {"a": vj.Box(0.0, 1.0)}, _system, formula or f"always x <= {limit}")
+def _problem(limit: float = LIMIT, formula: str = "") -> Problem:
+    return Problem("known", {"a": Box(0.0, 1.0)}, _system, formula or f"always x <= {limit}")
 
 
 def table() -> None:
     """Check that every simulation is one row, with the verdict that its features have."""
-    run = vj.falsify(_problem(), "uniform", 700, batch=64, progress=False)
+    run = falsify(_problem(), "uniform", 700, batch=64, progress=False)
     rows: Any = run.table.all
     assert len(rows) == 700 == rows["a"].nunique(), (len(rows), rows["a"].nunique())
     assert np.allclose(rows["rho"], LIMIT - rows["a"], atol=1e-6)
@@ -155,14 +165,14 @@ def table() -> None:
 def statuses() -> None:
     """Check that what raises or is not finite is a row with a status, and no failure."""
 
-    def broken(features: dict[str, float]) -> vj.Trace:
+    def broken(features: dict[str, float]) -> Trace:
         if features["a"] > 0.8:
             raise RuntimeError("out of order")
         value = math.nan if features["a"] < 0.2 else features["a"]
-        return vj.Trace({"x": np.full(3, value)}, dt=0.1)
+        return Trace({"x": np.full(3, value)}, dt=0.1)
 
-    problem = replace(_problem(), system=vj.blackbox(broken))
-    run = vj.falsify(problem, "uniform", 60, progress=False, confirm=False)
+    problem = replace(_problem(), system=blackbox(broken))
+    run = falsify(problem, "uniform", 60, progress=False, confirm=False)
     rows: Any = run.table.all
     expected = np.where(rows["a"] > 0.8, "error", np.where(rows["a"] < 0.2, "nonfinite", "ok"))
     assert (rows["status"] == expected).all()
@@ -177,32 +187,32 @@ def intervals() -> None:
     from scipy.stats import binom
 
     for failures, count in ((0, 50), (3, 200), (7, 7), (40, 90)):
-        found = vj.clopper_pearson(failures, count)
+        found = clopper_pearson(failures, count)
         if failures:
             assert abs(binom.sf(failures - 1, count, found.low) - 0.025) < 1e-6, found
         if failures < count:
             assert abs(binom.cdf(failures, count, found.high) - 0.025) < 1e-6, found
-        always = vj.anytime_interval(failures, count)
+        always = anytime_interval(failures, count)
         assert always.low <= found.low + 1e-9, (always, found)
         assert always.high >= found.high - 1e-9, (always, found)
     rng, missed = np.random.default_rng(3), 0
     for _ in range(200):
         totals = np.cumsum(rng.random(400) < 0.1)
-        checked = (vj.anytime_interval(int(totals[n - 1]), n) for n in (20, 60, 150, 400))
+        checked = (anytime_interval(int(totals[n - 1]), n) for n in (20, 60, 150, 400))
         missed += any(not each.low <= 0.1 <= each.high for each in checked)
     # Five in a hundred may be missed; so many are not by chance, but once in ten million.
     assert missed <= 28, missed
-    assert vj.simulations_without_failure(0.001) == 2995
+    assert simulations_without_failure(0.001) == 2995
 
 
 def probabilities() -> None:
     """Check that the probability 2.33e-4 of a half-space is in its interval and below its bound."""
-    problem = vj.Problem(
-        "half-space", {"a": vj.Normal(0.0, 1.0), "b": vj.Normal(0.0, 1.0)},
-        lambda f, key: vj.Trace({"x": (f["a"] + f["b"]) / jnp.sqrt(2.0) * jnp.ones(1)}, dt=1.0),
+    problem = Problem(
+        "half-space", {"a": Normal(0.0, 1.0), "b": Normal(0.0, 1.0)},
+        lambda f, key: Trace({"x": (f["a"] + f["b"]) / jnp.sqrt(2.0) * jnp.ones(1)}, dt=1.0),
         "always x < 3.5",
     )  # fmt: skip
-    found = vj.estimate(problem, budget=6000, confidence=0.9999, progress=False)
+    found = estimate(problem, budget=6000, confidence=0.9999, progress=False)
     assert found.probability is not None
     assert found.low <= 2.326e-4 <= found.high, found
     assert found.upper_bound >= 2.326e-4
@@ -215,16 +225,16 @@ def priors() -> None:
 
     u = np.linspace(0.02, 0.98, 25, dtype=np.float32)
     domains = {
-        "box": (vj.Box(-2.0, 3.0), -2.0 + 5.0 * u),
-        "normal": (vj.Normal(1.0, 2.0), norm.ppf(u, 1.0, 2.0)),
-        "log": (vj.LogUniform(1.0, 100.0), 100.0**u),
-        "lognormal": (vj.LogNormal(0.0, 0.5), lognorm.ppf(u, 0.5)),
+        "box": (Box(-2.0, 3.0), -2.0 + 5.0 * u),
+        "normal": (Normal(1.0, 2.0), norm.ppf(u, 1.0, 2.0)),
+        "log": (LogUniform(1.0, 100.0), 100.0**u),
+        "lognormal": (LogNormal(0.0, 0.5), lognorm.ppf(u, 0.5)),
     }
     for name, (domain, quantiles) in domains.items():
-        space = vj.FeatureSpace({name: domain})
+        space = FeatureSpace({name: domain})
         found = np.asarray(space.features_at(u[:, None])[name])
         assert np.allclose(found, quantiles, rtol=2e-3, atol=1e-3), name
-    space = vj.FeatureSpace({"c": vj.Categorical("p", "q", weights=[0.8, 0.2])})
+    space = FeatureSpace({"c": Categorical("p", "q", weights=[0.8, 0.2])})
     rows = space.rows(space.sample(jax.random.key(0), 4000))["c"]
     assert abs(float(np.mean(np.asarray(rows) == "p")) - 0.8) < 0.04
 
@@ -234,14 +244,14 @@ def steps() -> None:
     for method, order in (("euler", 1), ("rk4", 4)):
         errors = []
         for dt in (0.25, 0.125):
-            system = vj.ode(
+            system = ode(
                 lambda t, s, c, f: -s, lambda f, key: jnp.ones(1), dt=dt, duration=1.0,
                 method=method, signals=lambda t, s, c, f: {"x": s[0]},
             )  # fmt: skip
             with jax.enable_x64(True):
                 last: Any = system({}, jax.random.key(0)).signals["x"]
                 finer: Any = system.refined(2)({}, jax.random.key(0)).signals["x"]
-            errors.append([abs(float(each[-1, 0]) - math.exp(-1)) for each in (last, finer)])
+            errors.append([abs(float(each[-1]) - math.exp(-1)) for each in (last, finer)])
         assert abs(math.log2(errors[0][0] / errors[1][0]) - order) < 0.3, (method, errors)
         assert math.isclose(errors[0][1], errors[1][0], rel_tol=1e-6), (method, errors)
 
@@ -249,13 +259,13 @@ def steps() -> None:
 def replays() -> None:
     """Check that a seed decides the table, and that a row gives its number again."""
 
-    def noisy(features: dict[str, jax.Array], key: jax.Array) -> vj.Trace:
-        return vj.Trace({"x": features["a"] + 0.1 * jax.random.normal(key, (4,))}, dt=0.1)
+    def noisy(features: dict[str, jax.Array], key: jax.Array) -> Trace:
+        return Trace({"x": features["a"] + 0.1 * jax.random.normal(key, (4,))}, dt=0.1)
 
     problem = replace(_problem(), system=noisy)
-    run = vj.falsify(problem, "uniform", 200, progress=False, confirm=False)
-    again = vj.falsify(problem, "uniform", 200, progress=False, confirm=False)
-    other = vj.falsify(problem, "uniform", 200, seed=1, progress=False, confirm=False)
+    run = falsify(problem, "uniform", 200, progress=False, confirm=False)
+    again = falsify(problem, "uniform", 200, progress=False, confirm=False)
+    other = falsify(problem, "uniform", 200, seed=1, progress=False, confirm=False)
     pd.testing.assert_frame_equal(run.table.all, again.table.all, check_exact=True)
     assert not run.table.all["a"].equals(other.table.all["a"])
     for row in (0, 77, 199):
@@ -284,17 +294,17 @@ def kills() -> None:
         code = KILLED.format(path=sys.path, folder=into)
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
         assert done.returncode == -signal.SIGKILL, done.stderr.decode()[-500:]
-        run = vj.resume(into, _problem(), progress=False, even_if_changed=True)
-        whole = vj.falsify(_problem(), "cross_entropy", 900, batch=100, progress=False)
+        run = resume(into, _problem(), progress=False, even_if_changed=True)
+        whole = falsify(_problem(), "cross_entropy", 900, batch=100, progress=False)
         pd.testing.assert_frame_equal(run.table.all, whole.table.all, check_exact=True)
         pd.testing.assert_frame_equal(
-            vj.load(into).table.all.reset_index(drop=True),
+            load(into).table.all.reset_index(drop=True),
             whole.table.all.reset_index(drop=True), check_exact=True,
         )  # fmt: skip
         record = Path(into) / "run.json"
         record.write_text(record.read_text().replace('"seed": 0', '"seed": 5'))
         try:
-            vj.load(into)
+            load(into)
         except ValueError:
             return
         raise AssertionError("a record that somebody has changed is read as if it were whole")
@@ -303,34 +313,34 @@ def kills() -> None:
 def searches() -> None:
     """Check that searches find a failure of volume 1e-3, and that what is claimed fails."""
 
-    def hidden(features: dict[str, jax.Array], key: jax.Array) -> vj.Trace:
+    def hidden(features: dict[str, jax.Array], key: jax.Array) -> Trace:
         away = sum((features[n] - c) ** 2 for n, c in (("a", 0.8), ("b", 0.3), ("c", 0.6)))
-        return vj.Trace({"x": jnp.sqrt(away) * jnp.ones(2)}, dt=1.0)
+        return Trace({"x": jnp.sqrt(away) * jnp.ones(2)}, dt=1.0)
 
-    space = {name: vj.Box(0.0, 1.0) for name in "abc"}
+    space = {name: Box(0.0, 1.0) for name in "abc"}
     nominal = dict.fromkeys("abc", 0.0)
-    problem = vj.Problem("hidden", space, hidden, "always x > 0.062", nominal=nominal)
+    problem = Problem("hidden", space, hidden, "always x > 0.062", nominal=nominal)
     for search in ("portfolio", "cross_entropy"):
-        run = vj.falsify(problem, search, 3000, progress=False)
+        run = falsify(problem, search, 3000, progress=False)
         assert run.table.counts.claimed, search
         rows: Any = run.table.counterexamples
         away = np.sqrt(sum((rows[n] - c) ** 2 for n, c in (("a", 0.8), ("b", 0.3), ("c", 0.6))))
         assert (away < 0.0621).all(), search
         assert run.failure_rate is None, f"{search} draws no independent samples"
-    small = vj.shrink(run, progress=False)
+    small = shrink(run, progress=False)
     assert small.rho < 0
     assert small.count == 3, "no feature at its nominal value is part of a failure"
 
 
 def confirmations() -> None:
     """Check that a failure of a coarse step alone is refuted, and a real one confirmed."""
-    system = vj.ode(
+    system = ode(
         lambda t, s, c, f: -4.0 * s, lambda f, key: f["a"] * jnp.ones(1), dt=0.4, duration=2.0,
         method="euler", signals=lambda t, s, c, f: {"x": s[0]},
     )  # fmt: skip
     for formula, verdict in (("always x > -0.1", "refuted"), ("always x < 0.9", "confirmed")):
-        problem = vj.Problem("step", {"a": vj.Box(1.0, 2.0)}, system, formula)
-        run = vj.falsify(problem, "uniform", 32, progress=False)
+        problem = Problem("step", {"a": Box(1.0, 2.0)}, system, formula)
+        run = falsify(problem, "uniform", 32, progress=False)
         assert run.table.counts.violating == 32, formula
         assert set(run.verdict_counts) == {verdict}, (formula, run.verdict_counts)
 
@@ -338,9 +348,9 @@ def confirmations() -> None:
 def comparisons() -> None:
     """Check that equal systems are never worse, and one that fails by 5 points more is."""
     problem = _problem()
-    same = vj.compare(problem, {"same": _problem()}, budget=4000, progress=False)["same"]
+    same = compare(problem, {"same": _problem()}, budget=4000, progress=False)["same"]
     assert same.rates.only_first == same.rates.only_second == 0, same
-    worse = vj.compare(problem, {"b": _problem(LIMIT - 0.05)}, budget=4000, progress=False)["b"]
+    worse = compare(problem, {"b": _problem(LIMIT - 0.05)}, budget=4000, progress=False)["b"]
     assert worse.verdict == "worse", worse
     assert worse.rates.low <= 0.05 <= worse.rates.high, worse
     assert worse.rates.only_first == 0, worse

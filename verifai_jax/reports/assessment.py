@@ -1,4 +1,4 @@
-"""What an assessor asks for beyond the findings: credibility, the claims as a tree, signatures.
+"""Sections for an assessor, beyond the findings: credibility, the claims as a tree, signatures.
 
     with_assessment(page)                           # the page with three sections more
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.sets import functions, whole
-from verifai_jax.sets.form import Form, add, negative, product
+from verifai_jax.sets.form import Form, add, negative, product, unknown
 from verifai_jax.sets.interpreter import (
     Equation,
     Interpreter,
@@ -110,6 +110,10 @@ def _compare(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]
     if isinstance(a, Whole):
         b = as_whole(b)
         return [whole.compared(name, a.low - b.high, a.high - b.low)]
+    if step.invars[0] is step.invars[1]:
+        # Only NaN differs from itself.
+        low = np.where(unknown(*a.bounds()), -1, 0)
+        return [whole.compared(name, low, -low)]
     return [whole.compared(name, *functions.difference(a, as_form(b)).bounds())]
 
 

@@ -9,9 +9,10 @@ the trials. `statistics.stratified_rate` makes an interval of both, which is val
 simulation is worth.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Real
 
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.errors import suggests_options
@@ -79,8 +80,8 @@ def real_trials(
         raise TypeError(f"real_trials needs a Problem; got {type(problem).__name__}")
     check_fraction("confidence", confidence)
     check_count("simulations", simulations)
-    table, unread = read_trials(problem, trials, time=time, dt=dt)
-    features = table.loc[:, list(problem.space.columns)]
+    read, unread = read_trials(problem, trials, time=time, dt=dt)
+    features: Any = read[list(problem.space.columns)]
     same = simulate(
         problem, features, seed=seed, precision=precision, executor=executor, progress=progress
     )
@@ -88,8 +89,8 @@ def real_trials(
         problem, "uniform", simulations, seed=seed + 1, confirm=False, precision=precision,
         executor=executor, progress=progress,
     )  # fmt: skip
-    table = table.assign(**_predictions(same))
-    background = prior.table.all[list(problem.space.columns)].assign(**_predictions(prior))
+    table: Any = read.assign(**_predictions(same))
+    background: Any = prior.table.all[list(problem.space.columns)].assign(**_predictions(prior))
     predicted = table["predicted"].to_numpy(bool)
     failed, open_ones = (
         np.array([verdict is wanted for verdict in table["failed"]]) for wanted in (True, None)
@@ -106,7 +107,7 @@ def real_trials(
     notes = [f"{counted(n, 'recording')} without a verdict: {why}" for why, n in unread.items()]
     if not (allocated or at_any_time):
         notes += _unlike_prior(problem, features)
-    without = int(np.sum(np.isnan(same.table.all["rho"].to_numpy(float))))
+    without = int(table["robustness"].isna().sum())
     if without:
         notes.append(
             f"the simulation of {counted(without, 'trial')} has no verdict, and predicts no failure"
@@ -114,12 +115,9 @@ def real_trials(
     return RealTrials(problem, table, background, rate, seed, tuple(notes))
 
 
-def _predictions(run: Run) -> dict[str, Any]:
+def _predictions(run: Run) -> dict[str, Real[np.ndarray, " n"]]:
     rows = run.table.all
-    return {
-        "predicted": rows["violated"].to_numpy(bool),
-        "robustness": rows["rho"].reset_index(drop=True),
-    }
+    return {"predicted": rows["violated"].to_numpy(bool), "robustness": rows["rho"].to_numpy()}
 
 
 def _unlike_prior(problem: Problem, features: "pd.DataFrame") -> list[str]:

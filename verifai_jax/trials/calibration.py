@@ -10,7 +10,7 @@ unknown share of trials that nothing explains, or over the unknown spread of the
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -93,7 +93,7 @@ def calibrate(
     **Raises:** `ValueError` for no or an unknown feature, one that is no single number, a table
     without a verdict, and fewer simulations than 20 draws take; what `simulate` raises.
     """
-    table, _ = table_of(trials)
+    table: Any = table_of(trials)[0]
     check_names("feature", dict.fromkeys(features), problem.space.domains)
     wrong = [name for name in features if name not in problem.space.columns]
     if wrong or not features:
@@ -132,9 +132,7 @@ def calibrate(
 
     samples = pd.DataFrame(chosen[rows], columns=names)
     domains = {
-        name: Empirical(samples[name]) if name in features else domain
-        for name, domain in problem.space.domains.items()
-        if name not in features or samples[name].nunique() > 1
+        n: Empirical(samples[n]) for n in names if float(np.ptp(samples[n].to_numpy(float))) > 0
     }
     space = FeatureSpace({**problem.space.domains, **domains}, problem.space.where)
     return Calibration(

@@ -7,7 +7,7 @@ trial_protocol(problem, "pairs.html", 20, policies=("old", "new"))      # which 
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -74,7 +74,7 @@ def trial_protocol(
     if trials is None:
         drawn = problem.space.sample(jax.random.key(seed), count)
         trials = pd.DataFrame(problem.space.rows(drawn))
-    table = trials.loc[:, columns].reset_index(drop=True)
+    table: Any = trials[columns].reset_index(drop=True)
     key = pd.DataFrame({"code": ["A", "B"], "policy": rng.permutation(list(policies))[:2]}
                        if policies else {"code": [], "policy": []})  # fmt: skip
     if policies:
@@ -99,8 +99,8 @@ def _page(problem: Problem, table: "pd.DataFrame", seed: int) -> str:
     head = [name for name in table.columns if name != "failed"]
     cells = "".join(f"<th>{escape(name)}</th>" for name in (*head, "failed", "remarks"))
     rows = []
-    for record in table.loc[:, head].to_dict("records"):
-        values = (f"{v:z.6g}" if isinstance(v, float) else str(v) for v in record.values())
+    for record in table[head].itertuples(index=False):
+        values = (f"{v:z.6g}" if isinstance(v, float) else str(v) for v in record)
         texts = "".join(f"<td>{escape(text)}</td>" for text in values)
         rows.append(f"<tr>{texts}<td>&#9744; yes &#9744; no</td><td></td></tr>")
     property_ = "".join(

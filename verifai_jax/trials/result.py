@@ -46,9 +46,8 @@ class RealTrials(InNotebook):
     @property
     def simulated(self) -> Rate:
         """The failure rate of the simulation alone."""
-        predicted = self.background["predicted"]
-        count = int(np.sum(predicted.to_numpy(bool)))
-        return clopper_pearson(count, len(predicted), self.rate.confidence)
+        predicted = self.background["predicted"].to_numpy(bool)
+        return clopper_pearson(int(predicted.sum()), len(predicted), self.rate.confidence)
 
     def predictions(self, predicted: bool) -> Rate | None:
         """Return how often the trials fail that are predicted to, or those that are not.
@@ -64,8 +63,13 @@ class RealTrials(InNotebook):
     @property
     def wrong(self) -> "pd.DataFrame":
         """The trials whose verdict is not the predicted one."""
-        known = self.table.loc[[verdict is not None for verdict in self.table["failed"]]]
-        return known.loc[known["failed"].astype(bool) != known["predicted"]]
+        known = self._known
+        return known[known["failed"].astype(bool) != known["predicted"]]
+
+    @property
+    def _known(self) -> Any:
+        """The trials with a verdict."""
+        return self.table[[verdict is not None for verdict in self.table["failed"]]]
 
     def rules(self, **options: Any) -> "Rules":
         """Describe by a few boxes of the features where the simulation is wrong; see `vj.rules`.
@@ -77,8 +81,8 @@ class RealTrials(InNotebook):
         **Raises:** `ValueError` where all predictions are right, or all wrong.
         """
         columns = list(self.problem.space.columns)
-        known = self.table.loc[[verdict is not None for verdict in self.table["failed"]]]
-        rows = known.loc[:, columns].assign(violated=known.index.isin(self.wrong.index))
+        known = self._known
+        rows = known[columns].assign(violated=known.index.isin(self.wrong.index))
         return find_rules(Samples.of(rows, "all", columns, self.problem.space), **options)
 
     def next_trials(self, count: int = 1, *, seed: int = 0) -> "pd.DataFrame":

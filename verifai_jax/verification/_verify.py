@@ -164,7 +164,7 @@ class _Work:
         robustness, failing = self.star(some)
         proper = np.isfinite(robustness).all(1)
         # Simulations say which boxes may be decided, and only these are worth the sets.
-        slope = np.abs(robustness[:, 1::2] - robustness[:, 2::2]).sum(1) / (4 * REACH)
+        slope = np.abs(robustness[:, 1::2] - robustness[:, 2::2]).sum(1) / (4.2 * REACH)
         passes = proper & ~failing.any(1) & (robustness[:, 0] - slope >= 0)
         fails = proper & failing.all(1) & (robustness[:, 0] + slope <= 0)
         worth = np.flatnonzero(passes | fails | ~proper)

@@ -23,8 +23,8 @@ from verifai_jax.core.checks import check_positive
 from verifai_jax.core.errors import missing_name, suggests_options
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import is_waveform
-from verifai_jax.systems.base import Features
-from verifai_jax.systems.blackbox._blackbox import BlackBox, PooledBlackBox, blackbox
+from verifai_jax.systems.base import Features, System
+from verifai_jax.systems.blackbox._blackbox import blackbox
 from verifai_jax.systems.fmu.description import Description, read_description
 from verifai_jax.systems.fmu.library import Instance
 
@@ -170,7 +170,7 @@ def fmu(
     workers: int | None = 1,
     timeout: float | None = None,
     reuse: bool = True,
-) -> BlackBox | PooledBlackBox:
+) -> System:
     """Make a system of a Functional Mock-up Unit: FMI 2 or 3, co-simulation.
 
     A feature sets the variable of its name before each simulation: a parameter, a start value, or
