@@ -8,7 +8,7 @@ LAWS = ["tests/test_architecture.py", "tests/test_language.py", "tests/test_publ
 
 def test_a_file_calls_for_its_room_and_for_those_that_import_it():
     found = paths_for(["verifai_jax/plotting/replay.py"])
-    assert found == ["tests/cli", "tests/plotting", "tests/reports", *LAWS]
+    assert found == ["tests/cli", "tests/plotting", "tests/reports", *LAWS, "tests/traceability"]
 
 
 def test_importers_go_through_others():

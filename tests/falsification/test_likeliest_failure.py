@@ -113,8 +113,8 @@ def test_it_is_the_nearest_point_of_a_half_space():
     assert small.distance == pytest.approx(2.9 / math.sqrt(2), rel=2e-3)
     assert small.features["even"] == pytest.approx(1.0, abs=0.05)
     plain = vj.falsify(HALF, "cross_entropy", budget=1024, progress=False)
-    likeliest = run.improbability()["log_density"].max()
-    assert likeliest > plain.improbability()["log_density"].max() - 1e-6
+    likeliest = run.improbability()["log_density"].to_numpy().max()
+    assert likeliest > plain.improbability()["log_density"].to_numpy().max() - 1e-6
     with pytest.raises(ValueError, match="leave out nominal="):
         vj.shrink(run, by="likelihood", nominal={"x": 0.0}, progress=False)
 

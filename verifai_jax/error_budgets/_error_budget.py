@@ -173,7 +173,7 @@ def _sampling(result: Number, number: _Number, each: float) -> ErrorPart:
         low, high = factor * low, factor * high
     text = (
         f"The interval of the result, {number.low:z.3g} to {number.high:z.3g} at "
-        f"{format_percent(own)}, widened to {format_percent(max(own, each))}."
+        f"{format_percent(own)}{f', widened to {format_percent(each)}' if own < each else ''}."
     )
     return ErrorPart("sampling", low, high, text)
 

@@ -14,6 +14,7 @@ reliability analysis, Probabilistic Engineering Mechanics 33 (2013), for the res
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import numpy as np

@@ -62,7 +62,7 @@ class NativeEngine:
 
     **Arguments:**
 
-    - `engine`: the engine that runs XLA's program, in single precision, over points of the unit cube.
+    - `engine`: the engine of XLA, in single precision, over points of the unit cube.
     - `wanted`: `"native"`, or `"auto"` for the rule of the module's docstring.
     - `budget`: simulations of the run.
     """

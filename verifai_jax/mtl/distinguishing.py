@@ -32,7 +32,7 @@ APART = 1e12
 class Distinction(Drawn, InNotebook):
     """A trace on which one of two formulas holds and the other does not; `str()` says which.
 
-    - `trace`: None where none was found.
+    - `trace`: None if none was found.
     - `source`: where it is from.
     - `holds`, `robustness`: of the first formula and of the second one on it.
     - `tried`: traces that were looked at.

@@ -47,7 +47,7 @@ four-thousandth, which single precision still tells from none."""
 
 @dataclass(frozen=True)
 class Examples(Drawn, InNotebook):
-    """Traces that satisfy a formula, barely satisfy it, and break it; None where none was found.
+    """Traces that satisfy a formula, barely satisfy it, and break it; None if none was found.
 
     - `robustness`: the robustness of each by its name.
     """

@@ -13,35 +13,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
-from xml.parsers import expat
+
+from verifai_jax.core.xml import read_xml
 
 NAMESPACE = "http://www.omg.org/spec/ReqIF/20110401/reqif.xsd"
 OTHER_NAMES = {"foreignid": "id"}
 """Names of attributes in the implementation guide of ReqIF that stand for fields of ours."""
 MAX_LENGTH = 32000
 """Characters of an attribute that other tools need to keep."""
-
-
-def read_xml(data: bytes, name: str) -> Element:
-    """Read XML that may come from anywhere.
-
-    **Raises:** `ValueError` for a document type, with which entities are declared, and for what is
-    no XML.
-    """
-
-    def refuse(*declared: object) -> None:
-        raise ValueError(
-            f"{name} declares a document type, <!DOCTYPE {declared[0]}>, which is refused: "
-            "entities in it could read other files; remove the declaration"
-        )
-
-    parser = expat.ParserCreate()
-    parser.StartDoctypeDeclHandler = refuse
-    try:
-        parser.Parse(data, True)
-        return ElementTree.fromstring(data)
-    except (expat.ExpatError, ElementTree.ParseError) as error:
-        raise ValueError(f"{name} is no XML: {error}") from None
 
 
 def read_reqif(path: Path, fields: Sequence[str]) -> list[dict[str, object]]:

@@ -48,7 +48,7 @@ def plain_unit(unit: str) -> str:
 
 
 def unit_of(e: Term, units: Mapping[str, str], faults: list[str]) -> str | None:
-    """Return the unit of an expression; None where it is not known, as of a number alone.
+    """Return the unit of an expression; None if it is unknown, as for a number alone.
 
     **Arguments:**
 

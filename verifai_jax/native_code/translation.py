@@ -10,10 +10,10 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 
 import jax
-import jax.extend.core
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from verifai_jax.core.jaxprs import run_through
 from verifai_jax.native_code import elementary
 from verifai_jax.native_code.code import Code
 from verifai_jax.native_code.values import (
@@ -70,25 +70,21 @@ class Translator:
 
         **Raises:** `Untranslatable` for a part that is unknown.
         """
-        values: dict[object, Value] = {}
-        for variable, value in zip(program.constvars, constants, strict=True):
-            values[variable] = self.constant(value)
-        values.update(zip(program.invars, inputs, strict=True))
-
-        def read(each: object) -> Value:
-            if isinstance(each, jax.extend.core.Literal):
-                return self.constant(each.val, each.aval)
-            return values[each]
-
         used = Counter(each for step in program.eqns for each in map(id, step.invars))
         used.update(map(id, program.outvars))
-        for step in program.eqns:
-            operands = [read(each) for each in step.invars]
+
+        def step(step: Equation, operands: list[Value]) -> list[Value]:
             # What several steps use is stored; the others are computed where they are used.
             self._once = all(used[id(each)] <= 1 for each in step.outvars)
-            results = self.step(step, operands)
-            values.update(zip(step.outvars, results, strict=True))
-        return [read(each) for each in program.outvars]
+            return self.step(step, operands)
+
+        return run_through(
+            program,
+            [self.constant(value) for value in constants],
+            inputs,
+            lambda each: self.constant(each.val, each.aval),
+            step,
+        )
 
     def closed(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
         """Translate a program with its constants, or one without."""

@@ -222,7 +222,7 @@ class Stacked:
     count: int
 
     def example(self, weights: PyTree) -> np.ndarray | None:
-        """Return zeros in the form of one observation; None where the network does not say it."""
+        """Return zeros in the form of one observation; None if the network does not say it."""
         network, _ = weights
         inner = getattr(self.inner, "example", lambda _: None)(network)
         return None if inner is None else np.zeros(np.size(inner) // self.count)

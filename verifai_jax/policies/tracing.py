@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from verifai_jax.core.fingerprint import operands_of_scan
+from verifai_jax.core.jaxprs import run_through
 from verifai_jax.policies.errors import PolicyError
 from verifai_jax.policies.onnx_graph import OPSET, Graph
 from verifai_jax.policies.onnx_node import Node
@@ -152,16 +153,7 @@ class _Translation:
         self, jaxpr: Jaxpr, constants: Sequence[Value], inputs: Sequence[Value]
     ) -> list[Value]:
         """Add the nodes of a function, and return its outputs."""
-        values: dict[Any, Any] = dict(zip(jaxpr.constvars, constants, strict=True))
-        values |= dict(zip(jaxpr.invars, inputs, strict=True))
-
-        def read(variable: Jaxpr) -> Any:
-            return _known(variable.val) if hasattr(variable, "val") else values[variable]
-
-        for equation in jaxpr.eqns:
-            given = [read(v) for v in equation.invars]
-            values |= zip(equation.outvars, self.equation(equation, given), strict=True)
-        return [read(v) for v in jaxpr.outvars]
+        return run_through(jaxpr, constants, inputs, lambda each: _known(each.val), self.equation)
 
     def equation(self, equation: Jaxpr, given: list[Value]) -> list[Value]:
         """Return the outputs of one operation."""

@@ -26,7 +26,7 @@ def qualify(only: Sequence[str] | None = None) -> Qualification:
 
     **Returns:** the outcomes, with versions and one hash of all files of the package.
 
-    **Raises:** `UnknownNameError` for an oracle that there is not, with those that there are.
+    **Raises:** `UnknownNameError` for the name of no oracle; it lists all names.
     """
     check_names("oracle", only or (), ORACLES)
     outcomes = []

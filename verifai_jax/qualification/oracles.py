@@ -322,7 +322,8 @@ def searches() -> None:
     problem = Problem("hidden", space, hidden, "always x > 0.062", nominal=nominal)
     for search in ("portfolio", "cross_entropy"):
         run = falsify(problem, search, 3000, progress=False)
-        assert run.table.counts.claimed, search
+        # As many uniform samples meet three of them on average, and 30 never.
+        assert run.table.counts.violating > 30, search
         rows: Any = run.table.counterexamples
         away = np.sqrt(sum((rows[n] - c) ** 2 for n, c in (("a", 0.8), ("b", 0.3), ("c", 0.6))))
         assert (away < 0.0621).all(), search

@@ -14,7 +14,7 @@ from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import counted, format_seconds
 from verifai_jax.qualification.hazards import HAZARDS
 from verifai_jax.reports.markup import Markup, element, paragraph, table
-from verifai_jax.reports.page import Page, Section, render
+from verifai_jax.reports.page import Page, Section, write_page
 from verifai_jax.reports.signing import signing_section
 
 
@@ -120,8 +120,7 @@ class Qualification(InNotebook):
             ),
             claims={"package_sha256": self.package_sha256, "passed": self.passed},
         )
-        with replacing(path) as partial:
-            partial.write_text(render(page), encoding="utf-8", newline="\n")
+        write_page(page, path)
         return path
 
     def _oracles(self) -> Markup:

@@ -25,7 +25,7 @@ from verifai_jax.reports.comparison_report import comparison_page
 from verifai_jax.reports.errors_section import with_errors
 from verifai_jax.reports.estimate_report import estimate_page
 from verifai_jax.reports.judgement_report import judgement_page
-from verifai_jax.reports.page import render
+from verifai_jax.reports.page import write_page
 from verifai_jax.reports.run_question import About
 from verifai_jax.reports.run_report import run_page
 from verifai_jax.reports.sweep_report import sweep_page
@@ -117,8 +117,7 @@ def write_report(
         page = with_errors(page, errors)
     if assessment:
         page = with_assessment(page)
-    with replacing(path) as partial:
-        partial.write_text(render(page), encoding="utf-8", newline="\n")
+    write_page(page, path)
     claims = json.dumps(page.claims, indent=2, allow_nan=False)
     with replacing(claims_path(path)) as partial:
         partial.write_text(claims + "\n", encoding="utf-8", newline="\n")

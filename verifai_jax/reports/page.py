@@ -1,6 +1,7 @@
 """A page from its sections: one HTML file that needs nothing else, with or without JavaScript.
 
 render(page)                                        # the text of the file
+write_page(page, "report.html")
 
 Its policy of content allows the pictures inside of it, and one style sheet and one script by their
 hashes: nothing is loaded, nothing is sent, and no text that came into the page can run.
@@ -11,9 +12,11 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 from verifai_jax._version import __version__
+from verifai_jax.core.atomic_files import replacing
 from verifai_jax.reports.markup import Markup, bullets, data_block, element, join
 
 
@@ -51,6 +54,15 @@ class Page:
 def asset(name: str) -> str:
     """Return the text of a file that lies next to this one."""
     return resources.files("verifai_jax.reports").joinpath(name).read_text(encoding="utf-8")
+
+
+def write_page(page: Page, path: str | Path) -> None:
+    """Write a page as an HTML file, whole or not at all.
+
+    **Raises:** `OSError` that names the file, for whatever the file system refuses.
+    """
+    with replacing(path) as partial:
+        partial.write_text(render(page), encoding="utf-8", newline="\n")
 
 
 def render(page: Page) -> str:

@@ -9,12 +9,11 @@ by the name of JAX's primitive.
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
-import jax
-import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from verifai_jax.core.jaxprs import run_through
 from verifai_jax.core.user_errors import source_line
 from verifai_jax.sets.form import Form
 from verifai_jax.sets.whole import Whole
@@ -75,20 +74,13 @@ class Interpreter:
 
         **Raises:** `MissingRule` for an operation without a rule, with its name and its line.
         """
-        values: dict[object, Value] = {}
-        for variable, value in zip(program.constvars, constants, strict=True):
-            values[variable] = constant(value, variable.aval.dtype)
-        values.update(zip(program.invars, inputs, strict=True))
-
-        def read(each: object) -> Value:
-            if isinstance(each, jax.extend.core.Literal):
-                return constant(each.val, each.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
-            return values[each]
-
-        for step in program.eqns:
-            results = self.step(step, [read(each) for each in step.invars])
-            values.update(zip(step.outvars, results, strict=True))
-        return [read(each) for each in program.outvars]
+        known = [
+            constant(value, variable.aval.dtype)
+            for variable, value in zip(program.constvars, constants, strict=True)
+        ]
+        return run_through(
+            program, known, inputs, lambda each: constant(each.val, each.aval.dtype), self.step
+        )
 
     def closed(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
         """Evaluate a program with its constants, or one without."""

@@ -81,7 +81,7 @@ class Log:
             self._extents.update(_extents(frame, begin))
 
     def get(self, name: str) -> dict[str, np.ndarray] | None:
-        """Return an entry; None where there is none, or it is damaged."""
+        """Return an entry; None if there is none, or it is damaged."""
         if (extent := self._index().get(name)) is None:
             return None
         with self._opened() as file:
@@ -103,7 +103,7 @@ class Log:
         self.put({name: {_JSON: np.frombuffer(json.dumps(value).encode(), np.uint8)}})
 
     def get_json(self, name: str) -> Any:
-        """Return the plain data of an entry; None where there is none, or it is damaged."""
+        """Return the plain data of an entry; None if there is none, or it is damaged."""
         entry = self.get(name)
         with contextlib.suppress(ValueError, KeyError, RecursionError):
             return None if entry is None else json.loads(entry[_JSON].tobytes())
@@ -164,7 +164,7 @@ def write_log(path: Path, entries: Mapping[str, Arrays]) -> None:
 
 
 def _find_frames(file: IO[bytes]) -> Iterator[dict[str, _Extent] | None]:
-    """Yield the entries of each frame of a file; None where there is damage."""
+    """Yield the entries of each frame of a file; None if it is damaged."""
     end, at = file.seek(0, os.SEEK_END), file.seek(0)
     while header := file.read(HEADER.size):
         with contextlib.suppress(struct.error, ValueError):

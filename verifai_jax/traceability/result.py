@@ -14,7 +14,7 @@ from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.notebook import InNotebook, frame_html
 from verifai_jax.core.text import counted, listed, shorten
 from verifai_jax.reports.markup import Child, element, paragraph, table
-from verifai_jax.reports.page import Page, Section, render
+from verifai_jax.reports.page import Page, Section, write_page
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -157,6 +157,5 @@ class TraceMatrix(InNotebook):
             ),
             claims={},
         )
-        with replacing(path) as partial:
-            partial.write_text(render(page), encoding="utf-8", newline="\n")
+        write_page(page, path)
         return Path(path)

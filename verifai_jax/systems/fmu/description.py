@@ -13,10 +13,10 @@ import sys
 import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
-from xml.etree import ElementTree
-from xml.parsers import expat
+from xml.etree.ElementTree import Element
 
 from verifai_jax.core.errors import missing_name
+from verifai_jax.core.xml import read_xml
 
 MAX_BYTES = 64 << 20
 """Bytes of a description at most."""
@@ -141,7 +141,9 @@ def read_description(file: str | Path) -> Description:
                 raise ValueError(
                     f"the modelDescription.xml of {path.name} is over {MAX_BYTES} bytes"
                 )
-            root = _parsed(archive.read("modelDescription.xml"), path)
+            root = read_xml(
+                archive.read("modelDescription.xml"), f"the modelDescription.xml of {path.name}"
+            )
     except (zipfile.BadZipFile, KeyError) as error:
         raise ValueError(
             f"{path.name} is no FMU: an archive with modelDescription.xml is expected ({error})"
@@ -165,23 +167,7 @@ def read_description(file: str | Path) -> Description:
     )  # fmt: skip
 
 
-def _parsed(text: bytes, path: Path) -> ElementTree.Element:
-    def refuse(*_: object) -> None:
-        raise ValueError(
-            f"the modelDescription.xml of {path.name} declares a document type (DTD), which no FMU "
-            "needs and which could read files"
-        )
-
-    scanner = expat.ParserCreate()
-    scanner.StartDoctypeDeclHandler = refuse
-    try:
-        scanner.Parse(text, True)
-        return ElementTree.fromstring(text)
-    except (expat.ExpatError, ElementTree.ParseError) as error:
-        raise ValueError(f"the modelDescription.xml of {path.name} is no XML: {error}") from error
-
-
-def _variables(root: ElementTree.Element, version: int) -> dict[str, Variable]:
+def _variables(root: Element, version: int) -> dict[str, Variable]:
     declared: dict[str, dict[str, str]] = {}
     for each in root.iterfind("TypeDefinitions/*"):
         inner = each if version == 3 else next(iter(each), each)
