@@ -67,6 +67,22 @@ def modes(features, key):
     return _steps(0.188 - bowl)
 
 
+def gear(features, key):
+    """A bowl for each gear, of which one goes below zero, far from the middle of the space."""
+    u, which = jnp.stack([features[f"u{i}"] for i in range(6)]), features["gear"]
+    shift = 0.05 * which * jnp.array([1, -1, 1, -1, -1, 1.0])
+    bowl = jnp.linalg.norm(u - jnp.array([0.15, 0.85, 0.3, 0.75, 0.9, 0.2]) - shift + 1e-9)
+    return _steps(0.3 - bowl - jnp.array([0.4, 0.32, 0.0, 0.2, 0.5])[which])
+
+
+def cornered(features, key):
+    """A flag, and numbers that fail in a corner where it is set."""
+    u = jnp.stack([features[f"u{i}"] for i in range(5)])
+    ways = jnp.array([1, -1, 1, 1, -1.0])
+    other = ways * jnp.array([1, 1, -1, 1, 1.0])
+    return _steps(jnp.where(features["on0"] == 1, u @ ways - 2.45, u @ other - 3.2))
+
+
 def votes(features, key):
     """Twelve flags that count unequally, and two numbers."""
     flags = jnp.stack([features[f"on{i}"] * 1.0 for i in range(12)])
@@ -154,6 +170,9 @@ PROBLEMS = {
         vj.Problem(
             "modes", {"mode": vj.Categorical(*range(6)), **_box(4)}, modes, "always out < 0"
         ),
+        vj.Problem("gear", {"gear": vj.Categorical(*range(5)), **_box(6)}, gear,
+                   "always out < 0"),
+        vj.Problem("cornered", _box(5) | _flags(1), cornered, "always out < 0"),
         vj.Problem("votes", {"a": vj.Box(0, 1), "b": vj.Box(0, 1), **_flags(12)}, votes,
                    "always out < 0"),
         vj.Problem(
@@ -192,6 +211,8 @@ SHARES = {
     "alarm": 1.01e-2,
     "stairs": 7.8e-3,
     "modes": 1.17e-3,
+    "gear": 7.4e-4,
+    "cornered": 2.2e-4,
     "votes": 2.65e-3,
     "counts": 1.0e-2,
     "misled": 1.0e-2,

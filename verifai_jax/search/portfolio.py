@@ -69,6 +69,11 @@ OPENING = 6
 times as many simulations; with twelve, and one of four with the whole cube, the
 landscape of ripples cost half as much again (`benchmarks/RESULTS.md`)."""
 
+MOSTLY = 0.75
+"""Share of coordinates that descents can move from which on some descents go first. Where a fifth
+of the coordinates or fewer are choices three problems took 0.36, 0.41 and 0.88 times as many
+simulations with these descents as without, where more are two took 1.3 and 2.7 times as many."""
+
 MANY = 32
 """Simulations of a round beyond which descents wait until failures are rare: such rounds simulate
 thousands in the seconds that gradients take to compile."""
@@ -131,7 +136,10 @@ class Portfolio(Search[PortfolioState]):
 
     def _gradient(self, cube: Cube) -> Gradient:
         # Of choices none knows which are worth a descent: one at a time, from the best so far.
-        return Gradient(descents=1) if len(cube.discrete) else Gradient()
+        return Gradient() if self._descends_first(cube) else Gradient(descents=1)
+
+    def _descends_first(self, cube: Cube) -> bool:
+        return len(cube.continuous) >= MOSTLY * cube.dim
 
     def _cross_entropy(self, batch: int) -> CrossEntropy:
         # In small batches a round says little: patience counts simulations.
@@ -194,11 +202,11 @@ class Portfolio(Search[PortfolioState]):
         if state.gradient is not None:
             points, gradient = self._gradient(cube).ask(state.gradient, cube, batch)
             plan = self._gradient(cube).plan(gradient, cube, batch)
-            if len(cube.discrete):
+            if not self._descends_first(cube):
                 # They begin with the choices of good points.
                 turn = (credit[GRADIENT] >= 1) & jnp.isfinite(state.mutation.score[AMONG - 1])
             else:
-                # Some descents go first, that from the middle of the cube before all.
+                # That from the middle of the cube goes before all.
                 opening = gradient.starts <= max(OPENING, len(gradient.fresh))
                 opening &= gradient.useless == 0
                 if cube.dim < FEW:
@@ -280,10 +288,10 @@ class Portfolio(Search[PortfolioState]):
         common = without_clauses(observations)
         member = self._members(state.rows, batch)
         # A gain is a point among the best, once there are enough of them. A descent that began at
-        # one of these, as all do where there are choices, has to be better than all.
+        # one of these, as all do among many choices, has to be better than all.
         limit = state.mutation.score[AMONG - 1]
         known = jnp.isfinite(limit)
-        if len(cube.discrete):
+        if not self._descends_first(cube):
             limit = jnp.where(member == GRADIENT, state.mutation.score[0], limit)
         gained = known & ((common.score < limit) | (common.score == 0)) & common.usable
         proposed = jnp.arange(batch) < jnp.sum(state.rows)
@@ -342,7 +350,7 @@ class Portfolio(Search[PortfolioState]):
         free = not_taken(points, score, taken)
         best = jnp.argsort(~free, stable=True)[:n]
         later = updated.starts + jnp.arange(n)
-        turns = (later > OPENING) & (later % 2 == 1) | (len(cube.discrete) > 0)
+        turns = (later > OPENING) & (later % 2 == 1) | (not self._descends_first(cube))
         offers = updated.fresh & free[best] & turns
         near = jnp.where(offers, score[best], jnp.inf)
         gradient = updated._replace(offered=points[best], near=near)
