@@ -89,8 +89,7 @@ AMONG = 4
 """Number of best points among which a new one is a gain: those that mutations have as parents."""
 
 TAKEN = 32
-"""Points that are remembered as starts and ends of descents; as many as mutations keep to start
-from."""
+"""Points remembered as starts and ends of descents; as many as mutations keep to start from."""
 
 
 class PortfolioState(NamedTuple):
@@ -329,11 +328,7 @@ class Portfolio(Search[PortfolioState]):
         return self._offer(state, cube, choose(turn, updated, state.gradient), turn)
 
     def _offer(
-        self,
-        state: PortfolioState,
-        cube: Cube,
-        updated: GradientState,
-        turn: Bool[Array, ""],
+        self, state: PortfolioState, cube: Cube, updated: GradientState, turn: Bool[Array, ""]
     ) -> PortfolioState:
         """Offer the best points where no descent began or ended as every second start."""
         before, n = state.gradient, len(updated.fresh)
