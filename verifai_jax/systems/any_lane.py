@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
 
 
@@ -35,7 +36,7 @@ def changed_if_needed(
     def changed(needed: Any, value: PyTree, *others: PyTree) -> Any:
         # A loop of one pass or none: unlike a branch it copies nothing of the value.
         def once(carry: tuple[Any, PyTree]) -> tuple[Any, PyTree]:
-            return carry[0] & False, change(carry[1], *others)
+            return jnp.array(False), change(carry[1], *others)
 
         return jax.lax.while_loop(lambda carry: carry[0], once, (in_any_lane(needed), value))[1]
 
