@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     from verifai_jax.core.executors import Executor
     from verifai_jax.features.given import Rows
     from verifai_jax.statistics.stopping import StoppingRule
+    from verifai_jax.verification import Verification
 
 
 @suggests_options
@@ -94,6 +95,7 @@ def falsify(
     keep_going: bool = False,
     engine: str = "xla",
     cheap: Problem | None = None,
+    proved: "Verification | None" = None,
 ) -> Run:
     """Search the feature space for inputs under which the system breaks its property.
 
@@ -157,6 +159,8 @@ def falsify(
     - `cheap`: a cheap model of the same features. It is searched first, with 20 times the budget;
       at most a quarter of the budget is then spent on what it found, the gravest first and no two
       alike, from which the search goes on. Only `problem` decides what fails.
+    - `proved`: what `verify` found of this problem. What it proved is not simulated, and the run is
+      of the rest: `proved.rest(problem)`, with which it is resumed from a folder.
 
     Ctrl-C ends the run and returns what is finished. What is likely a mistake of the problem is in
     the run's `notes`, and above the progress bar.
@@ -172,6 +176,8 @@ def falsify(
     started = time.perf_counter()
     check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
     check_engine(engine)
+    if proved is not None:
+        problem = proved.rest(problem, precision)
     asking, search = without_suggestions(search)
     default = search == AUTO
     usual = "cross_entropy" if objective == "likelihood" else "portfolio"
@@ -210,6 +216,8 @@ def falsify(
     with tracing():
         problem.check()
         search, lasting = adapt_search(problem, search, executor)
+        if proved is not None:
+            lasting = (*lasting, proved.note)
         notes = notes_before(problem, search)
     if diverse:
         by = "inputs" if diverse is True else diverse
