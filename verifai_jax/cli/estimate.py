@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 @arguments.PRECISION
 @arguments.BACKEND
 @arguments.CLUSTER
+@arguments.PROVED
 @arguments.PLOT
 @arguments.REPORT
 @arguments.ERRORS

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -82,7 +83,7 @@ def estimate(
     simulations_are: Literal["auto", "slow", "fast"] = "auto",
     within: float | None = None,
     cheap: Problem | None = None,
-    proved: "Verification | None" = None,
+    proved: "Verification | str | Path | None" = None,
 ) -> Estimate:
     """Estimate the probability, under the prior of the features, that a simulation fails.
 
@@ -115,8 +116,8 @@ def estimate(
     - `cheap`: a cheap model of the same features, which says where failures may be. It is simulated
       some 100 000 times; every claim rests on simulations of `problem` alone. Simulations are
       `"slow"` then, and end at `within=1.5` where nothing else is said.
-    - `proved`: what `verify` found of this problem. Where it showed that no point fails, or that
-      all do, nothing is estimated, and all simulations are of the rest.
+    - `proved`: what `verify` found of this problem, or the file of it. Where it showed that no
+      point fails, or that all do, nothing is estimated, and all simulations are of the rest.
 
     **Returns:** the estimate with its interval and a guaranteed bound. Ctrl-C gives the estimate
     from the finished simulations. A simulation without a verdict (not finite, raised, out of time)
@@ -149,7 +150,11 @@ def estimate(
     choice = resolved(problem, batch=batch, budget=budget, precision=precision, wanted=backend)
     choice.problem.check()
     sources, begun = problem.sources(), time.time()
-    rest = None if proved is None else proved.left(choice.problem, precision)
+    rest = None
+    if proved is not None:
+        from verifai_jax.verification.result import as_verification
+
+        rest = as_verification(proved).left(choice.problem, precision)
     simulated = DoublePrecisionEvaluator(choice.problem, batch, precision, seed, executor)
     simulated.compile()
     with SimulationProgress(problem.name, budget, progress) as bar, one_thread():
@@ -286,9 +291,7 @@ def _differentiates(problem: Problem) -> bool:
     return many and without_derivative(problem) is None
 
 
-def _constraint(
-    problem: Problem, rest: "Rest | None"
-) -> Callable[[np.ndarray], np.ndarray] | None:
+def _constraint(problem: Problem, rest: "Rest | None") -> Callable[[np.ndarray], np.ndarray] | None:
     accepts = problem.space.accepts_points
     if rest is None and problem.space.where is None:
         return None
@@ -304,9 +307,7 @@ def _nothing_left(limit_state: LimitState, rng: np.random.Generator, plan: Plan)
     return Answer(Counts(0, 0, 0), 0.0, 0.0, 0.0)
 
 
-def _with_decided(
-    found: Estimate, rest: "Rest", limit_state: LimitState, seed: int
-) -> Estimate:
+def _with_decided(found: Estimate, rest: "Rest", limit_state: LimitState, seed: int) -> Estimate:
     """Return the estimate for the whole prior, where `found` is for the rest of a proof.
 
     What is decided lies within the constraint; samples say how much of the rest does.

@@ -166,12 +166,13 @@ class Estimate(Drawn, InNotebook):
             )
         lines.append(
             f"  guaranteed   at most {self.upper_bound:z.2g} at {sure}, by {self.prior_failures:,} "
-            f"failures in {self.prior_simulations:,} independent samples of {self._drawn_from} alone"
+            f"failures in {self.prior_simulations:,} independent samples of {self._drawn_from} "
+            "alone"
         )
         if self.no_verdict:
             lines.append(
-                f"  no verdict   {format_percent(self.no_verdict_probability)} of the prior, by its "
-                "samples; neither safe nor failing: the upper ends count them as failing"
+                f"  no verdict   {format_percent(self.no_verdict_probability)} of the prior, by "
+                "its samples; neither safe nor failing: the upper ends count them as failing"
             )
         if self.p0 is not None:
             lines.append(f"  p < {self.p0:zg}    {self._conclusion(self.p0)}")

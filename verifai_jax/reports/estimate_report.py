@@ -76,12 +76,14 @@ def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> 
         ("method", method),
         ("interval", f"{interval}, at {sure}"),
         ("guaranteed bound", f"{bound}, at {sure}"),
-        ("proved and certain to fail", f"{1 - estimate.rest:z.6g}, {estimate.certain:z.3g}"),
         (f"independent samples of {drawn_from}", f"{estimate.prior_simulations:,}"),
         ("failures among these", f"{estimate.prior_failures:,}"),
         ("without a verdict among these", f"{estimate.prior_no_verdict:,}"),
         ("relative error", format_percent(estimate.relative_error)),
     ]
+    if estimate.rest < 1:
+        shares = map(format_percent, (estimate.rest, estimate.certain))
+        numbers.append(("left by a proof, and certain to fail", ", ".join(shares)))
     asked = [] if problem is None else problem_content(problem, about)
     prior = "not stated" if problem is None else "see the table of features"
     steps = [f"seed {estimate.seed}", f"precision {estimate.precision}"]

@@ -1,4 +1,4 @@
-"""What boxes that are decided leave of a feature space, to draw samples from and to search.
+"""The part of a feature space that boxes leave open, to draw samples from and to search.
 
 rest = Rest(boxes, (PROVED, BROKEN))
 rest.mass, rest.draw(random, 1000)      # its share of the prior, and points [1000, dim] of it
@@ -85,7 +85,7 @@ def _grow(nodes: list[Node], low: np.ndarray, high: np.ndarray, decided: np.ndar
     node = len(nodes)
     alike = decided.all() or not decided.any()
     inside = low.min(0) if decided.all() else np.full(low.shape[1], np.inf)
-    below, axis, cut = (decided, 0, 0.0) if alike else _most_even_cut(low, high)
+    below, axis, cut = (decided, 0, 0.0) if alike else _even_cut(low, high)
     nodes.append((axis, cut, after := [node, node], inside, high.max(0)))
     if alike:
         return 0
@@ -96,7 +96,7 @@ def _grow(nodes: list[Node], low: np.ndarray, high: np.ndarray, decided: np.ndar
     return 1 + max(depths)
 
 
-def _most_even_cut(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, int, float]:
+def _even_cut(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, int, float]:
     """Return which boxes lie below a cut that goes through none, its coordinate, and where it is.
 
     Of all such cuts it is the one with the most equal numbers of boxes on both sides.

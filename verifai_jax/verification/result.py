@@ -42,7 +42,8 @@ class Verification(Drawn, InNotebook):
     - `name`: the name of the problem; `columns`: its unit coordinates.
     - `boxes`: the partition of the unit cube; `shares`, `upper_shares`: the corners of the boxes as
       shares of the range of the features.
-    - `features`, `formulas`, `model`, `precision`: what was verified; `model` is a hash of the system.
+    - `features`, `formulas`, `model`, `precision`: what was verified, the system by a
+      hash.
     - `confidence`: the confidence of bounds by samples.
     - `looked_at`: boxes that were looked at; `simulations`; `seconds`; `stopped`: why it ended.
     - `notes` for people; `version`.
@@ -244,6 +245,14 @@ class Verification(Drawn, InNotebook):
         arrays = {name: array.tolist() for name, array in asdict(self.boxes).items()}
         write_record(Path(path), {"kind": KIND, **plain, "boxes": arrays}, locked=False)
         return Path(path)
+
+
+def as_verification(result: "Verification | str | Path") -> Verification:
+    """Return a result, read from its file where that is given.
+
+    **Raises:** as `load_verification`.
+    """
+    return load_verification(result) if isinstance(result, str | Path) else result
 
 
 def described(problem: Problem) -> dict[str, Any]:
