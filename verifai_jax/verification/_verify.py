@@ -77,6 +77,7 @@ def verify(
     before = None if resume is None else as_verification(resume)
     if before is not None:
         before.check_same(problem, precision)
+    sources, begun = problem.sources(), time.time()
     enclosure = Enclosure(problem, precision)
     found = Boxes.whole(enclosure) if before is None else before.boxes.copy()
     work = BranchAndBound(problem, enclosure, found, seed)
@@ -99,4 +100,5 @@ def verify(
         stopped=stopped,
         notes=(f"{work.contradicted} {CONTRADICTED}",) if work.contradicted else (),
         version=__version__,
+        sources=sources.settled(begun).to_json(),
     )  # fmt: skip

@@ -16,6 +16,7 @@ import pandas as pd
 from jaxtyping import Bool, Float
 
 from verifai_jax.core.figure import Drawn
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook, frame_html, picture_html
 from verifai_jax.core.text import counted, format_percent
 from verifai_jax.problem.model_digest import digest_of_model
@@ -46,7 +47,7 @@ class Verification(Drawn, InNotebook):
       hash.
     - `confidence`: the confidence of bounds by samples.
     - `looked_at`: boxes that were looked at; `simulations`; `seconds`; `stopped`: why it ended.
-    - `notes` for people; `version`.
+    - `notes` for people; `version`; `sources`: what the model was made of, as a run records it.
     """
 
     _picture = "verification", "plot_verification"
@@ -68,6 +69,7 @@ class Verification(Drawn, InNotebook):
     stopped: str
     notes: tuple[str, ...]
     version: str
+    sources: Mapping[str, Any] = field(repr=False)
 
     @cached_property
     def verdicts(self) -> np.ndarray:
@@ -226,6 +228,18 @@ class Verification(Drawn, InNotebook):
         if not left.mass:
             raise ValueError(f"all of {problem.name!r} is proved: nothing is left to search")
         return replace(problem, space=RestSpace(problem.space, left))
+
+    def report(self, path: str | Path, **options: Any) -> Path:
+        """Write the evidence report on the verification as HTML, and its claims as JSON.
+
+        **Arguments:**
+
+        - `path`: the path of the HTML file.
+        - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`.
+
+        **Returns:** the path.
+        """
+        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
 
     def save(self, path: str | Path) -> Path:
         """Write the result as JSON; `load_verification` reads it.
