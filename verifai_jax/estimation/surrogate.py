@@ -283,7 +283,8 @@ def _state_of(limit_state: LimitState, surrogate: Surrogate, caution: float) -> 
         return rho, rho < 0, np.ones(len(rho), bool)
 
     constraint = limit_state.constraint
-    return LimitState(evaluate, limit_state.dim, 100 * FITTING, 4 * CHUNK, constraint)
+    budget, rest = 100 * FITTING, limit_state.rest
+    return LimitState(evaluate, limit_state.dim, budget, 4 * CHUNK, constraint, rest=rest)
 
 
 def _failures_of(
