@@ -75,6 +75,18 @@ def test_all_recordings_or_a_share_of_them():
     assert "18 of 20 recordings" in str(mined)
 
 
+@pytest.mark.parametrize("text", ["always x > ?d", "always (x > 2 -> eventually[0, ?T] x < ?d)"])
+def test_what_many_recordings_satisfy_is_what_each_of_them_does(text):
+    rng = np.random.default_rng(3)
+    drives = [trace(x=rng.uniform(0, 5, 8).round(2)) for _ in range(12)]
+    together = mtl.mine(text, drives)
+    for corner in together.front:
+        numbers = read_parametric(together.text).formula(corner)
+        assert all(mtl.satisfied(numbers, each) for each in drives)
+    again = mtl.mine(text, drives[::-1])
+    assert again.front == together.front
+
+
 def dominating(pairs, signs):
     """The pairs of which no other is at least as tight in both."""
 

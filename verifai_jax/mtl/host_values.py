@@ -104,6 +104,10 @@ class HostValues:
             raise ValueError(f"no verdict: a signal of {formula} is NaN where it matters")
         return value > 0
 
+    def forget(self) -> None:
+        """Drop what is known of formulas, for those who ask about thousands of them."""
+        self._known.clear()
+
     def walk(self, formula: Formula) -> Walk:
         """Return the way to what decides a formula at the first sample."""
         pad = self._pad(formula)

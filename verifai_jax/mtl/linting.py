@@ -373,7 +373,7 @@ class _Linter:
             if len(known) > 1:
                 faults.append(f"{leaf} compares {known[0]} with {known[1]}")
             yield from (self._found("units", leaf, fault) for fault in faults)
-            for unit in known:
+            for unit in known[: 0 if faults else 1]:
                 owners.setdefault(unit, leaf)
         wanted = plain_unit(self.requirement.unit)
         if wanted and owners and wanted not in owners:

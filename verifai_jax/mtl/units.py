@@ -50,6 +50,8 @@ def plain_unit(unit: str) -> str:
 def unit_of(e: Term, units: Mapping[str, str], faults: list[str]) -> str | None:
     """Return the unit of an expression; None if it is unknown, as for a number alone.
 
+    That of `2 * speed` is unknown, too, since the number may stand for seconds.
+
     **Arguments:**
 
     - `faults`: gets a sentence on each two units that are added, and on a sine of degrees.
@@ -68,8 +70,4 @@ def unit_of(e: Term, units: Mapping[str, str], faults: list[str]) -> str | None:
                 if len(known) > 1:
                     faults.append(f"{e} computes with {' and '.join(known)} together")
                 return known[0] if len(known) == 1 else None
-            if word in ("*", "/") and not arguments[1].signals():
-                return parts[0]
-            if word == "*" and not arguments[0].signals():
-                return parts[1]
     return None
