@@ -7,7 +7,7 @@ unit_of(term, units, faults)                            # 'm', and what does not
 import re
 from collections.abc import Iterable, Mapping
 
-from verifai_jax.mtl.expression import Arithmetic, Component, Signal
+from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Signal
 from verifai_jax.mtl.formula import Term
 
 IN_NAME = re.compile(r"[(\[]\s*([^()\[\]\d][^()\[\]]*?)\s*[)\]]\s*$")
@@ -57,6 +57,8 @@ def unit_of(e: Term, units: Mapping[str, str], faults: list[str]) -> str | None:
     - `faults`: gets a sentence on each two units that are added, and on a sine of degrees.
     """
     match e:
+        case Duration():
+            return "s"
         case Signal(name):
             return units.get(name)
         case Component(vector, _):
