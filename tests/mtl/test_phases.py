@@ -1,5 +1,7 @@
 """Phases of a run, and what is counted within a window, against definitions written out."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -81,6 +83,19 @@ def test_after_the_end_nothing_is_counted():
     assert monitor.finish() == 0.0
     monitor.step({"x": 3.0})
     assert monitor.interval()[1] == -1.0  # whatever follows
+
+
+@pytest.mark.thorough
+def test_a_trace_that_ended_early_counts_to_its_end():
+    x = jnp.asarray(RANDOM.normal(size=(3, 12)))
+    valid = jnp.array([1, 7, 12])
+    f = mtl.parse("always duration(x > 0, 3) <= 1")
+    run = jax.vmap(lambda x, n: mtl.robustness(f, Trace({"x": x}, dt=0.5, valid=n)))
+    expected = [
+        1 - max(seconds_held(np.asarray(row[:n]) > 0, 6, 0.5))
+        for row, n in zip(x, valid, strict=True)
+    ]
+    np.testing.assert_array_equal(run(x, valid), expected)
 
 
 def test_what_was_recorded_between_two_instants_counts():

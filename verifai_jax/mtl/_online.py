@@ -101,7 +101,7 @@ def online(formula: Formula | str, dt: float, semantics: Semantics = hard) -> On
     """
     formula = parse(formula) if isinstance(formula, str) else formula
     monitor = Online(formula, dt, semantics.kind)
-    if counted := durations_in(term for f in formula.subformulas() for term in f.terms()):
+    if counted := durations_in(formula):
         raise ValueError(f"{counted[0]} is counted by watch and export_c, and not by online")
     _plan(monitor)
     return monitor

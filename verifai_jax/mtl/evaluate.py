@@ -236,7 +236,14 @@ class Evaluator:
             truth = boolean.value(e.operand, 0, self._last)
             dtype = next(iter(self.signals.values())).dtype
             n = int(samples(e.window, self.dt, Interval(0.0, e.window))) * self.stride
-            self._memo[e] = seconds_held(truth, n, self.dt / self.stride, jnp).astype(dtype)
+            seconds = seconds_held(truth, n, self.dt / self.stride, jnp).astype(dtype)
+            if self.valid is not None:  # After the end nothing is counted.
+                rows = jnp.minimum(self._index(0, seconds), self.valid - 1)
+                shape = jnp.broadcast_shapes(rows.shape, seconds.shape)
+                seconds = jnp.take_along_axis(
+                    jnp.broadcast_to(seconds, shape), jnp.broadcast_to(rows, shape), axis=0
+                )
+            self._memo[e] = seconds
         return self._memo[e]
 
     def _arithmetic(self, e: Arithmetic, start: int, stop: int) -> Array | float:

@@ -6,7 +6,7 @@ x, theta = signal("x"), signal("theta")
 
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from operator import methodcaller
 
@@ -261,9 +261,10 @@ def duration(operand: Formula | Term, window: float) -> Duration:
     return Duration(f"duration({counted}, {number_text(window)})", counted, float(window))
 
 
-def durations_in(terms: Iterable[Term]) -> tuple[Duration, ...]:
-    """Return the durations in expressions, each once."""
-    parts = (part for term in terms for part in postorder(term))
+def durations_in(*formulas: Formula) -> tuple[Duration, ...]:
+    """Return the durations in formulas, each once."""
+    leaves = (leaf for f in formulas for leaf in f.subformulas())
+    parts = (part for leaf in leaves for term in leaf.terms() for part in postorder(term))
     return tuple(dict.fromkeys(part for part in parts if isinstance(part, Duration)))
 
 

@@ -135,7 +135,7 @@ def streams(
             each, streams(each.operand, dt, boolean, every=True),
             int(samples(each.window, dt, ast.Interval(0.0, each.window))), dt,
         )
-        for each in durations_in(term for f, _ in plan.leaves for term in f.terms())
+        for each in durations_in(*(f for f, _ in plan.leaves))
     )  # fmt: skip
     made = Plan(parsed, tuple(plan.leaves), tuple(plan.ops), tuple(outputs), plan.top, counts)
     if made.memory > LARGEST:
