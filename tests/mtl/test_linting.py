@@ -221,6 +221,10 @@ def test_a_number_in_a_product_may_have_a_unit(drives):
     assert [each.sentence for each in said] == ["dist > speed compares m with m/s"]
 
 
+def test_few_seconds_that_are_counted_are_near_their_limit(drives):
+    assert not mtl.lint("always duration(speed > 28, 10) <= 3", drives, units=UNITS)
+
+
 def test_a_formula_alone_is_looked_at_without_recordings():
     assert [f.kind for f in mtl.lint("always (x > 5 & x < 3)")] == ["always false"]
     assert not mtl.lint("always (x > 5 -> eventually[0, 2] y < 3)")

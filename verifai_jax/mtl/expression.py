@@ -268,6 +268,14 @@ def durations_in(*formulas: Formula) -> tuple[Duration, ...]:
     return tuple(dict.fromkeys(part for part in parts if isinstance(part, Duration)))
 
 
+def with_counted(*formulas: Formula) -> list[Formula]:
+    """Return formulas, and those that their durations count."""
+    found = list(formulas)
+    for each in found:
+        found += [d.operand for d in durations_in(each) if d.operand not in found]
+    return found
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Component(Expression):
     """One component of a vector signal `[time, k]`, counted from 0."""
