@@ -50,7 +50,7 @@ def check_guarantees(sets, further):
     return [np.mean(each) for each in (false, above, strange, caught)]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_alarms_are_false_as_seldom_as_they_say():
     false, above, strange, caught = check_guarantees(12, 40)
     assert max(false, above, strange) < 0.16

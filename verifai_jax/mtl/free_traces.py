@@ -185,8 +185,14 @@ def _clock(
     ends = [t for i in intervals for t in (i.start, i.end) if 0 < t < math.inf]
     ends += [each.window for each in durations_in(*formulas)]
     if dt is None:
-        exact = [Fraction(repr(t)) for t in ends]
+        # Seconds that are counted are multiples of the period, too, and so are their limits.
+        counts = [leaf for f in formulas for leaf in predicates_of(f) if durations_in(leaf)]
+        limits = [number for leaf in counts for number in _numbers(leaf) if number > 0]
+        exact = [Fraction(repr(t)) for t in (*ends, *limits)]
         common = Fraction(1) if not exact else _common(exact)
+        if limits and sum(ends) > common * MAX_SAMPLES / 8:
+            exact = exact[: len(ends)]
+            common = _common(exact)
         # Where windows have few samples there are some between their ends.
         shortest = min(exact, default=Fraction(1))
         dt = float(common / max(1, math.ceil(4 / (shortest / common))))
