@@ -102,7 +102,7 @@ def ridge(u):
     return jnp.array([one, two, ABSENT, ABSENT])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_maximum_of_clauses_does_not_stall_a_descent():
     cube = Cube((0,) * D)
     u = jax.random.uniform(jax.random.key(0), (200_000, D))

@@ -81,7 +81,7 @@ def test_failures_inside_the_space_are_found(histories):
     assert found >= without + 2
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_most_descents_are_given_up_early():
     search, cube = Descent(), Cube((0,) * D)
     ask, tell = jax.jit(search.ask, static_argnums=(1, 2)), jax.jit(search.tell, static_argnums=1)

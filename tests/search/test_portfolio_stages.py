@@ -81,7 +81,7 @@ def test_a_search_for_diverse_failures_has_the_stages_of_the_one_inside():
     assert search.stage(state._replace(inner=inner), CUBE, 4) is search
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_stage_proposes_what_the_whole_proposes():
     points, states = zip(*play(Portfolio(), begin(4), 4, 60), strict=True)
     same, others = zip(*play(DESCENDS, begin(4), 4, 60), strict=True)

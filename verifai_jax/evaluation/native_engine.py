@@ -232,7 +232,7 @@ def _cut(temperature: Temperature, which: slice | np.ndarray) -> Temperature:
 
 
 def _alike(ours: np.ndarray, theirs: np.ndarray) -> bool:
-    """Return whether derivatives agree, but for those of few chaotic simulations."""
+    """Return whether derivatives agree, except in a few chaotic simulations."""
     ours, theirs = ours.reshape(len(ours), -1), theirs.reshape(len(theirs), -1)
     size = np.max(np.abs(theirs), axis=1, keepdims=True) + 1e-6
     same = np.isclose(ours, theirs, rtol=0, atol=10 * AGREES * size, equal_nan=True)
