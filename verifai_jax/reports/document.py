@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from verifai_jax.analysis import OperationalDomain
 from verifai_jax.comparison.result import Comparison, Transfer
 from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.checks import check_count
@@ -25,6 +26,7 @@ from verifai_jax.reports.comparison_report import comparison_page
 from verifai_jax.reports.errors_section import with_errors
 from verifai_jax.reports.estimate_report import estimate_page
 from verifai_jax.reports.judgement_report import judgement_page
+from verifai_jax.reports.odd_section import with_odd
 from verifai_jax.reports.page import write_page
 from verifai_jax.reports.run_question import About
 from verifai_jax.reports.run_report import run_page
@@ -47,6 +49,7 @@ def write_report(
     modes: int | None = None,
     problem: Problem | None = None,
     errors: ErrorBudget | None = None,
+    odd: OperationalDomain | None = None,
     assessment: bool = False,
     progress: bool | None = None,
 ) -> Path:
@@ -69,6 +72,8 @@ def write_report(
     - `problem`: the problem of an estimate or a verification, or the baseline of a comparison, for
       its property and prior.
     - `errors`: how wrong the number can be, as `vj.error_budget` says: a section and a claim.
+    - `odd`: the operational design domain, of `vj.read_odd`: a section on what a run covers of it;
+      its units, and its reasons with their sources, are those of features without others.
     - `assessment`: whether sections for an assessor follow: the claims as a tree, the nine steps of
       credibility with boxes to be filled in, and a page to be signed.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
@@ -80,7 +85,11 @@ def write_report(
     since they were written;
     `TypeError` for something that is not a result.
     """
-    path, about = Path(path), About(units or {}, reasons or {})
+    path = Path(path)
+    about = About(
+        {**(odd.units if odd else {}), **(units or {})},
+        {**(odd.reasons if odd else {}), **(reasons or {})},
+    )
     if modes is not None:
         check_count("modes", modes)
     match result:
@@ -92,7 +101,8 @@ def write_report(
                 )
             space = result.problem.space if result.problem else None
             _check(about, space, result.table.features)
-            words = None if errors is not None else " --assessment" * assessment
+            apart = errors is not None or odd is not None
+            words = None if apart else " --assessment" * assessment
             page = run_page(result, about, traces, studies, modes, words)
         case Sweep():
             _check(about, result.space, result.hyperparameters)
@@ -120,6 +130,10 @@ def write_report(
             )
     if errors is not None:
         page = with_errors(page, errors)
+    if odd is not None:
+        if not isinstance(result, Run):
+            raise TypeError(f"odd= is for a report on a run; got {type(result).__name__}")
+        page = with_odd(page, odd.coverage(result))
     if assessment:
         page = with_assessment(page)
     write_page(page, path)
