@@ -99,15 +99,13 @@ BALL_VARIABLES = {
     "der(h)": (7, "local", "continuous", None, None, "m/s"),
     "der(v)": (8, "local", "continuous", None, None, "m/s2"),
     "asks_at": (9, "parameter", "fixed", "100.0", None, "m"),
-    "starts": (10, "output", "discrete", None, None, "1"),
 }
 
 BALL = r"""
-typedef struct { double r[11]; int32_t mode; double time; int kicked; double starts; } Model;
+typedef struct { double r[10]; int32_t mode; double time; int kicked; } Model;
 static void reset(Model *m) {
   double start[] = {9.81, 0.7, 100, 0, 1, 0, 0, 0, 0, 100}; memcpy(m->r, start, sizeof start);
   m->mode = 0; m->time = 0; m->kicked = 0; }
-static void initialize(Model *m) { m->r[10] = ++m->starts; }
 /* A bounce at the ground, a kick at a time that is known, a catch where a step asks for it. */
 static int event(Model *m, double *next) {
   if (m->r[4] <= 0 && m->r[5] < 0) { m->r[5] *= -m->r[1]; m->r[6]++; }
@@ -129,7 +127,7 @@ void *fmi2Instantiate(const char *n, int t, const char *g, const char *r, void *
 void fmi2FreeInstance(void *c) { free(c); }
 int fmi2SetupExperiment(void *c, int a, double b, double d, int e, double f) { return 0; }
 int fmi2EnterInitializationMode(void *c) { return 0; }
-int fmi2ExitInitializationMode(Model *c) { initialize(c); return 0; }
+int fmi2ExitInitializationMode(void *c) { return 0; }
 int fmi2Terminate(void *c) { return 0; }
 int fmi2Reset(Model *c) { reset(c); return 0; }
 int fmi2SetReal(Model *c, const unsigned *v, size_t n, const double *x) {
@@ -150,10 +148,6 @@ int fmi2GetDerivatives(Model *c, double *dx, size_t n) { slopes(c, dx); return 0
 int fmi2GetEventIndicators(Model *c, double *z, size_t n) { z[0] = c->r[4]; return 0; }
 int fmi2CompletedIntegratorStep(Model *c, int no, int *enter, int *end) {
   *enter = asks(c); *end = ends(c); return 0; }
-int fmi2GetFMUstate(Model *c, Model **s) {
-  if (!*s) *s = malloc(sizeof *c); **s = *c; return 0; }
-int fmi2SetFMUstate(Model *c, Model *s) { double n = c->starts; *c = *s; c->starts = n; return 0; }
-int fmi2FreeFMUstate(Model *c, Model **s) { free(*s); *s = 0; return 0; }
 """
 
 BALL_THREE = r"""
@@ -163,7 +157,7 @@ void *fmi3InstantiateModelExchange(const char *n, const char *g, const char *r, 
   Model *x = calloc(1, sizeof(Model)); reset(x); return x; }
 void fmi3FreeInstance(void *c) { free(c); }
 int fmi3EnterInitializationMode(void *c, bool a, double b, double d, bool e, double f) { return 0; }
-int fmi3ExitInitializationMode(Model *c) { initialize(c); return 0; }
+int fmi3ExitInitializationMode(void *c) { return 0; }
 int fmi3Terminate(void *c) { return 0; }
 int fmi3Reset(Model *c) { reset(c); return 0; }
 int fmi3SetFloat64(Model *c, const uint32_t *v, size_t n, const double *x, size_t m) {
@@ -188,12 +182,9 @@ int fmi3GetContinuousStateDerivatives(Model *c, double *dx, size_t n) { slopes(c
 int fmi3GetEventIndicators(Model *c, double *z, size_t n) { z[0] = c->r[4]; return 0; }
 int fmi3CompletedIntegratorStep(Model *c, bool no, bool *enter, bool *end) {
   *enter = asks(c); *end = ends(c); return 0; }
-int fmi3GetFMUState(Model *c, Model **s) {
-  if (!*s) *s = malloc(sizeof *c); **s = *c; return 0; }
-int fmi3SetFMUState(Model *c, Model *s) { double n = c->starts; *c = *s; c->starts = n; return 0; }
-int fmi3FreeFMUState(Model *c, Model **s) { free(*s); *s = 0; return 0; }
 """
 
+TEXT = 'name="text" valueReference="21" causality="output" variability="discrete"'
 INCLUDES = "\n".join(MODEL.splitlines()[1:5]) + "\n"
 STRUCTURE = (
     "<ModelStructure><Derivatives><Unknown index='8'/><Unknown index='9'/></Derivatives>"
@@ -218,8 +209,10 @@ def description(version, doctype="", variables=VARIABLES, kind="CoSimulation", m
     common = 'name="mode" valueReference="20" causality="parameter" variability="fixed"'
     if version == 2:
         rows.append(f'<ScalarVariable {common}><Integer start="0"/></ScalarVariable>')
+        rows.append(f"<ScalarVariable {TEXT}><String/></ScalarVariable>")
     else:
         rows.append(f'<Int32 {common} start="0"/>')
+        rows.append(f"<String {TEXT}/>")
         rows.append(
             '<Float64 name="table" valueReference="9" causality="parameter" start="0 0">'
             '<Dimension start="2"/></Float64>'
@@ -233,12 +226,11 @@ def description(version, doctype="", variables=VARIABLES, kind="CoSimulation", m
                 if version == 2
                 else f'<Float64Type name="T{name}" {span}/>'
             )
-    saves = "canGetAndSetFMUState" if version == 3 else "canGetAndSetFMUstate"
     token = 'guid="token"' if version == 2 else 'instantiationToken="token"'
     return (
         f'<?xml version="1.0"?>{doctype}<fmiModelDescription fmiVersion="{version}.0" '
         f'modelName="spring" {token} numberOfEventIndicators="1">'
-        f'<{kind} modelIdentifier="spring" {saves}="true"/>'
+        f'<{kind} modelIdentifier="spring"/>'
         f"<TypeDefinitions>{''.join(kinds)}</TypeDefinitions>"
         f"<ModelVariables>{''.join(rows)}</ModelVariables>{more_of_root}</fmiModelDescription>"
     )

@@ -213,8 +213,8 @@ def fmu(
     description = read_description(file, exchange)
     _ = description.binary
     if outputs is None:
-        there = [v.name for v in description.variables.values() if v.causality == "output"]
-        named = {_identifier(name): name for name in there if description.variables[name].scalar}
+        there = [v for v in description.variables.values() if v.causality == "output"]
+        named = {_identifier(v.name): v.name for v in there if v.scalar and v.type != "String"}
     else:
         named = (
             dict(outputs) if isinstance(outputs, Mapping) else {_identifier(n): n for n in outputs}

@@ -2,9 +2,9 @@
 
 instance = ExchangeInstance(description, folder)     # begin, set, step and get as of `Instance`
 
-LSODA integrates, which changes to implicit steps where the equations are stiff. Its steps are at
-most as long as those of communication. An event happens where an indicator changes its sign, which
-bisection finds within the step, at a time that the FMU named, and wherever the FMU asks for one.
+LSODA integrates, which changes to implicit steps where the equations are stiff. An event happens
+where an indicator has changed its sign after a step of communication, which bisection finds within
+it, at a time that the FMU named, where it asks for one, and wherever an input changes.
 """
 
 from collections.abc import Mapping
@@ -20,6 +20,10 @@ TOLERANCE = 1e-6
 """Relative tolerance of the integration; the absolute one is this share of a state's nominal."""
 RESOLUTION = 1e-12
 """Seconds, as a share of the time, to which the time of an event is found."""
+MIN_STEPS = 50
+"""Steps of the integrator in a simulation, at least: longer ones might miss a short pulse."""
+MAX_STEPS = 100_000
+"""Steps of the integrator in one step of communication, at which a simulation is given up."""
 MAX_EVENTS = 1000
 """Events of one step of communication, and rounds of one event, at which a simulation is given up:
 such a model chatters."""
@@ -49,13 +53,14 @@ class ExchangeInstance(Instance):
         super().begin(values, duration)
         self._running, self._ended = True, False
         self._inputs, self._time, self._stop = dict(values), 0.0, duration
-        self._size, indicators = self._sizes()
-        # One number at least: without states the integrator is given one that stands still.
-        self._states, self._slopes, nominals = ((c_double * max(self._size, 1))() for _ in range(3))
-        self._indicators = (c_double * indicators)()
+        self._size, self._count = self._sizes()
+        self._states, self._state_view = _shared(self._size)
+        self._slopes, self._slope_view = _shared(self._size)
+        self._indicators, self._indicator_view = _shared(self._count)
+        nominals, nominal = _shared(self._size)
         if self._size:
             self._call("GetNominalsOfContinuousStates", nominals, c_size_t(self._size))
-        self._tolerances: Any = TOLERANCE * np.maximum(np.abs(nominals), 1e-30 if self._size else 1.0)
+        self._tolerances: Any = TOLERANCE * np.where(nominal == 0, 1.0, np.abs(nominal))
         self._settle()
 
     def set(self, values: Mapping[str, float]) -> None:
@@ -74,13 +79,10 @@ class ExchangeInstance(Instance):
 
         **Raises:** `FMUError` also where the integration fails, or events do not end.
         """
-        end, events = min(time + size, self._stop), 0
+        end, events = time + size, 0
         while self._time < end and not self._ended:
-            if self._solver is None or self._time >= self._reached:
-                self._integrate(size)
-            self._time = max(self._time, min(end, self._reached, self._next))
-            self._move(self._time, self._course(self._time))
-            if self._completed() or self._time >= min(self._crossing, self._next):
+            event = self._integrate(min(end, self._next))
+            if self._completed() or event or self._time >= self._next:
                 events += 1
                 if events > MAX_EVENTS:
                     raise self._chatters("events in a step of communication")
@@ -88,55 +90,61 @@ class ExchangeInstance(Instance):
                 self._settle()
         return not self._ended
 
-    def _integrate(self, size: float) -> None:
-        """Take one step of the integrator, and find where in it an indicator changes its sign."""
-        from scipy.integrate import LSODA
+    def _integrate(self, end: float) -> bool:
+        """Go on up to a time, or to a change of sign before it, and return whether there is one."""
+        from scipy.integrate import ode, solve_ivp
 
+        begin, before = self._time, self._state_view.copy()
         if self._solver is None:
-            self._solver = LSODA(
-                self._slope, self._time, np.array(self._states), self._stop,
-                max_step=size, rtol=TOLERANCE, atol=self._tolerances,
+            self._solver = ode(self._slope).set_integrator(
+                "lsoda", rtol=TOLERANCE, atol=self._tolerances, max_step=self._stop / MIN_STEPS,
+                nsteps=MAX_STEPS,
             )  # fmt: skip
-        said = self._solver.step()
-        if self._solver.status == "failed":
+            self._solver.set_initial_value(before, begin)
+        longer = end - begin > RESOLUTION * end
+        self._move(end, self._solver.integrate(end) if longer else before)
+        if not self._solver.successful():
             raise FMUError(
-                f"{self.description.file.name} cannot be integrated beyond {self._time:z.6g} s: "
-                f"{said}{self._said()}"
+                f"{self.description.file.name} cannot be integrated from {begin:z.6g} to {end:z.6g}"
+                f" s{self._said()}"
             )
-        self._course = self._solver.dense_output()
-        low, high = self._time, self._solver.t
-        self._reached, self._crossing = high, np.inf
-        if not self._changed(high):
-            return
-        while high - low > RESOLUTION * max(high, size):
-            middle = (low + high) / 2
-            low, high = (low, middle) if self._changed(middle) else (middle, high)
-        self._reached = self._crossing = high
-
-    def _changed(self, time: float) -> bool:
-        """Return whether an indicator has another sign than after the last event."""
-        if not len(self._indicators):
+        self._time = end
+        if not self._changed():
             return False
-        self._move(time, self._course(time))
-        return bool(np.any(self._signs() != self._signs_before))
+        course: Any = solve_ivp(
+            self._slope, (begin, end), before, "LSODA", rtol=TOLERANCE, atol=self._tolerances,
+            dense_output=True,
+        ).sol  # fmt: skip
+        low, high = begin, end
+        while high - low > RESOLUTION * max(high, end - begin):
+            middle = (low + high) / 2
+            self._move(middle, course(middle))
+            low, high = (low, middle) if self._changed() else (middle, high)
+        self._time = high
+        self._move(high, course(high))
+        return True
+
+    def _changed(self) -> bool:
+        """Return whether an indicator has another sign than after the last event."""
+        return bool(self._count) and bool(np.any(self._signs() != self._signs_before))
 
     def _signs(self) -> Bool[np.ndarray, " indicators"]:
-        if len(self._indicators):
-            self._call("GetEventIndicators", self._indicators, c_size_t(len(self._indicators)))
-        return np.array(self._indicators) > 0
+        if self._count:
+            self._call("GetEventIndicators", self._indicators, c_size_t(self._count))
+        return self._indicator_view > 0
 
     def _slope(self, time: float, states: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         self._move(time, states)
         if self._size:
             name = "GetDerivatives" if self._two else "GetContinuousStateDerivatives"
             self._call(name, self._slopes, c_size_t(self._size))
-        return np.array(self._slopes)
+        return self._slope_view
 
     def _move(self, time: float, states: Float[np.ndarray, " n"]) -> None:
         """Take the FMU to a time and its states."""
         self._call("SetTime", c_double(time))
         if self._size:
-            self._states[:] = states.tolist()
+            self._state_view[:] = states
             self._call("SetContinuousStates", self._states, c_size_t(self._size))
 
     def _completed(self) -> bool:
@@ -189,3 +197,12 @@ class ExchangeInstance(Instance):
             f"{self.description.file.name} has more than {MAX_EVENTS:,} {events} at "
             f"{self._time:z.6g} s{self._said()}"
         )
+
+
+def _shared(count: int) -> tuple[Any, Float[np.ndarray, " n"]]:
+    """Return numbers for C, and the same memory as an array.
+
+    It has one number at least: a model without states is integrated as one that stands still.
+    """
+    numbers = (c_double * max(count, 1))()
+    return numbers, np.frombuffer(numbers)
