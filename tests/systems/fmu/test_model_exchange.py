@@ -80,7 +80,9 @@ class TestEvents:
 @pytest.mark.thorough
 def test_a_ball_is_falsified(file):
     space = {"e": vj.Box(0.5, 0.9), "h": vj.Box(0.5, 1.5)}
-    problem = vj.Problem("ball", space, vj.fmu(file, **TIMES), "always[0.7, 1.5] h < 0.6")
+    problem = vj.Problem(
+        "ball", space, vj.fmu(file, **TIMES, workers=None), "always[0.7, 1.5] h < 0.6"
+    )
     problem.check()
     run = vj.falsify(problem, "uniform", budget=20, seed=1)
     failed = run.table.counterexamples

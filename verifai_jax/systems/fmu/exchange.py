@@ -204,5 +204,5 @@ def _shared(count: int) -> tuple[Any, Float[np.ndarray, " n"]]:
 
     It has one number at least: a model without states is integrated as one that stands still.
     """
-    numbers = (c_double * max(count, 1))()
+    numbers: Any = (c_double * max(count, 1))()
     return numbers, np.frombuffer(numbers)
