@@ -26,7 +26,7 @@ TOGETHER = ("reduce", "arg", "cum", "dot", "conv", "sort", "gather", "scatter")
 
 
 class Layout(NamedTuple):
-    """How the rows of a batch are laid out.
+    """The layout of the rows of a batch.
 
     - `devices`: JAX devices, of which each has an equal share.
     - `chunks`: parts of a share, worked through one after the other.
