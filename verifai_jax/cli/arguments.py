@@ -123,6 +123,14 @@ PLOT = click.option(
 )
 """File of the one picture of a result."""
 
+PROVED = click.option(
+    "--proved",
+    type=click.Path(path_type=Path),
+    metavar="JSON",
+    help="What verify wrote with --into: spend nothing on what it proved.",
+)
+"""File of a verification."""
+
 REPORT = click.option(
     "--report",
     type=click.Path(path_type=Path),

@@ -57,7 +57,7 @@ def report(
 ) -> None:
     """Write the evidence report on a run or a sweep: one HTML file, and its claims as JSON.
 
-    FOLDER may also be a file that `estimate --json` or `compare --json` wrote.
+    FOLDER may also be a file that `estimate --json`, `compare --json` or `verify --into` wrote.
     """
     from verifai_jax.reports.document import claims_path, write_report
 

@@ -32,7 +32,9 @@ from verifai_jax.reports.run_question import About
 from verifai_jax.reports.run_report import run_page
 from verifai_jax.reports.sweep_report import sweep_page
 from verifai_jax.reports.transfer_report import transfer_page
+from verifai_jax.reports.verification_report import verification_page
 from verifai_jax.sweeps.result import Sweep
+from verifai_jax.verification.result import Verification
 
 
 @shows_progress("writing the report on")
@@ -55,8 +57,8 @@ def write_report(
 
     **Arguments:**
 
-    - `result`: a run, a sweep, an estimate, a comparison, a transfer or a judgement. The failures
-      of a run that has its problem are simulated again.
+    - `result`: a run, a sweep, an estimate, a verification, a comparison, a transfer or a
+      judgement. The failures of a run that has its problem are simulated again.
     - `path`: the path of the HTML file; the claims go to the same name with the ending
       `.claims.json`.
     - `units`: the units of features, by name.
@@ -67,8 +69,8 @@ def write_report(
       system is a black box that takes long.
     - `modes`: simulations spent on all ways of failing of a run and their probabilities, as
       `vj.modes` finds them; none when left out.
-    - `problem`: the problem of an estimate, or the baseline of a comparison, for its property and
-      prior.
+    - `problem`: the problem of an estimate or a verification, or the baseline of a comparison, for
+      its property and prior.
     - `errors`: how wrong the number can be, as `vj.error_budget` says: a section and a claim.
     - `odd`: the operational design domain, of `vj.read_odd`: a section on what a run covers of it;
       its units, and its reasons with their sources, are those of features without others.
@@ -108,6 +110,9 @@ def write_report(
         case Estimate():
             _check(about, None if problem is None else problem.space, ())
             page = estimate_page(result, about, problem)
+        case Verification():
+            _check(about, None if problem is None else problem.space, ())
+            page = verification_page(result, about, problem)
         case Comparison():
             _check(about, result.candidates[0].space, ())
             page = comparison_page(result, about, problem)
@@ -120,8 +125,8 @@ def write_report(
         case _:
             kind = type(result).__name__
             raise TypeError(
-                "a report is on a run, a sweep, an estimate, a comparison, a transfer or a "
-                f"judgement; got {kind}"
+                "a report is on a run, a sweep, an estimate, a verification, a comparison, a "
+                f"transfer or a judgement; got {kind}"
             )
     if errors is not None:
         page = with_errors(page, errors)
