@@ -127,15 +127,15 @@ class Server:
         """Yield an answer to each request, as a line."""
         for line in filter(str.strip, lines):
             try:
-                message = json.loads(line)
+                request = json.loads(line)
             except ValueError:
                 yield _line(None, error={"code": -32700, "message": "the message is no JSON"})
                 continue
-            valid = isinstance(message, dict) and isinstance(message.get("method"), str)
-            if not valid or not isinstance(message.get("params", {}), dict):
+            valid = isinstance(request, dict) and isinstance(request.get("method"), str)
+            if not valid or not isinstance(request.get("params", {}), dict):
                 yield _line(None, error={"code": -32600, "message": "this is no request"})
-            elif "id" in message:  # Nothing is answered to a notification.
-                yield self._answer(message["id"], message["method"], message.get("params", {}))
+            elif "id" in request:  # Nothing is answered to a notification.
+                yield self._answer(request["id"], request["method"], request.get("params", {}))
 
     def _answer(self, number: object, method: str, params: Mapping[str, Any]) -> str:
         match method:
@@ -212,7 +212,7 @@ class Server:
                 env={**os.environ, "MPLBACKEND": "agg"},
             )  # fmt: skip
         except subprocess.TimeoutExpired:
-            raise Refused(f"it was ended after {self.seconds:g} s; take a smaller budget") from None
+            raise Refused(f"it was ended after {self.seconds:zg} s; take a smaller budget") from None
 
     def _fence(self, key: str, value: str) -> None:
         """Refuse a path outside of the folder, and a problem that is no file in it."""
