@@ -9,6 +9,7 @@ Interrupted, it goes on where it was.
 """
 
 import argparse
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +22,23 @@ from specs.cartpole import balance_with
 from specs.mountain_car import climb_with, safe_training
 from verifai_jax.statistics.paired import paired_difference
 
+WIDE = {
+    "x0": vj.Box(-1.5, 1.5),
+    "theta0": vj.Box(-0.12, 0.12),
+    "masspole": vj.Box(0.05, 1.0),
+    "length": vj.Box(0.2, 2.0),
+}
+"""Starts and poles of which a policy that was trained on CartPole-v1 keeps not all."""
+
+
+def wide_with(policy):
+    """Return `balance` under a policy, with these starts and poles."""
+    return dataclasses.replace(balance_with(policy), space=vj.FeatureSpace(WIDE))
+
+
 CASES = {
     "cartpole": (
-        CartPoleTask(masspole_range=0.0, length_range=0.0), balance_with, HYPER_PARAMETERS,
+        CartPoleTask(masspole_range=0.0, length_range=0.0), wide_with, HYPER_PARAMETERS,
         {"steps": 300_000, "p": 0.001},
     ),
     "mountain_car": (

@@ -375,8 +375,8 @@ def _as_study(
     else:
         if isinstance(given, Trainer) and algorithm is not None:
             raise ValueError("a Trainer has algorithms; give no other")
-        options = {} if algorithm is None else {"algorithms": algorithm}
-        trainer = given if isinstance(given, Trainer) else Trainer(given, **options)
+        trainer = given if isinstance(given, Trainer) else Trainer(given)
+        trainer = trainer if algorithm is None else Trainer(given, algorithm)
         space = {"steps": Categorical(trainer.steps)}
         study = Study(trainer.name, space, trainer, problem, p=0.01 if p is None else p)
     trainer = study.trainer
