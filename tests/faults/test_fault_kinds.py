@@ -240,7 +240,7 @@ def test_faults_of_one_channel_apply_in_their_order():
     assert other.space == problem().space  # Nothing of it varies.
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_line_between_two_samples(all_of_them):
     """Onset and duration move in whole samples: only over a few of them is there a slope."""
     weight = jnp.linspace(1, 2, STEPS + 1)
