@@ -165,12 +165,12 @@ def _row(
             raise missing_name("the recording", "signal", signal, trace.signals)
     if reading.end == "strict":
         check_horizon(formula, trace, values.dt)
-    robustness = float(values(formula)[0])
+    robustness = float(values.first(formula))
     if math.isnan(robustness):
         missing = f"no verdict: {first_nan(formula, trace)}"
         return Row(name, requirement.id, error=missing)
     # At a robustness of zero the comparison decides.
-    holds = robustness > 0 or (robustness == 0 and float(values.truth(formula)[0]) > 0)
+    holds = robustness > 0 or (robustness == 0 and float(values.first(formula, boolean=True)) > 0)
     instant, why = _decision(values, formula, clock) if reading.explain else (math.nan, "")
     return Row(name, requirement.id, "holds" if holds else "fails", robustness, instant, why)
 
