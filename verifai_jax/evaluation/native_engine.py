@@ -89,7 +89,7 @@ class NativeEngine:
     @property
     def padded(self) -> int:
         """Rows of the program of XLA."""
-        return self._begun.padded
+        return self._begun.layout.padded
 
     @property
     def compile_seconds(self) -> float:
@@ -316,7 +316,7 @@ class _Program:
         library = self.ready()
         temperatures = np.broadcast_to(np.asarray(temperature, np.float32), (len(rows),))
         words = np.asarray(jax.random.key_data(key))
-        threads = len(self.engine.devices)
+        threads = len(self.engine.layout.devices)
         packed = library(rows, words, first, temperatures, self.engine.numbers, threads)
         unpacked: Any = self.engine.unpack({"uint32": packed}, len(rows))
         rho, status, features, more = unpacked
