@@ -37,7 +37,7 @@ from verifai_jax.estimation.importance import ImportanceSamples
 from verifai_jax.estimation.intervals import student_quantile
 from verifai_jax.estimation.mixture import Mixture
 from verifai_jax.estimation.monte_carlo import Counts
-from verifai_jax.estimation.normal_space import Ended, LimitState, to_unit_cube
+from verifai_jax.estimation.normal_space import Begun, Ended, LimitState, to_unit_cube
 from verifai_jax.estimation.splitting import SplittingRun, run_splitting
 from verifai_jax.search.gaussian_process import GaussianProcess, Hyper, Posterior, TrainingData
 
@@ -63,7 +63,7 @@ surrogate among them that makes splitting superfluous."""
 SETTLED = 0.01
 """Expected share of the surrogate's failures that are none, or are missed, at which it is good, and
 all learning is spent on looking for others."""
-SETTLED_BY_CHEAP = 0.05
+SETTLED_BY_CHEAP = 0.15
 """The same with a cheap model, at which learning ends."""
 EXPLORED = 3
 """One of so many simulations of a round goes where the surrogate knows least, whatever it says
@@ -231,22 +231,38 @@ def _known(limit_state: LimitState) -> tuple[Float[np.ndarray, "n d"], Float[np.
 
 
 def _learn(limit_state: LimitState, rng: np.random.Generator, surrogate: Surrogate) -> None:
-    """Simulate where the surrogate is least sure of the sign, and where it knows least at all."""
+    """Simulate where the surrogate is least sure of the sign, and where it knows least at all.
+
+    Workers of an executor are given a round while the one before it is simulated: it is chosen by
+    the results of those before that one, and by the points of that one. So it depends on the
+    numbers of the simulations, and not on when they end. A cheap model settles so much that few
+    rounds are better, each of which knows all of them.
+    """
     from scipy.special import ndtr
 
     learning = min(LEARNING * limit_state.budget, MAX_LEARNING)
     until = limit_state.budget - learning
-    rounds = ROUNDS if surrogate.cheap is None else ROUNDS_BY_CHEAP
+    knows_all = surrogate.cheap is not None
+    rounds = ROUNDS_BY_CHEAP if knows_all else ROUNDS
     size = max(1, int(learning / rounds))
+    begun: Begun | None = None
     while True:
         z, rho = _known(limit_state)
         if len(z) > 1:
             surrogate.learn(z, rho)
-        if limit_state.left <= until or len(z) < 2:
-            return
-        size = min(size, int(limit_state.left - until) + 1)
-        anywhere = _spread(limit_state, rng, CHUNK)
-        unknown = _in_doubt(np.zeros(len(anywhere)), surrogate.covariance(anywhere), size)
+        coming = np.zeros((0, limit_state.dim)) if begun is None else begun.z
+        left = limit_state.left - len(coming) - until
+        if left <= 0 or len(z) < 2:
+            if begun is None:
+                return
+            begun.result()
+            begun = None
+            continue
+        size = min(size, int(left) + 1)
+        # As many points as fit into one shape.
+        anywhere = _spread(limit_state, rng, CHUNK)[: CHUNK - len(coming)]
+        covariance = surrogate.covariance(np.concatenate([coming, anywhere]))
+        unknown = _in_doubt(np.zeros(len(anywhere)), _given(covariance, len(coming)), size)
         population, _ = _failures_of(limit_state, rng, surrogate, CAUTION)
         if not len(population):
             population = limit_state.sample_prior(rng, PER_LEVEL)
@@ -255,10 +271,21 @@ def _learn(limit_state: LimitState, rng: np.random.Generator, surrogate: Surroga
         doubt = float(wrong.sum() / max(np.sum(mean < 0), 1.0))
         if surrogate.cheap is not None and doubt < SETTLED_BY_CHEAP:
             return
-        population, explored = population[:CHUNK], size if doubt < SETTLED else size // EXPLORED
-        covariance = surrogate.covariance(population)
-        chosen = _in_doubt(mean[:CHUNK], covariance, size - explored)
-        limit_state(np.concatenate([population[chosen], anywhere[unknown[:explored]]]))
+        population = population[: CHUNK - len(coming)]
+        explored = size if doubt < SETTLED else size // EXPLORED
+        covariance = surrogate.covariance(np.concatenate([coming, population]))
+        chosen = _in_doubt(
+            mean[: len(population)], _given(covariance, len(coming)), size - explored
+        )
+        points = np.concatenate([population[chosen], anywhere[unknown[:explored]]])
+        following = limit_state.begin(points)
+        try:
+            if (waited := following if knows_all else begun) is not None:
+                waited.result()
+        except Ended:
+            following.cancel()
+            raise
+        begun = None if knows_all else following
 
 
 def _in_doubt(
@@ -279,6 +306,15 @@ def _in_doubt(
         column = covariance[:, best]
         covariance = covariance - np.outer(column, column) / (column[best] + noise)
     return chosen
+
+
+def _given(covariance: Float[np.ndarray, "n n"], count: int) -> Float[np.ndarray, "m m"]:
+    """Return the covariance of the values of all but the first points, once those are known."""
+    if not count:
+        return covariance
+    first, cross = covariance[:count, :count], covariance[:count, count:]
+    noise = 1e-4 * float(np.max(np.diag(covariance))) * np.eye(count)
+    return covariance[count:, count:] - cross.T @ np.linalg.solve(first + noise, cross)
 
 
 def _state_of(limit_state: LimitState, surrogate: Surrogate, caution: float) -> LimitState:
