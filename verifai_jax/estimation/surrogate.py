@@ -5,8 +5,8 @@
 A Gaussian process on the robustness learns where the border of the failures is, from simulations
 that are chosen where its sign is least sure. A proposal is fitted to the failures of the surrogate,
 at which no simulation is spent. The estimate is made of fresh samples of that proposal alone, all
-of them simulated and weighted: it is unbiased whatever the surrogate is worth, and so is the
-interval, which is wide where the surrogate is worth little.
+of them simulated and weighted, with the surrogate as a control variate where that is shorter: it is
+unbiased whatever the surrogate is worth, and its interval is wide where that is little.
 
 Sources: Echard, Gayton, Lemaire, AK-MCS, Structural Safety 33 (2011), for the choice of
 simulations; Dubourg, Sudret, Deheeger, Metamodel-based importance sampling for structural
