@@ -125,13 +125,19 @@ def monitor(
     (file,) = recording
     parsed = mtl.parse(formula, numbers, named)
     if str(file) == "-":
-        whole = (plot, compat, period, missing)
+        whole = (plot, compat, period)
         if explain or end != "hold" or any(option is not None for option in whole):
             raise click.UsageError(
-                "a stream goes with --dt, --time, --const, --define and --fail-on; other options "
-                "need the whole recording"
+                "a stream goes with --dt, --time, --missing hold, --const, --define and --fail-on; "
+                "other options need the whole recording"
             )
-        holds = monitor_stream(parsed, sys.stdin, time, dt)
+        if missing in ("drop", "interpolate"):
+            why = {
+                "drop": "leaves instants out, and samples of a stream are evenly spaced",
+                "interpolate": "needs the value after a gap, which a stream has not had yet",
+            }[missing]
+            raise click.UsageError(f"--missing {missing} {why}: use --missing hold")
+        holds = monitor_stream(parsed, sys.stdin, time, dt, hold=missing == "hold")
         give_result(formula=str(parsed), holds=holds)
         check_gate(fail_on, {"violation": not holds, "incomplete": not holds})
         return

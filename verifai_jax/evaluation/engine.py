@@ -21,15 +21,15 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
 
 from verifai_jax.core.compilation import Compilation, XlaOptimization, compile_soon, tracing
-from verifai_jax.core.devices import spread_over_devices
 from verifai_jax.core.fingerprint import as_traced, fingerprint, identity
-from verifai_jax.core.keys import IMPLEMENTATION, as_key, simulation_key
+from verifai_jax.core.keys import IMPLEMENTATION, as_key
 from verifai_jax.core.lifting import CAPACITY, LiftedNumbers
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot, pad_rows
 from verifai_jax.core.remembered import is_kept, lower_or_recall, remembered_as
 from verifai_jax.evaluation.differentiation import Derivative, reverse_refused
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
+from verifai_jax.evaluation.layout import Layout
 from verifai_jax.evaluation.row import CubePoints, Inputs, Packing, Row, RowFunction
 from verifai_jax.evaluation.verdicts import Verdicts, violations
 from verifai_jax.mtl.clauses import goals_of
@@ -92,13 +92,7 @@ class Engine:
             effort = "little" if gradient and effort == "most" else effort
         self.effort: XlaOptimization = effort
         devices = jax.local_devices() if devices is None else devices
-        # A batch smaller than the number of devices is not worth splitting.
-        self.devices = devices[: max(1, min(len(devices), batch))]
-        self.together = problem.system.lanes
-        self.chunks, self.lanes = chunks_and_lanes(problem, batch, len(self.devices))
-        if lanes is not None:
-            self.chunks, self.lanes = -(-batch // (lanes * len(self.devices))), lanes
-        self.padded = self.lanes * self.chunks * len(self.devices)
+        self.layout = Layout.of(problem, batch, devices, lanes)
         self.compile_seconds = 0.0
         self.notes: tuple[str, ...] = ()
         self._derivative = Derivative(self.inputs.dim, problem.system.forward_up_to)
@@ -183,7 +177,7 @@ class Engine:
     def with_batch(self, batch: int) -> "Engine":
         """Return an engine of other batches, which has traced what this one has."""
         other = Engine(
-            self.problem, batch, self.gradient, self.devices, self.precision,
+            self.problem, batch, self.gradient, self.layout.devices, self.precision,
             self.goals is not None, self.inputs, self.own_keys, self.alone, guidance=self.guidance,
         )  # fmt: skip
         other._packing, other._numbers = self._packing, self._numbers
@@ -276,11 +270,11 @@ class Engine:
             count = len(jax.tree.leaves(rows)[0])
             temperatures = np.asarray(temperature, np.float32)
             if temperatures.ndim:
-                temperatures = pad_rows(temperatures, self.padded)
+                temperatures = pad_rows(temperatures, self.layout.padded)
             else:
-                temperatures = np.full(self.padded, temperatures)
+                temperatures = np.full(self.layout.padded, temperatures)
             # In NumPy: of an array of JAX each first use of this kind compiles a program.
-            rows = jax.tree.map(lambda leaf: pad_rows(leaf, self.padded), rows)
+            rows = jax.tree.map(lambda leaf: pad_rows(leaf, self.layout.padded), rows)
             program = self._executable(mode)
             numbers = self._vectors[mode]
             if self.alone:
@@ -288,7 +282,9 @@ class Engine:
                 packed = program(one, _one_key(key), temperatures[0], shared, numbers)
                 packed = jax.tree.map(lambda leaf: np.asarray(leaf)[None], packed)
             else:
-                number = _pad_keys(key, self.padded) if self.own_keys else (key, np.int32(first))
+                number = (
+                    _pad_keys(key, self.layout.padded) if self.own_keys else (key, np.int32(first))
+                )
                 packed = program(rows, number, temperatures, shared, numbers)
             return self._packing[mode].unpack(packed, count)
 
@@ -311,7 +307,9 @@ class Engine:
         name = "gradients" if differentiates else self.inputs.purpose
         with tracing(name):
             lowered = self._lower_gradient() if differentiates else self._lower(mode)
-            self._compiling[mode] = compile_soon(name, lowered, self.effort)
+            self._compiling[mode] = compile_soon(
+                name, lowered, self.effort, splits=not self.layout.fills_machine
+            )
         self.compile_seconds += time.perf_counter() - started
 
     def _trace(self, mode: Mode) -> jax.stages.Traced:
@@ -340,7 +338,9 @@ class Engine:
         if self.alone:
             return traced.lower()
         name = self._kept_as("simulations", fingerprint(traced.jaxpr, derivatives=False))
-        return lower_or_recall(name, self._batched(as_traced(traced)), self._arguments)
+        layout = self.layout.for_program(traced.jaxpr.jaxpr)
+        program = layout.spread(as_traced(traced), self.own_keys)
+        return lower_or_recall(name, program, self._arguments)
 
     def _packed(self, packing: Packing, result: Row | Array) -> dict[str, Array]:
         """Pack the result of one row, without its features where the inputs have them already."""
@@ -389,9 +389,15 @@ class Engine:
 
     def _kept_as(self, kind: str, computes: str | None, *values: object) -> str | None:
         """Return the name under which a program of batches is kept on disk, if it can be."""
-        if list(self.devices) != jax.local_devices()[: len(self.devices)]:
+        if list(self.layout.devices) != jax.local_devices()[: len(self.layout.devices)]:
             return None  # A program from a file runs on the first ones.
-        shape = (self.padded, self.chunks, self.own_keys, self.alone, len(self.devices))
+        shape = (
+            self.layout.padded,
+            self.layout.chunks,
+            self.own_keys,
+            self.alone,
+            len(self.layout.devices),
+        )
         shape = (*shape, self.precision, type(self.inputs).__qualname__)
         return remembered_as(kind, computes, shape, *values)
 
@@ -402,7 +408,7 @@ class Engine:
     def _lower_gradient(self) -> jax.stages.Lowered:
         """Lower the program of derivatives, or recall it; see `core.remembered`."""
         one_row = self._derivatives[1]
-        program = one_row if self.alone else self._batched(one_row)
+        program = one_row if self.alone else self.layout.spread(one_row, self.own_keys)
         return self.differentiable(
             lambda: lower_or_recall(self._gradient_kept_as, partial(program), self._arguments)
         )
@@ -411,7 +417,7 @@ class Engine:
     def _arguments(self) -> tuple[Any, ...]:
         """Shapes and types of the arguments of the programs of batches."""
         first = jax.ShapeDtypeStruct((), jnp.int32)
-        leading = () if self.alone else (self.padded,)
+        leading = () if self.alone else (self.layout.padded,)
         key = _key_form()
         return (
             jax.tree.map(
@@ -423,47 +429,6 @@ class Engine:
             self.inputs.shared_form,
             jax.ShapeDtypeStruct((CAPACITY,), self.precision),
         )
-
-    def _batched(self, one_row: Callable[..., Any]) -> Callable[..., Any]:
-        """Spread `one_row` over chunks of lanes and over the devices."""
-
-        def on_device(
-            rows: PyTree,
-            numbers: Array,
-            temperature: Array,
-            key: Any,
-            shared: PyTree,
-            vector: Array,
-        ) -> Any:
-            def chunk(block: tuple[PyTree, Array, Array]) -> Any:
-                keys = block[1]
-                if not self.own_keys:
-                    keys = jax.vmap(partial(simulation_key, key))(keys)
-                each = jax.vmap(one_row, in_axes=(0, 0, 0, None, None))
-                return each(block[0], keys, block[2], shared, vector)
-
-            blocks = (rows, numbers, temperature)
-            if self.chunks == 1:
-                return chunk(blocks)
-            cut = jax.tree.map(
-                lambda leaf: leaf.reshape(self.chunks, self.lanes, *leaf.shape[1:]), blocks
-            )
-            results = jax.lax.map(chunk, cut)
-            return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), results)
-
-        split = (True, True, True, False, False, False)
-        spread = spread_over_devices(on_device, split, self.devices)
-
-        def program(
-            rows: PyTree, number: Any, temperature: Array, shared: PyTree, vector: Array
-        ) -> Any:
-            if self.own_keys:
-                return spread(rows, number, temperature, (), shared, vector)
-            key, first = number
-            numbers = first + jnp.arange(self.padded, dtype=jnp.int32)
-            return spread(rows, numbers, temperature, key, shared, vector)
-
-        return program
 
     def row_holds(
         self,
@@ -483,17 +448,6 @@ def _key_form() -> Any:
 GRADIENT_WORK = 6
 """Work of a simulation with its reverse sweep, in simulations: 5 to 10 as measured on eight
 problems."""
-ACCELERATOR_FACTOR = 128
-"""How many times as many rows a chunk has on an accelerator as on a core, whose cache traces fit.
-On an H200 chunks of 65,536 rows were 9 to 91 times as fast as those of 512 (RESULTS.md)."""
-
-
-def chunks_and_lanes(problem: Problem, batch: int, devices: int) -> tuple[int, int]:
-    """Return into how many chunks a device's share of a batch is cut, and the rows of one."""
-    per_device = -(-batch // max(1, min(devices, batch)))
-    factor = 1 if jax.default_backend() == "cpu" else ACCELERATOR_FACTOR
-    chunks = -(-per_device // (factor * problem.system.lanes))
-    return chunks, -(-per_device // chunks)
 
 
 def _pad_keys(keys: Key[Array, " lanes"], count: int) -> Key[Array, " count"]:

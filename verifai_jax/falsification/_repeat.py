@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.checks import check_options
+from verifai_jax.core.compilation import options_of
 from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.keys import run_keys, simulation_key
@@ -344,12 +345,12 @@ class _WholeRounds:
             traced = self.engine.differentiable(
                 lambda: jax.jit(partial(program)).lower(state, keys, first)
             )
-            self._programs[len(keys)] = traced.compile()
+            self._programs[len(keys)] = traced.compile(options_of("most"))
         return self._programs[len(keys)](state, keys, first)
 
     def _on_device(self, state: PyTree, keys: Array, first: Array) -> PyTree:
         # Blocks of seeds whose simulations fit the cache together.
-        blocks = max(1, self.engine.together // self.batch)
+        blocks = max(1, self.problem.system.lanes // self.batch)
         return jax.lax.map(
             lambda seed: self._one_seed(seed[0], seed[1], first), (state, keys), batch_size=blocks
         )
@@ -369,6 +370,9 @@ class _WholeRounds:
             gradient = None if gradient is None else gradient.astype(jnp.float32)
             valid = row.status == Status.OK
             observations = Observations(u, lowest.astype(jnp.float32), valid, gradient)
+            if search.wants.no_verdict_rows:
+                rho = jnp.where(valid, observations.rho, jnp.nan)
+                observations = observations._replace(rho=rho, valid=jnp.ones(batch, bool))
             if search.learns:
                 state = search.tell(state, cube, observations)
             return state, (u, lowest, row.status)

@@ -24,8 +24,8 @@ from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.confirm_seeds import SeedConfirmer
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Observations, Search
-from verifai_jax.search.proposals import optimization_of
 from verifai_jax.search.repetition import Repetition
+from verifai_jax.search.search_program import optimization_of
 
 VALUES_AT_ONCE = 256
 """Simulations of one call without derivatives."""
@@ -120,7 +120,7 @@ def lockstep(
             for first in range(0, len(seed), engine.batch):
                 block = slice(first, first + engine.batch)
                 # Always as many, so that one program makes the keys.
-                index = np.minimum(np.arange(first, first + engine.padded), len(seed) - 1)
+                index = np.minimum(np.arange(first, first + engine.layout.padded), len(seed) - 1)
                 own = number_keys(run_key[seed[index]], numbers[index].astype(np.int32))
                 some = seed[block], row[block]
                 parts.append(engine.evaluate(u[some], own, temperature=temperature[some]))
