@@ -306,10 +306,15 @@ class Engine:
         differentiates = self.gradient and mode == "evaluate"
         name = "gradients" if differentiates else self.inputs.purpose
         with tracing(name):
-            lowered = self._lower_gradient() if differentiates else self._lower(mode)
-            self._compiling[mode] = compile_soon(
-                name, lowered, self.effort, splits=not self.layout.fills_machine
-            )
+            layout = self.layout
+            if differentiates:
+                lowered = self._lower_gradient()
+            else:
+                layout = layout.for_program(self._trace(mode).jaxpr.jaxpr)
+                lowered = self._lower(mode, layout)
+            splits = not layout.fills_machine
+            compiling = compile_soon(name, lowered, self.effort, splits=splits, wide=layout.wide)
+            self._compiling[mode] = compiling
         self.compile_seconds += time.perf_counter() - started
 
     def _trace(self, mode: Mode) -> jax.stages.Traced:
@@ -332,13 +337,12 @@ class Engine:
         traced = self._traced[mode] = jax.jit(packed_row).trace(*one)
         return traced
 
-    def _lower(self, mode: Mode) -> jax.stages.Lowered:
+    def _lower(self, mode: Mode, layout: Layout) -> jax.stages.Lowered:
         """Lower a program without derivatives, or recall it; see `core.remembered`."""
         traced = self._trace(mode)
         if self.alone:
             return traced.lower()
         name = self._kept_as("simulations", fingerprint(traced.jaxpr, derivatives=False))
-        layout = self.layout.for_program(traced.jaxpr.jaxpr)
         program = layout.spread(as_traced(traced), self.own_keys)
         return lower_or_recall(name, program, self._arguments)
 

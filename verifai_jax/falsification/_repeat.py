@@ -20,7 +20,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.checks import check_options
-from verifai_jax.core.compilation import options_of
 from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.keys import run_keys, simulation_key
@@ -345,7 +344,7 @@ class _WholeRounds:
             traced = self.engine.differentiable(
                 lambda: jax.jit(partial(program)).lower(state, keys, first)
             )
-            self._programs[len(keys)] = traced.compile(options_of("most"))
+            self._programs[len(keys)] = traced.compile()
         return self._programs[len(keys)](state, keys, first)
 
     def _on_device(self, state: PyTree, keys: Array, first: Array) -> PyTree:
