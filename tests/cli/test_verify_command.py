@@ -37,5 +37,17 @@ def test_the_command_prints_saves_goes_on_and_fails_by_its_gate(tmp_path):
     assert result["proved"]["mass"] == pytest.approx(0.5, abs=0.05)
     parts = [result[part]["mass"] for part in ("proved", "broken", "undecided")]
     assert sum(parts) == pytest.approx(1.0)
-    done = call(f"{file}:half", "--into", str(into))
+    done = call(f"{file}:half", "--into", str(into), "--report", str(tmp_path / "now.html"))
     assert "of 40 that were looked at" in done.output
+    done = CliRunner().invoke(main, ["report", str(into), "--problem", f"{file}:half"])
+    assert done.exit_code == 0, done.output
+    later, now = ((tmp_path / name).read_text() for name in ("half.html", "now.html"))
+    assert later == now
+    assert "evidence report on a verification" in now
+    options = ["--method", "monte_carlo", "--budget", "200", "--proved", str(into)]
+    done = CliRunner().invoke(main, ["estimate", f"{file}:half", *options])
+    assert "that fails for certain" in done.output
+    options = ["--search", "uniform", "--budget", "50", "--proved", str(into)]
+    done = CliRunner().invoke(main, ["falsify", f"{file}:half", *options, "--no-progress",
+                                     "--folder", str(tmp_path / "run")])  # fmt: skip
+    assert "is proved and not simulated" in done.output

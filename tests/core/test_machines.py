@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import verifai_jax as vj
+from verifai_jax.core.precision import in_precision
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.layout import chunks_and_lanes
@@ -155,3 +156,14 @@ def test_the_section_on_accelerators_is_written_once_where_it_belongs():
     assert once.index("## First") < once.index(gpu.HEADING) < once.index(gpu.BEFORE)
     assert gpu.written(once, text) == once
     assert gpu.BEFORE in (ROOT / "benchmarks" / "RESULTS.md").read_text()
+
+
+def test_an_accelerator_multiplies_matrices_in_whole_precision(monkeypatch):
+    def product(a):
+        return a @ a
+
+    with in_precision("float32"):
+        assert "HIGHEST" not in str(jax.make_jaxpr(product)(np.eye(2)))
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    with in_precision("float32"):
+        assert "HIGHEST" in str(jax.make_jaxpr(product)(np.eye(2)))

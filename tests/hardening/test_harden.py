@@ -127,7 +127,7 @@ def _features(rows):
     return set(map(tuple, rows[["x0", "pull"]].to_numpy(np.float32)))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_killed_and_called_again_it_gives_the_same(whole, tmp_path, monkeypatch):
     options = {"baseline": True, "seed": 3, "folder": tmp_path, **SMALL}
 
@@ -199,7 +199,7 @@ def test_where_nothing_fails_it_is_certified_at_once():
     assert "hardened in 0 rounds (certified)" in str(result)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_where_everything_fails_the_budget_ends_it():
     result = harden(TASK, staying_below(-100.0), **{**SMALL, "rounds": 1})
     assert (result.stopped, result.safe, len(result.table)) == ("budget", False, 2)

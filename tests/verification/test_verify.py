@@ -1,10 +1,13 @@
 """What is proved has no failure, what is broken has one, and the parts sum to one."""
 
+import json
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import verifai_jax as vj
+from verifai_jax.core.text import format_percent
 from verifai_jax.sets import MissingRule
 from verifai_jax.store.files import DamagedError
 from verifai_jax.verification.enclosure import Enclosure
@@ -68,6 +71,21 @@ def test_the_text_says_what_is_verified(verified):
     assert table["mass"].is_monotonic_decreasing
     assert set(table["verdict"]) == {"proved", "broken", "undecided"}
     assert (table.loc[table["verdict"] == "proved", "failure_bound"] == 0).all()
+
+
+@pytest.mark.thorough
+def test_a_report_says_what_is_proved_and_what_not(verified, tmp_path):
+    path = verified.report(tmp_path / "decay.html", problem=decay(), units={"a": "m"})
+    text, claims = path.read_text(), json.loads((tmp_path / "decay.claims.json").read_text())
+    share = format_percent(verified.proved.mass)
+    sentences = [claim["claim"] for claim in claims["claims"]]
+    assert sentences[0] == f"No simulation fails in {share} of the prior."
+    assert sentences[2].endswith("contain a point that fails for certain.")
+    assert claims["about"]["result"] == "verification"
+    assert f"{share} of the prior is proved" in text
+    assert "rate from" in text
+    assert "no differential equation" in text
+    assert "data:image/png" in text
 
 
 @pytest.mark.thorough

@@ -123,6 +123,14 @@ PLOT = click.option(
 )
 """File of the one picture of a result."""
 
+PROVED = click.option(
+    "--proved",
+    type=click.Path(path_type=Path),
+    metavar="JSON",
+    help="What verify wrote with --into: spend nothing on what it proved.",
+)
+"""File of a verification."""
+
 REPORT = click.option(
     "--report",
     type=click.Path(path_type=Path),
@@ -138,6 +146,14 @@ ERRORS = click.option(
     help="Say how wrong the number can be, by so many pairs of simulations for each part.",
 )
 """Simulations by which the parts of an error are measured."""
+
+ODD = click.option(
+    "--odd",
+    type=click.Path(path_type=Path),
+    metavar="YAML",
+    help="The operational design domain, a file of OpenODD: say what is covered of it.",
+)
+"""The file of a domain."""
 
 EVEN_IF_CHANGED = click.option(
     "--even-if-changed",

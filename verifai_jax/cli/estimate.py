@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 @arguments.PRECISION
 @arguments.BACKEND
 @arguments.CLUSTER
+@arguments.PROVED
 @arguments.PLOT
 @arguments.REPORT
 @arguments.ERRORS
@@ -80,13 +81,13 @@ def estimate(
         click.echo(f"  report       {path}")
     if not found.simulations:
         raise CommandError("interrupted before a batch was finished", INTERRUPTED)
-    if found.prior_no_verdict == found.prior_simulations and not found.failures:
+    if found.rest and found.prior_no_verdict == found.prior_simulations and not found.failures:
         raise CommandError(
             f"no simulation had a verdict, of {found.prior_simulations:,}: nothing is known of the "
             "probability; verifai-jax falsify says why",
             BROKEN,
         )
-    failed = {"counterexample": found.failures > 0}
+    failed = {"counterexample": found.failures > 0 or found.certain > 0}
     if p0 is not None:
         failed["p0"] = not _is_below(found, p0)
     if fail_on is not None and fail_on.bound is not None:

@@ -56,6 +56,7 @@ _PARTS = (
 @arguments.BACKEND
 @arguments.ENGINE
 @arguments.CLUSTER
+@arguments.PROVED
 @click.option(
     "--shard",
     metavar="I/N",

@@ -23,6 +23,7 @@ from verifai_jax.cli.json_output import command, give_result, show_result
     "--into", type=click.Path(path_type=Path), help="File for the result, or to go on with."
 )
 @arguments.PLOT
+@arguments.REPORT
 @arguments.PROGRESS
 @fail_on(
     counterexample="if any box contains a point that fails for certain",
@@ -33,6 +34,7 @@ def verify(
     only: str | None,
     into: Path | None,
     plot: Path | None,
+    report: Path | None,
     fail_on: Gate | None,
     **options: Any,
 ) -> None:
@@ -48,6 +50,8 @@ def verify(
     give_result(**parts, failing_at_least=low, failing_at_most=high, formulas=found.formulas)
     if into is not None:
         click.echo(f"  result       {found.save(into)}")
+    if report is not None:
+        click.echo(f"  report       {found.report(report, problem=problem)}")
     check_gate(
         fail_on,
         {"counterexample": found.broken.mass > 0, "undecided": found.proved.mass < 1},

@@ -29,6 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.interpreters import batching, partial_eval
 
+from verifai_jax.core.jaxprs import CALLS, CUSTOM_CALLS
 from verifai_jax.core.user_errors import source_line
 
 _CUSTOM = ("custom_jvp_call", "custom_vjp_call")
@@ -359,9 +360,7 @@ def operands_of_scan(options: Mapping[str, Any]) -> tuple[int, int]:
     return options["num_consts"], options["num_carry"]
 
 
-_CUSTOM_CALLS = ("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
-_CALLS = ("checkpoint", "closed_call", "core_call", "jit", "pjit", "remat", "remat2")
-_RUN_AS_THEY_ARE = frozenset({*_CUSTOM_CALLS, *_CALLS, "cond", "scan", "while"})
+_RUN_AS_THEY_ARE = CUSTOM_CALLS | CALLS - {"custom_vmap_call"} | {"cond", "scan", "while"}
 """Steps whose programs are in a batch if they are."""
 _CALLBACKS = frozenset({"pure_callback", "io_callback"})
 """Calls of Python, which have a rule that refuses some of them."""

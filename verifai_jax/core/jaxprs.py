@@ -7,6 +7,22 @@ from jax.extend.core import Literal
 
 V = TypeVar("V")
 
+CALLS = frozenset({
+    "checkpoint", "closed_call", "core_call", "custom_vmap_call", "jit", "pjit", "remat", "remat2",
+})  # fmt: skip
+"""Steps that call a function, which has no derivative of its own."""
+CUSTOM_CALLS = frozenset({"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"})
+"""Steps that call a function with a derivative of its own."""
+_PARAMETERS = ("jaxpr", "call_jaxpr", "fun_jaxpr", "call")
+"""Parameters by which such steps hold the program of the function."""
+
+
+def called(step: Any) -> Any | None:
+    """Return the program that a step runs once on its operands; None for a step that calls none."""
+    if step.primitive.name not in CALLS | CUSTOM_CALLS:
+        return None
+    return next(step.params[name] for name in _PARAMETERS if name in step.params)
+
 
 def run_through(
     program: Any,

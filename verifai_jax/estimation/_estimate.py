@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -34,7 +35,7 @@ from verifai_jax.estimation.methods import (
     estimate_automatically,
     estimate_by_importance_sampling,
 )
-from verifai_jax.estimation.monte_carlo import AT_ONCE
+from verifai_jax.estimation.monte_carlo import AT_ONCE, Counts
 from verifai_jax.estimation.moved_priors import notice_own_chance
 from verifai_jax.estimation.normal_space import LimitState
 from verifai_jax.estimation.result import METHODS, WEIGHTED, Estimate
@@ -48,6 +49,8 @@ from verifai_jax.statistics.binomial import clopper_pearson
 
 if TYPE_CHECKING:
     from verifai_jax.core.executors import Executor
+    from verifai_jax.verification import Verification
+    from verifai_jax.verification.rest import Rest
 
 GRADIENTS_FROM = 3
 """Continuous coordinates from which the searches for failing regions take gradients."""
@@ -80,6 +83,7 @@ def estimate(
     simulations_are: Literal["auto", "slow", "fast"] = "auto",
     within: float | None = None,
     cheap: Problem | None = None,
+    proved: "Verification | str | Path | None" = None,
 ) -> Estimate:
     """Estimate the probability, under the prior of the features, that a simulation fails.
 
@@ -112,14 +116,16 @@ def estimate(
     - `cheap`: a cheap model of the same features, which says where failures may be. It is simulated
       some 100 000 times; every claim rests on simulations of `problem` alone. Simulations are
       `"slow"` then, and end at `within=1.5` where nothing else is said.
+    - `proved`: what `verify` found of this problem, or the file of it. Where it showed that no
+      point fails, or that all do, nothing is estimated, and all simulations are of the rest.
 
     **Returns:** the estimate with its interval and a guaranteed bound. Ctrl-C gives the estimate
     from the finished simulations. A simulation without a verdict (not finite, raised, out of time)
     is no failure in the estimate, and counts as one at the upper ends of interval and bound.
 
     **Raises:** before anything compiles, `TypeError` for something that is no `Problem`, and
-    `ValueError` for options out of range, unknown names, a problem whose parts do not fit, or a
-    constraint that refuses every sample.
+    `ValueError` for options out of range, unknown names, a problem whose parts do not fit, a
+    constraint that refuses every sample, or a verification of another problem.
     """
     started = time.perf_counter()
     if not isinstance(problem, Problem):
@@ -144,6 +150,11 @@ def estimate(
     choice = resolved(problem, batch=batch, budget=budget, precision=precision, wanted=backend)
     choice.problem.check()
     sources, begun = problem.sources(), time.time()
+    rest = None
+    if proved is not None:
+        from verifai_jax.verification.result import as_verification
+
+        rest = as_verification(proved).left(choice.problem, precision)
     simulated = DoublePrecisionEvaluator(choice.problem, batch, precision, seed, executor)
     simulated.compile()
     with SimulationProgress(problem.name, budget, progress) as bar, one_thread():
@@ -152,7 +163,7 @@ def estimate(
             problem.space.dim,
             int(budget),
             batch,
-            constraint=None if problem.space.where is None else _constraint(problem),
+            constraint=_constraint(problem, rest),
             deadline=None if max_seconds is None else started + max_seconds,
             report=bar.update,
             together=1 if executor is None else AT_ONCE,
@@ -160,6 +171,7 @@ def estimate(
             uniform=simulated.uniform,
             draws=depends_on_key(choice.problem),
             one_by_one=choice.problem.black_box and executor is None,
+            rest=rest,
         )
         slow = simulations_are == "slow" or cheap is not None
         plan = Plan(confidence, chains, simulated.clamped, within)
@@ -173,8 +185,9 @@ def estimate(
                 slow = slow or limit_state.seconds >= SLOW
         if slow and method is None and problem.space.dim:
             method = "surrogate"
+        answer_by = _METHODS[method] if rest is None or rest.mass else _nothing_left
         try:
-            answer = _METHODS[method](limit_state, np.random.default_rng(seed), plan)
+            answer = answer_by(limit_state, np.random.default_rng(seed), plan)
         except KeyboardInterrupt:
             # Interrupted while a proposal is fitted: the pilot samples still count.
             limit_state.ended = "interrupted"
@@ -183,6 +196,8 @@ def estimate(
     found = _result(
         problem, choice.backend, answer, limit_state, plan, seed, precision, p0, seconds
     )
+    if rest is not None:
+        found = _with_decided(found, rest, limit_state, seed)
     return replace(found, sources=sources.settled(begun).to_json())
 
 
@@ -276,9 +291,50 @@ def _differentiates(problem: Problem) -> bool:
     return many and without_derivative(problem) is None
 
 
-def _constraint(problem: Problem) -> Callable[[np.ndarray], np.ndarray]:
+def _constraint(problem: Problem, rest: "Rest | None") -> Callable[[np.ndarray], np.ndarray] | None:
     accepts = problem.space.accepts_points
-    return lambda u: np.asarray(accepts(np.asarray(u, np.float32)))
+    if rest is None and problem.space.where is None:
+        return None
+
+    def accepted(u: np.ndarray) -> np.ndarray:
+        fits = np.asarray(accepts(np.asarray(u, np.float32)))
+        return fits if rest is None else fits & ~rest.is_decided(u)
+
+    return accepted
+
+
+def _nothing_left(limit_state: LimitState, rng: np.random.Generator, plan: Plan) -> Answer:
+    return Answer(Counts(0, 0, 0), 0.0, 0.0, 0.0)
+
+
+def _with_decided(found: Estimate, rest: "Rest", limit_state: LimitState, seed: int) -> Estimate:
+    """Return the estimate for the whole prior, where `found` is for the rest of a proof.
+
+    What is decided lies within the constraint; samples say how much of the rest does.
+    """
+    left, error = rest.mass, 0.0
+    if rest.mass + rest.decided < 1 and rest.mass:
+        left, error = limit_state.acceptance(np.random.default_rng((seed, 2)))
+
+    def whole(inside: float, off: float) -> float:
+        part = left * (1 + off * error)
+        return (rest.failing + part * inside) / (part + rest.decided)
+
+    def ends(inside: float) -> list[float]:
+        return [whole(inside, off) for off in (-4, 4)]
+
+    probability = None if found.probability is None else whole(found.probability, 0)
+    estimated = 1 - whole(0.0, 0) / probability if probability else 1.0
+    return replace(
+        found,
+        probability=probability,
+        relative_error=estimated * found.relative_error,
+        low=min(ends(found.low)),
+        high=max(ends(found.high)),
+        upper_bound=max(ends(found.upper_bound)),
+        certain=whole(0.0, 0),
+        rest=left / (left + rest.decided),
+    )
 
 
 def one_thread() -> AbstractContextManager[object]:

@@ -11,10 +11,13 @@ they are tested on closed forms without a simulation.
 
 import time
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
+
+if TYPE_CHECKING:
+    from verifai_jax.verification.rest import Rest
 
 Evaluate: TypeAlias = Callable[
     [Float[np.ndarray, "n d"]],
@@ -97,6 +100,7 @@ class LimitState:
     - `gradient`: as `evaluate`, with the gradient by the coordinates of the cube; none when left
       out. A simulation with its gradient counts 2.
     - `uniform`: True at coordinates `[dim]` of uniform features; none of them when left out.
+    - `rest`: what is left of the prior beside a proof; the constraint has to refuse what is proved.
     - `draws`: whether the system draws from the random key of its simulation, so that a point fails
       with a probability.
 
@@ -118,6 +122,7 @@ class LimitState:
         uniform: Bool[np.ndarray, " dim"] | None = None,
         draws: bool = False,
         one_by_one: bool = False,
+        rest: "Rest | None" = None,
     ) -> None:
         self.max_step = self.step = batch * together
         self.one_by_one = one_by_one
@@ -125,7 +130,7 @@ class LimitState:
             self.step = min(FIRST, self.max_step)
         self.evaluate, self.dim, self.budget, self.batch = evaluate, dim, budget, batch
         self.constraint, self.deadline, self.report = constraint, deadline, report
-        self.gradient, self.draws = gradient, draws
+        self.gradient, self.draws, self.rest = gradient, draws, rest
         self.uniform = np.zeros(dim, bool) if uniform is None else uniform
         self.simulations = self.evaluated = self.failures = self.no_verdict = 0
         self.pilot: tuple[int, int, int] = (0, 0, 0)
@@ -167,7 +172,7 @@ class LimitState:
             return rng.standard_normal((n, self.dim))
         accepted, count, drawn = [], 0, 0
         while count < n:
-            z = rng.standard_normal((_CONSTRAINT_BATCH, self.dim))
+            z = self._drawn(rng, _CONSTRAINT_BATCH)
             z = z[self.accepts(z)][: n - count]
             accepted.append(z)
             count, drawn = count + len(z), drawn + _CONSTRAINT_BATCH
@@ -179,8 +184,17 @@ class LimitState:
         """Return the share of the prior that the constraint accepts, and its relative error."""
         if self.constraint is None:
             return 1.0, 0.0
-        share = float(np.mean(self.accepts(rng.standard_normal((n, self.dim)))))
-        return share, float(np.sqrt((1 - share) / (share * n))) if share else np.inf
+        share = float(np.mean(self.accepts(self._drawn(rng, n))))
+        error = float(np.sqrt((1 - share) / (share * n))) if share else np.inf
+        return share * (1.0 if self.rest is None else self.rest.mass), error
+
+    def _drawn(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n d"]:
+        """Draw points of the prior, or of its rest, whatever the constraint says of them."""
+        if self.rest is None:
+            return rng.standard_normal((n, self.dim))
+        from scipy.special import ndtri
+
+        return ndtri(np.clip(self.rest.draw(rng, n), 1e-300, 1 - 1e-16))
 
     def __call__(self, z: Float[np.ndarray, "n d"]) -> Scores:
         """Simulate points of normal space.

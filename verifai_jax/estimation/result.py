@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from verifai_jax.core.checks import check_fraction
 from verifai_jax.core.figure import Drawn
 from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook
@@ -54,6 +55,8 @@ class Estimate(Drawn, InNotebook):
     - `relative_error`: one standard error over the estimate.
     - `diagnostics`: further numbers of the method, by name.
     - `notes`: sentences on anything surprising.
+    - `certain`, `rest`: the share of the prior that fails for certain, and the one that is neither
+      proved nor certain to fail, of which samples are drawn; 0 and 1 without a proof.
     - `p0`: the wanted upper limit of the probability, if one was given.
     - `seed`, `version`, `precision`, `backend`: needed to repeat the estimate.
     - `seconds`: wall-clock time.
@@ -83,6 +86,8 @@ class Estimate(Drawn, InNotebook):
     relative_error: float = math.nan
     diagnostics: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    certain: float = 0.0
+    rest: float = 1.0
     p0: float | None = None
     seed: int = 0
     version: str = ""
@@ -100,8 +105,8 @@ class Estimate(Drawn, InNotebook):
 
     @property
     def no_verdict_probability(self) -> float:
-        """Share of the samples of the prior that have no verdict."""
-        return self.prior_no_verdict / max(self.prior_simulations, 1)
+        """Share of the prior that has no verdict, by its samples."""
+        return self.rest * self.prior_no_verdict / max(self.prior_simulations, 1)
 
     def simulations_until(self, p0: float, confidence: float | None = None) -> int:
         """Count further samples of the prior that show a probability below `p0` if none fails.
@@ -116,8 +121,11 @@ class Estimate(Drawn, InNotebook):
 
         **Raises:** `ValueError` unless `0 < p0 < 1`.
         """
+        check_fraction("p0", p0)
+        if p0 >= self.certain + self.rest:
+            return 0
         return simulations_until(
-            p0,
+            max((p0 - self.certain) / self.rest, 1e-18),
             self.prior_failures + self.prior_no_verdict,
             self.prior_simulations,
             self.confidence if confidence is None else confidence,
@@ -125,6 +133,9 @@ class Estimate(Drawn, InNotebook):
 
     def __str__(self) -> str:
         sure = format_percent(self.confidence)
+        if not self.rest:
+            exact = format_probability(self.certain)
+            return f"{self.name}: fails with probability {exact}, as all of the prior is decided"
         if self.probability is None or self.method is None:
             lines = [
                 f"{self.name}: no estimate of the failure probability; at most "
@@ -148,14 +159,20 @@ class Estimate(Drawn, InNotebook):
             lines.append(
                 f"  precision    relative error {format_percent(self.relative_error)}{worth}"
             )
+        if self.rest < 1:
+            lines.append(
+                f"  proved       all of the prior but {format_percent(self.rest)}, of which the "
+                f"samples are, and {format_percent(self.certain)} that fails for certain"
+            )
         lines.append(
             f"  guaranteed   at most {self.upper_bound:z.2g} at {sure}, by {self.prior_failures:,} "
-            f"failures in {self.prior_simulations:,} independent samples of the prior alone"
+            f"failures in {self.prior_simulations:,} independent samples of {self._drawn_from} "
+            "alone"
         )
         if self.no_verdict:
             lines.append(
-                f"  no verdict   {format_percent(self.no_verdict_probability)} of the prior's "
-                "samples; neither safe nor failing: the upper ends count them as failing"
+                f"  no verdict   {format_percent(self.no_verdict_probability)} of the prior, by "
+                "its samples; neither safe nor failing: the upper ends count them as failing"
             )
         if self.p0 is not None:
             lines.append(f"  p < {self.p0:zg}    {self._conclusion(self.p0)}")
@@ -164,14 +181,18 @@ class Estimate(Drawn, InNotebook):
 
     __repr__ = __str__
 
+    @property
+    def _drawn_from(self) -> str:
+        return "the prior" if self.rest == 1 else "this rest"
+
     def _conclusion(self, p0: float) -> str:
         """Write whether a probability below `p0` is shown, refuted or open."""
         if self.upper_bound <= p0:
-            return "shown, by samples of the prior alone"
+            return f"shown, by samples of {self._drawn_from} alone"
         more = self.simulations_until(p0)
         if self.low > p0:
             return "refuted: the whole interval is above"
-        prior = f"samples of the prior alone would need {more:,} more without a failure"
+        prior = f"samples of {self._drawn_from} alone would need {more:,} more without a failure"
         if self.probability is not None and self.high < p0:
             return f"shown, unless the method has missed a part of the failures; {prior}"
         return f"open; {prior}"

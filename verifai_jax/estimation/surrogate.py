@@ -14,7 +14,7 @@ reliability analysis, Probabilistic Engineering Mechanics 33 (2013), for the res
 """
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -34,6 +34,7 @@ from verifai_jax.estimation.answers import (
 from verifai_jax.estimation.components import Prior
 from verifai_jax.estimation.fitting import effective_size
 from verifai_jax.estimation.importance import ImportanceSamples
+from verifai_jax.estimation.intervals import student_quantile
 from verifai_jax.estimation.mixture import Mixture
 from verifai_jax.estimation.monte_carlo import Counts
 from verifai_jax.estimation.normal_space import Ended, LimitState, to_unit_cube
@@ -50,8 +51,8 @@ CAPACITY = 512
 LEARNING, MAX_LEARNING = 0.5, 400
 """Share of the budget that is spent on learning, and simulations at most; the rest is the
 estimate."""
-ROUNDS = 10
-"""Rounds of learning."""
+ROUNDS, ROUNDS_BY_CHEAP = 10, 25
+"""Rounds of learning, and those with a cheap model, which often needs few."""
 CAUTION, MARGIN = 2.0, 0.5
 """Standard deviations by which a point may be off and still count as failing, while learning and
 while the proposal is fitted."""
@@ -82,8 +83,16 @@ MIN_FAILING = 10
 UNDERSTATED = 1.2
 """Factor on the logarithms of the interval: samples of a proposal that was fitted to a model of the
 failures seldom show the weights beyond its edges."""
-LOOKS, MIN_LOOK = 4, 60
-"""Looks at the interval after the first one, where it decides when to stop, and samples of that."""
+CONTROL = 8000
+"""Samples of the proposal by which it is known how often the surrogate sees a failure."""
+UNSEEN = 8.0
+"""Degrees of freedom of an interval without a wrong verdict of the surrogate."""
+LOOKS, FIRST_SIZE = 6, 30
+"""Looks at the interval, where it decides when to stop, and samples before the first one."""
+CAUTIOUS = 1.15
+"""Factor on the samples that the width of an interval asks for."""
+MIN_LOOK = 60
+"""Samples at least of a proposal that is given up."""
 
 
 class Surrogate:
@@ -186,10 +195,11 @@ def estimate_by_surrogate(limit_state: LimitState, rng: np.random.Generator, pla
         counts = _first_design(limit_state, rng)
         _learn(limit_state, rng, surrogate)
         proposal = _proposal(limit_state, rng, surrogate)
-        samples, confidence = _sample(limit_state, rng, proposal, plan)
+        control = _Control(limit_state, rng, surrogate, proposal)
+        samples, mean = _sample(limit_state, rng, proposal, plan, control)
     except Ended:
         return bound_from_pilot(limit_state, plan)
-    return _answer(limit_state, rng, plan, counts, samples, surrogate, confidence)
+    return _answer(limit_state, rng, plan, counts, samples, control, mean)
 
 
 def _first_design(limit_state: LimitState, rng: np.random.Generator) -> Counts:
@@ -226,7 +236,8 @@ def _learn(limit_state: LimitState, rng: np.random.Generator, surrogate: Surroga
 
     learning = min(LEARNING * limit_state.budget, MAX_LEARNING)
     until = limit_state.budget - learning
-    size = max(1, int(learning / ROUNDS))
+    rounds = ROUNDS if surrogate.cheap is None else ROUNDS_BY_CHEAP
+    size = max(1, int(learning / rounds))
     while True:
         z, rho = _known(limit_state)
         if len(z) > 1:
@@ -283,7 +294,8 @@ def _state_of(limit_state: LimitState, surrogate: Surrogate, caution: float) -> 
         return rho, rho < 0, np.ones(len(rho), bool)
 
     constraint = limit_state.constraint
-    return LimitState(evaluate, limit_state.dim, 100 * FITTING, 4 * CHUNK, constraint)
+    budget, rest = 100 * FITTING, limit_state.rest
+    return LimitState(evaluate, limit_state.dim, budget, 4 * CHUNK, constraint, rest=rest)
 
 
 def _failures_of(
@@ -326,35 +338,101 @@ def _proposal(limit_state: LimitState, rng: np.random.Generator, surrogate: Surr
     return Mixture((Prior(limit_state.dim),), np.ones(1))
 
 
+class _Mean(NamedTuple):
+    """A mean with its relative error and its interval, and whether the surrogate is part of it."""
+
+    value: float
+    cv: float
+    low: float
+    high: float
+    controlled: bool = False
+
+
+class _Control:
+    """The surrogate as a control variate of the samples of a proposal.
+
+    How often it sees a failure is known from samples that cost nothing; what simulations have to
+    tell is how often it is wrong. Where that is too often, they are taken by themselves.
+    """
+
+    def __init__(
+        self,
+        limit_state: LimitState,
+        rng: np.random.Generator,
+        surrogate: Surrogate,
+        proposal: Mixture,
+    ) -> None:
+        self.surrogate = surrogate
+        self.mean = self.error = 0.0
+        if surrogate.posterior is not None:
+            z = proposal.sample(rng, CONTROL)[0]
+            fails = (surrogate.predict(z)[0] < 0) & limit_state.accepts(z)
+            weights = np.where(fails, 1 / proposal.ratio(z), 0.0)
+            self.mean, self.error = float(weights.mean()), float(weights.std() / len(z) ** 0.5)
+
+    def estimate(self, samples: ImportanceSamples, confidence: float) -> _Mean:
+        """Return the better one of the two means of samples."""
+        mean = samples.mean
+        low, high = samples.interval(confidence)
+        alone = _Mean(mean.mean, mean.cv, low, high)
+        if not self.mean or samples.without.any() or not low:
+            return alone
+        seen = self.surrogate.predict(samples.points)[0] < 0
+        weights = 1 / samples.proposal.ratio(samples.points)
+        gap = weights * (samples.failing.astype(float) - seen)
+        # As if it were wrong once more in either direction: it is, somewhere.
+        unseen = 2 * float(np.mean(weights[samples.failing] ** 2))
+        value = self.mean + float(gap.mean())
+        spread = np.sqrt(len(gap) * float(gap.var()) + unseen) / len(gap)
+        share, error = samples.acceptance
+        cv = float(np.hypot(np.hypot(spread, self.error) / max(value, 1e-300), error))
+        freedom = int(np.sum(samples.failing != seen)) + UNSEEN
+        reach = student_quantile(confidence, freedom) * cv
+        widened = 1 + samples.unresolved
+        low = value / share * max(1 - reach, np.exp(-1.5 * reach)) / widened
+        high = value / share * (1 + reach) * widened
+        if value <= 0 or high / low > alone.high / alone.low:
+            return alone
+        return _Mean(value / share, cv, low, high, True)
+
+
 def _sample(
-    limit_state: LimitState, rng: np.random.Generator, proposal: Mixture, plan: Plan
-) -> tuple[ImportanceSamples, float]:
+    limit_state: LimitState,
+    rng: np.random.Generator,
+    proposal: Mixture,
+    plan: Plan,
+    control: _Control,
+) -> tuple[ImportanceSamples, _Mean]:
     """Simulate fresh samples until the interval is as short as wanted, or the budget is spent.
 
     Nearly no failures among the first ones end it, too: the rest is worth more elsewhere.
-
-    **Returns:** the samples, and the confidence of an interval that may have been looked at before.
     """
     left, confidence = max(limit_state.left, 1), plan.confidence
-    sizes = [max(1, round(FIRST_LOOK * left))]
-    sizes.append(left - sizes[0])
+    looks, size = 2, max(1, round(FIRST_LOOK * left))
     if plan.within is not None:
-        sizes = [max(MIN_LOOK, left >> LOOKS), *(left >> i for i in range(LOOKS, 0, -1))]
         # Each look has an equal part of the error, so that their intervals hold together.
-        confidence = 1 - (1 - confidence) / len(sizes)
+        looks, size, confidence = LOOKS, FIRST_SIZE, 1 - (1 - confidence) / LOOKS
     found: ImportanceSamples | None = None
-    for size in sizes:
-        size = min(size, limit_state.left)
+    mean = _Mean(0.0, np.inf, 0.0, 1.0)
+    for look in range(looks):
+        size = limit_state.left if look == looks - 1 else min(size, limit_state.left)
         if found is not None and size < 1:
             break
         new = importance.sample_proposal(limit_state, rng, proposal, max(size, 1), plan.clamped)
         found = new if found is None else found.join(new)
-        low, high = found.interval(confidence)
-        enough = plan.within and low > 0 and (high / low) ** UNDERSTATED <= plan.within**2
-        if enough or limit_state.ended or found.failing.sum() < MIN_FAILING:
+        mean = control.estimate(found, confidence)
+        few = found.failing.sum() < MIN_FAILING
+        if limit_state.ended or (few and len(found.x) >= min(MIN_LOOK, FIRST_LOOK * left)):
             break
+        if plan.within is not None:
+            width = np.log(mean.high / mean.low) / np.log(plan.within) / 2 if mean.low else np.inf
+            width *= UNDERSTATED
+            if width <= 1 and not few:
+                break
+            # The width falls with the root of the samples; this is how many are still needed.
+            size = round(len(found.x) * min(CAUTIOUS * width**2 - 1, 1)) if not few else FIRST_SIZE
     assert found is not None
-    return found, confidence
+    return found, mean
 
 
 def _answer(
@@ -363,8 +441,8 @@ def _answer(
     plan: Plan,
     counts: Counts,
     samples: ImportanceSamples,
-    surrogate: Surrogate,
-    confidence: float,
+    control: _Control,
+    mean: _Mean,
 ) -> Answer:
     failing, drawn = samples.defensive_counts
     # The defensive part of the proposal is a sample of the prior.
@@ -376,16 +454,16 @@ def _answer(
             f"{int(samples.failing.sum()):,} fail, so that samples of the prior are counted"
         )
         return answer
-    mean = samples.mean
-    low, high = samples.interval(confidence)
-    low, high = (mean.mean * (end / mean.mean) ** UNDERSTATED for end in (low, high))
-    answer = Answer(counts, min(mean.mean, 1.0), low, high, "surrogate", mean.effective, mean.cv)
-    right = float(np.mean((surrogate.predict(samples.points)[0] < 0) == samples.failing))
-    worth = (1 - mean.mean) / (mean.mean * mean.cv**2)
+    weights, value = samples.mean, min(mean.value, 1.0)
+    low, high = (value * (end / value) ** UNDERSTATED for end in (mean.low, mean.high))
+    answer = Answer(counts, value, low, min(high, 1.0), "surrogate", weights.effective, mean.cv)
+    seen = control.surrogate.predict(samples.points)[0] < 0
+    right = float(np.mean(seen == samples.failing))
+    worth = (1 - value) / (value * mean.cv**2)
     answer.samples = samples
     answer.diagnostics = {
-        "tail_index": mean.tail,
-        "largest_share": mean.largest,
+        "tail_index": weights.tail,
+        "largest_share": weights.largest,
         "failing_share": float(samples.failing.mean()),
         "agreement": right,
         "worth": worth,
@@ -396,9 +474,9 @@ def _answer(
         f"the surrogate knew the verdict of {format_percent(right)} of {len(samples.x):,} samples "
         f"that it proposed; these are worth {worth:z,.0f} samples of the prior"
     )
-    if mean.tail > WORST_TAIL:
+    if weights.tail > WORST_TAIL and not mean.controlled:
         answer.notes.append(
-            f"the weights have a heavy tail (index {mean.tail:z.2f}): "
+            f"the weights have a heavy tail (index {weights.tail:z.2f}): "
             "the interval may be too narrow"
         )
     return answer

@@ -27,6 +27,7 @@ from verifai_jax.core.programs import Slot
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine, Wanted
 from verifai_jax.evaluation.verdicts import Verdicts, violations
+from verifai_jax.mtl.expression import durations_in
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.tree import Term, postorder
 from verifai_jax.native_code.library import (
@@ -215,8 +216,11 @@ class NativeEngine:
 def _greatest(formula: Formula) -> float:
     """Return the greatest of 1, the numbers that a formula compares with, and its finite reach.
 
-    Rounding is relative to what is compared, and adds up over time.
+    Rounding is relative to what is compared, and adds up over time. It is infinite where samples
+    are counted: whether one counts may be decided by rounding.
     """
+    if durations_in(formula):
+        return math.inf
     numbers = [node.number or 0.0 for node in postorder(formula) if isinstance(node, Term)]
     reach = filter(math.isfinite, (formula.horizon(), formula.history()))
     return max([1.0, *map(abs, numbers), *reach])
@@ -228,7 +232,7 @@ def _cut(temperature: Temperature, which: slice | np.ndarray) -> Temperature:
 
 
 def _alike(ours: np.ndarray, theirs: np.ndarray) -> bool:
-    """Return whether derivatives agree, but for those of few chaotic simulations."""
+    """Return whether derivatives agree, except in a few chaotic simulations."""
     ours, theirs = ours.reshape(len(ours), -1), theirs.reshape(len(theirs), -1)
     size = np.max(np.abs(theirs), axis=1, keepdims=True) + 1e-6
     same = np.isclose(ours, theirs, rtol=0, atol=10 * AGREES * size, equal_nan=True)

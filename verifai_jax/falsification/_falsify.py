@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     from verifai_jax.core.executors import Executor
     from verifai_jax.features.given import Rows
     from verifai_jax.statistics.stopping import StoppingRule
+    from verifai_jax.verification import Verification
 
 
 @suggests_options
@@ -94,6 +95,7 @@ def falsify(
     keep_going: bool = False,
     engine: str = "xla",
     cheap: Problem | None = None,
+    proved: "Verification | str | Path | None" = None,
 ) -> Run:
     """Search the feature space for inputs under which the system breaks its property.
 
@@ -157,6 +159,9 @@ def falsify(
     - `cheap`: a cheap model of the same features. It is searched first, with 20 times the budget;
       at most a quarter of the budget is then spent on what it found, the gravest first and no two
       alike, from which the search goes on. Only `problem` decides what fails.
+    - `proved`: what `verify` found of this problem, or the file of it. What it proved is not
+      simulated, and the run is of the rest: `proved.rest(problem)`, with which it is resumed from a
+      folder.
 
     Ctrl-C ends the run and returns what is finished. What is likely a mistake of the problem is in
     the run's `notes`, and above the progress bar.
@@ -172,6 +177,12 @@ def falsify(
     started = time.perf_counter()
     check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
     check_engine(engine)
+    of_rest: tuple[str, ...] = ()
+    if proved is not None:
+        from verifai_jax.verification.result import as_verification
+
+        proved = as_verification(proved)
+        problem, of_rest = proved.rest(problem, precision), (proved.note,)
     asking, search = without_suggestions(search)
     default = search == AUTO
     usual = "cross_entropy" if objective == "likelihood" else "portfolio"
@@ -242,8 +253,8 @@ def falsify(
                     rounds.warm(earlier)
 
         running = Running(
-            rounds, ends, choice, seed, target, notes, lasting, warm=earlier is not None,
-            keep_going=keep_going,
+            rounds, ends, choice, seed, target, notes, (*lasting, *of_rest),
+            warm=earlier is not None, keep_going=keep_going,
         )  # fmt: skip
         return running.play(progress, prepare, callbacks)
 

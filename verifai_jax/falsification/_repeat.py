@@ -369,6 +369,9 @@ class _WholeRounds:
             gradient = None if gradient is None else gradient.astype(jnp.float32)
             valid = row.status == Status.OK
             observations = Observations(u, lowest.astype(jnp.float32), valid, gradient)
+            if search.wants.no_verdict_rows:
+                rho = jnp.where(valid, observations.rho, jnp.nan)
+                observations = observations._replace(rho=rho, valid=jnp.ones(batch, bool))
             if search.learns:
                 state = search.tell(state, cube, observations)
             return state, (u, lowest, row.status)

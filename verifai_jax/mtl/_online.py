@@ -26,6 +26,7 @@ from verifai_jax.core.errors import missing_name
 from verifai_jax.core.gaps import with_gaps
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import Evaluator
+from verifai_jax.mtl.expression import durations_in
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.semantics import Kind, Semantics, hard
 from verifai_jax.mtl.stepping import advance, first_cells
@@ -105,6 +106,8 @@ def online(formula: Formula | str, dt: float, semantics: Semantics = hard) -> On
     """
     formula = parse(formula) if isinstance(formula, str) else formula
     monitor = Online(formula, dt, semantics.kind)
+    if counted := durations_in(formula):
+        raise ValueError(f"{counted[0]} is counted by watch and export_c, and not by online")
     _plan(monitor)
     return monitor
 

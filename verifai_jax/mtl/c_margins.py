@@ -1,15 +1,16 @@
 """The margins of a formula's leaves as lines of C over the numbers of a sample.
 
-code = margin_code(leaves, boolean=False, sizes={"p": 3})
+code = margin_code(plan, sizes={"p": 3})
 code.columns                    # (("x", None), ("p", 0), ...): what x[0], x[1] ... are
 code.lines, code.leaves         # "const double a2 = x[0] - x[1];" ..., and "a2" ...
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
+from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
 from verifai_jax.mtl.formula import Formula, Term
+from verifai_jax.mtl.streams import Plan
 from verifai_jax.mtl.tree import missing_case, postorder
 
 FEW = 64
@@ -23,34 +24,40 @@ class MarginCode(NamedTuple):
 
     - `columns`: name of the signal, and the index of a component of a vector.
     - `leaves`: the text of each margin, after the lines.
+    - `counts`: of each duration, the code of what is counted, and its columns among these.
     """
 
     columns: tuple[tuple[str, int | None], ...]
     lines: tuple[str, ...]
     leaves: tuple[str, ...]
+    counts: tuple[tuple["MarginCode", tuple[int, ...]], ...]
 
 
-def margin_code(
-    leaves: Iterable[tuple[Formula, int]], boolean: bool, sizes: Mapping[str, int]
-) -> MarginCode:
-    """Return the code of leaves, each with the sign of its margin.
+def margin_code(plan: Plan, sizes: Mapping[str, int]) -> MarginCode:
+    """Return the code of a plan's leaves, each with the sign of its margin.
+
+    A duration is read as `n0`, `n1` ..., which the lines before these have.
 
     **Arguments:**
 
-    - `boolean`: whether a margin is +1 where the leaf holds and -1 where not.
     - `sizes`: number of components of the signals of which a norm is taken.
 
     **Raises:** `ValueError` for a norm of a signal without a size.
     """
-    code = _Code(sizes)
-    texts = tuple(code.leaf(f, sign, boolean) for f, sign in leaves)
+    code = _Code(sizes, [count.duration for count in plan.counts])
+    texts = tuple(code.leaf(f, sign, plan.top == 1) for f, sign in plan.leaves)
+    counts: list[tuple[MarginCode, tuple[int, ...]]] = []
+    for count in plan.counts:
+        inner = margin_code(count.plan, sizes)
+        counts.append((inner, tuple(code.index(*column) for column in inner.columns)))
     lines = tuple(f"const double {name} = {text};" for text, name in code.names.items())
-    return MarginCode(tuple(code.columns), lines, texts)
+    return MarginCode(tuple(code.columns), lines, texts, tuple(counts))
 
 
 class _Code:
-    def __init__(self, sizes: Mapping[str, int]) -> None:
+    def __init__(self, sizes: Mapping[str, int], counted: Sequence[Duration]) -> None:
         self.sizes = sizes
+        self.counted = {each: f"n{k}" for k, each in enumerate(counted)}
         self.columns: dict[tuple[str, int | None], int] = {}
         self.names: dict[str, str] = {}
 
@@ -58,8 +65,11 @@ class _Code:
         """Return the name of the line that computes this, one for all that need it."""
         return self.names.setdefault(text, f"a{len(self.names)}")
 
+    def index(self, name: str, index: int | None = None) -> int:
+        return self.columns.setdefault((name, index), len(self.columns))
+
     def column(self, name: str, index: int | None = None) -> str:
-        return f"x[{self.columns.setdefault((name, index), len(self.columns))}]"
+        return f"x[{self.index(name, index)}]"
 
     def leaf(self, f: Formula, sign: int, boolean: bool) -> str:
         left, comparison, right = f.compared or (*f.terms(), ">", None)
@@ -80,6 +90,8 @@ class _Code:
         texts: dict[int, str] = {}
 
         def text(part: Term) -> str:
+            if isinstance(part, Duration):
+                return self.counted[part]
             # A signal is a number here, and a vector within its component or norm.
             return self.column(part.name) if isinstance(part, Signal) else texts[id(part)]
 

@@ -15,7 +15,7 @@ import numpy as np
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._parse import parse
-from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
+from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
 from verifai_jax.mtl.formula import Formula, Term
 from verifai_jax.mtl.host_values import FUNCTIONS, numbers
 from verifai_jax.mtl.parametric import read_parametric
@@ -165,6 +165,11 @@ class _Dense:
             match part:
                 case Number(value):
                     values[id(part)] = self.constant(value)
+                case Duration():
+                    raise ValueError(
+                        f"{part} counts samples, and between samples there are none: judge it by "
+                        "robustness"
+                    )
                 case Signal(name):
                     own = self.trace[name]
                     if own.ndim == 1:  # A vector is read by its component or norm.

@@ -19,8 +19,8 @@ from jaxtyping import Float
 from verifai_jax.core.errors import missing_name
 from verifai_jax.core.trace import Trace, without_wrapping
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl.evaluate import End, check_scalar, check_vector, samples
-from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
+from verifai_jax.mtl.evaluate import End, check_scalar, check_vector, samples, seconds_held
+from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
 from verifai_jax.mtl.formula import Formula, Interval, Term
 from verifai_jax.mtl.semantics import compared
 from verifai_jax.mtl.setting import check_trace, period
@@ -104,6 +104,10 @@ class HostValues:
             raise ValueError(f"no verdict: a signal of {formula} is NaN where it matters")
         return value > 0
 
+    def forget(self) -> None:
+        """Drop what is known of formulas, for those who ask about thousands of them."""
+        self._known.clear()
+
     def walk(self, formula: Formula) -> Walk:
         """Return the way to what decides a formula at the first sample."""
         pad = self._pad(formula)
@@ -185,6 +189,8 @@ class HostValues:
             match part:
                 case Number(value):
                     values[id(part)] = np.full((1,), value)
+                case Duration():
+                    values[id(part)] = self._duration(part, pad)
                 case Signal(name):
                     values[id(part)] = self._signal(name, pad)
                 case Component(Signal(name) as vector, index):
@@ -207,10 +213,14 @@ class HostValues:
     def _signal(self, name: str, pad: int) -> Values:
         padded = self._padded.setdefault(pad, {})
         if name not in padded:
-            signal = self.signals[name]
-            tail = np.repeat(signal[-1:], pad, axis=0)
-            padded[name] = np.concatenate([signal, tail]) if pad else signal
+            padded[name] = _held(self.signals[name], pad)
         return padded[name]
+
+    def _duration(self, e: Duration, pad: int) -> Values:
+        truth = self._value(e.operand, True, 0)
+        truth = np.broadcast_to(truth, (self.length, *truth.shape[1:]))
+        n = int(samples(e.window, self.dt, Interval(0.0, e.window))) * self.stride
+        return _held(seconds_held(truth, n, self.dt / self.stride, np), pad)
 
 
 def _span(interval: Interval, dt: float, stride: int) -> tuple[int, float]:
@@ -231,6 +241,10 @@ def numbers(signal: object) -> Values:
     """Return a signal in double precision, a truth value as 1 or -1."""
     array = np.asarray(without_wrapping(signal))  # pyright: ignore[reportArgumentType]
     return np.where(array, 1.0, -1.0) if array.dtype == bool else array.astype(float)
+
+
+def _held(signal: Values, pad: int) -> Values:
+    return np.concatenate([signal, np.repeat(signal[-1:], pad, axis=0)]) if pad else signal
 
 
 def _joined(values: Sequence[Values], sign: int) -> Values:

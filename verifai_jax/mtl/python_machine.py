@@ -1,6 +1,6 @@
 """The step of a monitor in Python, for machines without a compiler: some microseconds.
 
-    machine = PythonMachine(plan, columns)
+    machine = PythonMachine(plan, margin_code(plan, {}))
     machine.step([1.0, 0.0])                          # the numbers of one sample
     machine.out                                       # one number a formula
 
@@ -8,17 +8,18 @@ Each operation has a list of numbers as its memory, and does what its namesake i
 """
 
 import math
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from verifai_jax.mtl.c_margins import MarginCode
 from verifai_jax.mtl.expression import CONSTANT, Arithmetic, Component, Number, Signal
 from verifai_jax.mtl.formula import Formula, Term
 from verifai_jax.mtl.host_values import FUNCTIONS
-from verifai_jax.mtl.streams import Op, Plan
+from verifai_jax.mtl.streams import Count, Op, Plan
 from verifai_jax.mtl.tree import missing_case, postorder
 
-Columns = Sequence[tuple[str, int | None]]
 Memory = list[float]
 Join = Callable[[float, float], float]
 
@@ -29,10 +30,16 @@ class PythonMachine:
     - `out`: what the last step gave, one number a formula.
     """
 
-    def __init__(self, plan: Plan, columns: Columns) -> None:
+    def __init__(self, plan: Plan, front: MarginCode) -> None:
         self.out = [math.nan] * len(plan.outputs)
         self._outputs = plan.outputs
+        # What is counted follows the columns of a sample.
+        columns = [*front.columns, *((each.duration.name, None) for each in plan.counts)]
         numbered = {column: k for k, column in enumerate(columns)}
+        self._counts = [
+            _counted(count, PythonMachine(count.plan, own), own_columns)
+            for count, (own, own_columns) in zip(plan.counts, front.counts, strict=True)
+        ]
         self._margins = [_margin(f, sign, plan.top == 1, numbered) for f, sign in plan.leaves]
         self._leaves = [math.nan] * len(plan.leaves)
         self._steps = [(_STEPS[op.kind], op, _first(op, plan.top)) for op in plan.ops]
@@ -41,6 +48,7 @@ class PythonMachine:
     def step(self, sample: Sequence[float]) -> None:
         """Take in one sample."""
         numbers = [float(value) for value in sample]
+        numbers += [count(numbers) for count in self._counts]
         self._leaves = [margin(numbers) for margin in self._margins]
         self._follow()
 
@@ -208,6 +216,25 @@ _STEPS: dict[str, Callable[..., float]] = {
 
 
 # Margins
+
+
+def _counted(
+    count: Count, machine: PythonMachine, columns: Sequence[int]
+) -> Callable[[Sequence[float]], float]:
+    """Return what counts the seconds in which a formula held, sample by sample."""
+    last = deque([-1.0] * count.n, maxlen=count.n)
+    held = unknown = 0
+
+    def seconds(x: Sequence[float]) -> float:
+        nonlocal held, unknown
+        machine.step([x[k] for k in columns])
+        (now,), before = machine.out, last[0]
+        last.append(now)
+        held += (now > 0) - (before > 0)
+        unknown += (now != now) - (before != before)
+        return math.nan if unknown else held * count.dt
+
+    return seconds
 
 
 def _margin(

@@ -128,7 +128,7 @@ class Watch(Generic[R]):
         try:
             self._machine: CompiledMachine | PythonMachine = CompiledMachine(plan, front)
         except Unavailable:
-            self._machine = PythonMachine(plan, front.columns)
+            self._machine = PythonMachine(plan, front)
         self.compiled = isinstance(self._machine, CompiledMachine)
         self._step, self._out = self._machine.step, self._machine.out
 
@@ -267,7 +267,7 @@ def watch(
     norm without a size.
     """
     plan = streams(formulas, dt, semantics, every)
-    front = margin_code(plan.leaves, plan.top == 1, sizes or {})
+    front = margin_code(plan, sizes or {})
     if not isinstance(formulas, Mapping):
         return Watch(plan, front, lambda out: out[0])
     names = tuple(formulas)

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from verifai_jax.core.jaxprs import run_through
+from verifai_jax.core.jaxprs import called, run_through
 from verifai_jax.native_code import elementary
 from verifai_jax.native_code.code import Code
 from verifai_jax.native_code.values import (
@@ -94,6 +94,8 @@ class Translator:
     def step(self, step: Equation, inputs: list[Value]) -> list[Value]:
         """Translate one step."""
         name = step.primitive.name
+        if (inner := called(step)) is not None:
+            return self.closed(inner, inputs)
         if name in RULES:
             return RULES[name](self, step, inputs)
         out = step.outvars[0].aval
@@ -274,19 +276,6 @@ def pairs(high: Elements, low: Elements) -> Elements:
     for cell in np.ndindex(high.shape):
         out[cell] = (high[cell], low[cell])
     return out
-
-
-@rule("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint", "custom_lin")
-def _call(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
-    return t.closed(step.params.get("jaxpr", step.params.get("call_jaxpr")), inputs)
-
-
-@rule("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr", "custom_vmap_call")
-def _custom(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
-    for name in ("call_jaxpr", "fun_jaxpr", "call"):
-        if name in step.params:
-            return t.closed(step.params[name], inputs)
-    raise Untranslatable(f"the operation {step.primitive.name}")
 
 
 @rule("optimization_barrier")

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from verifai_jax.core.fingerprint import operands_of_scan
-from verifai_jax.core.jaxprs import run_through
+from verifai_jax.core.jaxprs import called, run_through
 from verifai_jax.policies.errors import PolicyError
 from verifai_jax.policies.onnx_graph import OPSET, Graph
 from verifai_jax.policies.onnx_node import Node
@@ -49,8 +49,6 @@ _COMPOSED: dict[str, Callable[..., str]] = {
     "clamp": lambda node, number, low, x, high: node("Min", [node("Max", [x, low]), high]),
 }
 """Operations of JAX that are several operators, by `node` and `number`, which makes constants."""
-_WITHIN = ("jaxpr", "call_jaxpr", "fun_jaxpr")
-"""Parameters by which an operation holds the function that it calls."""
 _REDUCTIONS = {
     "reduce_sum": "ReduceSum",
     "reduce_max": "ReduceMax",
@@ -158,8 +156,7 @@ class _Translation:
     def equation(self, equation: Jaxpr, given: list[Value]) -> list[Value]:
         """Return the outputs of one operation."""
         kind, options = equation.primitive.name, equation.params
-        inner = next((options[n] for n in _WITHIN if n in options and kind != "scan"), None)
-        if inner is not None and kind != "while":
+        if (inner := called(equation)) is not None:
             plain = getattr(inner, "jaxpr", inner)
             return self.translate(plain, getattr(inner, "consts", ()), given)
         if not any(isinstance(value, str) for value in given) and kind != "pure_callback":

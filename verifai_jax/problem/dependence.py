@@ -36,6 +36,7 @@ from verifai_jax.core.fingerprint import (
     used_inputs,
     without_unused,
 )
+from verifai_jax.core.jaxprs import CALLS, called
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import Slot
 from verifai_jax.problem.problem import Problem
@@ -60,9 +61,6 @@ KEY: Slot[None, bool] = Slot("dependence on the key")
 
 _FLAT = frozenset({"ceil", "floor", "nextafter", "round", "sign", "stop_gradient"})
 """Steps with real results whose derivative is zero."""
-_CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
-_CALLS |= {"remat2": "jaxpr", "checkpoint": "jaxpr", "remat": "jaxpr", "custom_vmap_call": "call"}
-"""Steps that call a function as it is, and the name of its program among their parameters."""
 
 
 def has_gradient(problem: Problem) -> bool:
@@ -151,8 +149,8 @@ class _Sweep:
     def results(self, program: jax.extend.core.Jaxpr, step: Any, moved: list[bool]) -> list[bool]:
         """Return which results of a step depend differentiably on the inputs that are `moved`."""
         name, options = step.primitive.name, step.params
-        if name in _CALLS and _CALLS[name] in options:
-            return self(_program(options[_CALLS[name]]), moved)
+        if name in CALLS:
+            return self(_program(called(step)), moved)
         if name == "scan":
             constants, carried = operands_of_scan(options)
             fixed, carry = moved[:constants], moved[constants : constants + carried]

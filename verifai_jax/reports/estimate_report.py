@@ -47,6 +47,7 @@ def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> 
             f"Fails with probability {estimate.probability:z.3g} ({sure} interval {interval}); "
             f"guaranteed at most {bound}."
         )
+    drawn_from = "the prior" if estimate.rest == 1 else "what a proof leaves of the prior"
     method = METHODS.get(estimate.method or "", "none that gave an estimate")
     assumptions = [MODEL, SAMPLES]
     if estimate.method not in (None, "monte_carlo"):
@@ -58,14 +59,14 @@ def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> 
             f"The failure probability is at most {bound} at {sure}.",
             (
                 f"{estimate.prior_failures:,} failures and {estimate.prior_no_verdict:,} without a "
-                f"verdict in {estimate.prior_simulations:,} samples of the prior",
+                f"verdict in {estimate.prior_simulations:,} samples of {drawn_from}",
             ),
             (MODEL, SAMPLES),
         ),
     ]
     if estimate.p0 is not None:
         shown = estimate.upper_bound <= estimate.p0
-        words = "is shown" if shown else "is not shown by samples of the prior alone"
+        words = "is shown" if shown else f"is not shown by samples of {drawn_from} alone"
         sentence = f"That the probability is below {estimate.p0:zg} {words}."
         claims.append(Claim("C3", sentence, ("the guaranteed bound",), (MODEL, SAMPLES)))
     numbers: list[tuple[str, Child]] = [
@@ -75,11 +76,14 @@ def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> 
         ("method", method),
         ("interval", f"{interval}, at {sure}"),
         ("guaranteed bound", f"{bound}, at {sure}"),
-        ("independent samples of the prior", f"{estimate.prior_simulations:,}"),
+        (f"independent samples of {drawn_from}", f"{estimate.prior_simulations:,}"),
         ("failures among these", f"{estimate.prior_failures:,}"),
         ("without a verdict among these", f"{estimate.prior_no_verdict:,}"),
         ("relative error", format_percent(estimate.relative_error)),
     ]
+    if estimate.rest < 1:
+        shares = map(format_percent, (estimate.rest, estimate.certain))
+        numbers.append(("left by a proof, and certain to fail", ", ".join(shares)))
     asked = [] if problem is None else problem_content(problem, about)
     prior = "not stated" if problem is None else "see the table of features"
     steps = [f"seed {estimate.seed}", f"precision {estimate.precision}"]

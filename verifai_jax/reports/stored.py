@@ -1,6 +1,6 @@
-"""Estimates and comparisons as `verifai-jax estimate --json` and `compare --json` wrote them.
+"""Results of which a command wrote a file: `estimate --json`, `compare --json`, `verify --into`.
 
-result = read_result(Path("estimate.json"))         # an Estimate or a Comparison
+result = read_result(Path("estimate.json"))     # an Estimate, a Comparison or a Verification
 """
 
 import json
@@ -16,6 +16,7 @@ from verifai_jax.core.text import one_line
 from verifai_jax.estimation.result import METHODS, Estimate
 from verifai_jax.features import FeatureSpace
 from verifai_jax.statistics.paired_rates import PairedRates
+from verifai_jax.verification.result import KIND, Verification, load_verification
 
 NOT_FINITE = ("effective", "relative_error")
 """Numbers of an estimate that JSON has as null where they are not finite."""
@@ -23,12 +24,15 @@ OPTIONAL = ("probability", "method", "p0", "backend", "stopped")
 """Entries of an estimate that may be null."""
 
 
-def read_result(file: Path, space: FeatureSpace | None = None) -> Estimate | Comparison:
-    """Read an estimate or a comparison from the JSON that a command wrote.
+def read_result(
+    file: Path, space: FeatureSpace | None = None
+) -> Estimate | Comparison | Verification:
+    """Read an estimate, a comparison or a verification from the JSON that a command wrote.
 
     **Arguments:**
 
-    - `file`: the output of `verifai-jax estimate --json` or `verifai-jax compare --json`.
+    - `file`: the output of `verifai-jax estimate --json` or `verifai-jax compare --json`, or what
+      `verifai-jax verify --into` wrote.
     - `space`: the space of the problems that were compared, which the JSON does not have.
 
     **Returns:** the result; a comparison without its single pairs.
@@ -40,6 +44,8 @@ def read_result(file: Path, space: FeatureSpace | None = None) -> Estimate | Com
         data = json.loads(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError):
         data = None
+    if isinstance(data, dict) and data.get("kind") == KIND:
+        return load_verification(file)
     commands = {"estimate": _estimate, "compare": lambda each: _comparison(each, space)}
     if not isinstance(data, dict) or data.get("command") not in commands:
         raise ValueError(

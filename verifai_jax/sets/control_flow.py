@@ -24,23 +24,6 @@ PASSES = 4096
 """Passes of a `while` after which boxes that may go on are taken to give anything."""
 
 
-@rule("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint", "custom_lin")
-def _call(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    return t.closed(step.params.get("jaxpr", step.params.get("call_jaxpr")), inputs)
-
-
-@rule("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr", "custom_vmap_call")
-def _custom(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    for name in ("call_jaxpr", "fun_jaxpr", "call"):
-        if name in step.params:
-            program = step.params[name]
-            known = None if t.known is None else t.known(program)
-            if known is not None:
-                return known(inputs)
-            return t.closed(program, inputs)
-    raise NotImplementedError("a function with a derivative of its own")
-
-
 @rule("scan")
 def _scan(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     params = step.params

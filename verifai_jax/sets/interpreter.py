@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from verifai_jax.core.jaxprs import run_through
+from verifai_jax.core.jaxprs import CUSTOM_CALLS, called, run_through
 from verifai_jax.core.user_errors import source_line
 from verifai_jax.sets.form import Form
 from verifai_jax.sets.whole import Whole
@@ -90,6 +90,9 @@ class Interpreter:
     def step(self, step: Equation, inputs: list[Value]) -> list[Value]:
         """Evaluate one operation."""
         name = step.primitive.name
+        if (inner := called(step)) is not None:
+            known = self.known(inner) if self.known and name in CUSTOM_CALLS else None
+            return self.closed(inner, inputs) if known is None else known(inputs)
         found = RULES.get(name)
         if found is None:
             return self.concrete(step, inputs)

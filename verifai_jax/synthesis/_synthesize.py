@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax.core.budget import Budget, split_budget
-from verifai_jax.core.checks import check_options
+from verifai_jax.core.checks import check_options, check_positive
 from verifai_jax.core.errors import check_names, suggests_options
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.falsification.validation import usual_batch
@@ -79,6 +79,7 @@ def synthesize(
     environments: int = 16,
     held_out: int = 2000,
     mass: float = 0.999,
+    prove: float | None = None,
     gradient: bool | None = None,
     batch: int = 256,
     seed: int = 0,
@@ -103,6 +104,9 @@ def synthesize(
     - `held_out`: fresh environments in which the result is checked; 0 for no check.
     - `mass`: probability of the part of the prior in which the environment is attacked, nearest to
       its medians; 1 for all of it, to the ends of all tails at once.
+    - `prove`: seconds, about, in which a box of parameters around the best is proved, as by
+      `verify`: with none of these, and no environment of that part of the prior, the formula
+      breaks. No proof when left out.
     - `gradient`: whether to follow gradients; by default where the system has them without
       changing the backend.
     - `batch`: simulations at once.
@@ -118,10 +122,17 @@ def synthesize(
     check_options(budget, batch, seed, max_seconds, None)
     check_numbers(margin, environments=environments, held_out=held_out)
     check_names("aim", [aim], AIMS)
+    if prove is not None:
+        check_positive("prove", prove)
     loop = feature_parameters(
         problem, parameters, gradient, batch, budget, precision, backend, seed
     )
     search = attack_search(problem, attack, loop)
+    enclosed = None
+    if prove is not None:
+        from verifai_jax.verification.enclosure import enclosable
+
+        enclosed = enclosable(loop.problem, precision)
     sources, begun = problem.sources(), time.time()
     limits, checking = split_budget(lambda: loop.simulations, budget, started, max_seconds)
     region = region_of(loop, mass)
@@ -151,6 +162,16 @@ def synthesize(
         checked = _check(loop, best.theta, held_out, margin, seed, checking)
     if checked is not None and checked.lowest is not None:
         robustness = min(robustness, checked.lowest)
+    proved = None
+    if enclosed is not None and prove is not None and stopped != "interrupted":
+        from verifai_jax.synthesis.proved_parameters import prove_around
+
+        point, chosen = np.full(enclosed.space.dim, 0.5), np.zeros(enclosed.space.dim, bool)
+        point[loop.mine], chosen[loop.mine] = best.theta, True
+        low, high = np.zeros(len(point)), np.ones(len(point))
+        if region is not None:
+            low[loop.theirs], high[loop.theirs] = region.ends
+        proved = prove_around(enclosed, point, chosen, low, high, prove, precision, seed)
     return Synthesis(
         problem=problem,
         parameters=loop.values(best.theta),
@@ -169,6 +190,8 @@ def synthesize(
         varied="" if region is None else region.describe(),
         counted=None if work.counts is None else (work.counts.failing, work.counts.samples),
         sources=sources.settled(begun).to_json(),
+        proved=proved,
+        proof_seconds=prove,
     )
 
 

@@ -50,6 +50,12 @@ class Region:
             return math.inf
         return math.sqrt(float(scipy_special().chdtri(count, 1 - self.mass)))
 
+    @property
+    def ends(self) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+        """The corners of the box around the region, in the environment's cube."""
+        low = np.where(self.tailed, scipy_special().ndtr(-self.radius), 0.0)
+        return low, 1 - low
+
     def contains(self, points: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
         """Return the points that lie in the region."""
         return self._distance(points) <= self.radius * (1 + 1e-6)

@@ -17,6 +17,8 @@ from verifai_jax.synthesis.parametric import held
 if TYPE_CHECKING:
     import pandas as pd
 
+    from verifai_jax.synthesis.proved_parameters import ProvedParameters
+
 
 @dataclass(frozen=True, eq=False)
 class Synthesis(InNotebook):
@@ -33,7 +35,8 @@ class Synthesis(InNotebook):
     `"max_seconds"`, `"no verdict"` or `"interrupted"`; `problem`: the one given; `seed`;
     `varied`: what was chosen, what the environment varied, and how far; `counted`: with
     `aim="probability"`, failures and samples by which the parameters were chosen; `sources`: what
-    the model was made of, as a run records it.
+    the model was made of, as a run records it; `proved`: the box of parameters that was proved,
+    None without one; `proof_seconds`: how long a proof was to take, None for none.
     """
 
     problem: Problem = field(repr=False)
@@ -53,6 +56,8 @@ class Synthesis(InNotebook):
     varied: str = ""
     counted: tuple[int, int] | None = None
     sources: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    proved: "ProvedParameters | None" = None
+    proof_seconds: float | None = None
 
     @property
     def holds(self) -> bool:
@@ -102,6 +107,10 @@ class Synthesis(InNotebook):
             lines.append("  not checked in held-out environments")
         if self.varied:
             lines.append(f"  {self.varied}")
+        if self.proved is not None:
+            lines.append(f"  {self.proved}{', whatever the others are' * around}")
+        elif self.proof_seconds is not None:
+            lines.append(f"  nothing around them was proved in {self.proof_seconds:zg} s")
         found, of = len(self.robust), len(self.candidates)
         if around:
             over = f"over {len(self.environments)} environments"

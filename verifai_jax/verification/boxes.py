@@ -79,6 +79,16 @@ class Boxes:
     def __getitem__(self, rows: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "Boxes":
         return Boxes(*(getattr(self, field.name)[rows] for field in fields(self)))
 
+    def copy(self) -> "Boxes":
+        """Return boxes that change without these."""
+        return self[np.arange(len(self))]
+
+    def within(self, low: Float[np.ndarray, " dim"], high: Float[np.ndarray, " dim"]) -> "Boxes":
+        """Return open boxes, the parts of these between two corners."""
+        lower, upper = np.maximum(self.low, low), np.minimum(self.high, high)
+        some = (lower < upper).all(axis=1)
+        return Boxes.between(lower[some], upper[some])
+
     def with_more(self, others: "Boxes") -> "Boxes":
         """Return these boxes, and others after them."""
         return Boxes(

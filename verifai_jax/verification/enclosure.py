@@ -21,9 +21,10 @@ from jaxtyping import Array, Bool, Float, PyTree
 from verifai_jax.core.cores import available_cores
 from verifai_jax.core.fingerprint import without_unused
 from verifai_jax.core.precision import in_precision
+from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.verdicts import boolean_semantics, trace_verdict
 from verifai_jax.features.ranges import FeatureRanges
-from verifai_jax.problem.problem import Problem
+from verifai_jax.problem.problem import Problem, ProblemError
 from verifai_jax.sets import Form, Interpreter, Whole
 from verifai_jax.sets.functions import FUNCTIONS
 from verifai_jax.sets.interpreter import Value, as_form, as_whole
@@ -156,6 +157,27 @@ class Enclosure:
                 else:
                     sets.append(Whole(begin.astype(np.int64), end.astype(np.int64), kind))
         return sets
+
+
+def enclosable(problem: Problem, precision: str) -> Problem:
+    """Return a problem on the backend on which sets go through it.
+
+    **Raises:** `ProblemError` for a black box, and for a system that draws random numbers; what
+    `Problem.check` raises.
+    """
+    problem = resolved(problem, batch=512, budget=512, precision=precision).problem
+    problem.check()
+    if problem.black_box:
+        raise ProblemError(
+            f"problem {problem.name!r} has a system that JAX does not trace, and verify evaluates "
+            "the traced program with sets; vj.estimate bounds how probable its failures are"
+        )
+    if problem.draws():
+        raise ProblemError(
+            f"the system of problem {problem.name!r} draws random numbers, and verify needs one "
+            "that depends on its features alone; make what it draws a feature"
+        )
+    return problem
 
 
 def _rows(value: Value, block: slice) -> Value:

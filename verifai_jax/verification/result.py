@@ -6,7 +6,7 @@ result.save("verified.json"); load_verification("verified.json")
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,12 +16,15 @@ import pandas as pd
 from jaxtyping import Bool, Float
 
 from verifai_jax.core.figure import Drawn
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook, frame_html, picture_html
 from verifai_jax.core.text import counted, format_percent
+from verifai_jax.problem.model_digest import digest_of_model
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.confidence_sequences import anytime_interval
 from verifai_jax.store.files import DamagedError, read_record, write_record
 from verifai_jax.verification.boxes import BROKEN, OUTSIDE, PROVED, Boxes
+from verifai_jax.verification.rest import Rest, RestSpace
 
 KIND = "verification"
 
@@ -40,13 +43,15 @@ class Verification(Drawn, InNotebook):
     - `name`: the name of the problem; `columns`: its unit coordinates.
     - `boxes`: the partition of the unit cube; `shares`, `upper_shares`: the corners of the boxes as
       shares of the range of the features.
-    - `features`, `formulas`, `precision`: what was verified.
+    - `features`, `formulas`, `model`, `precision`: what was verified, the system by a
+      hash.
     - `confidence`: the confidence of bounds by samples.
     - `looked_at`: boxes that were looked at; `simulations`; `seconds`; `stopped`: why it ended.
-    - `notes` for people; `version`.
+    - `notes` for people; `version`; `sources`: what the model was made of, as a run records it.
     """
 
     _picture = "verification", "plot_verification"
+    _internal = frozenset(("check_same", "left", "note"))
 
     name: str
     columns: tuple[str, ...]
@@ -55,6 +60,7 @@ class Verification(Drawn, InNotebook):
     upper_shares: Float[np.ndarray, "n dim"] = field(repr=False)
     features: Mapping[str, str]
     formulas: Mapping[str, str]
+    model: str
     precision: str
     confidence: float
     looked_at: int
@@ -63,6 +69,7 @@ class Verification(Drawn, InNotebook):
     stopped: str
     notes: tuple[str, ...]
     version: str
+    sources: Mapping[str, Any] = field(repr=False)
 
     @cached_property
     def verdicts(self) -> np.ndarray:
@@ -164,7 +171,7 @@ class Verification(Drawn, InNotebook):
                 f"fails, at {sure} by {count}",
             ),
             f"  failing      {format_percent(low)} of the prior at least, "
-            f"{format_percent(high)} at most{f' at {sure}' * (undecided.mass > 0)}",
+            f"{format_percent(high)} at most{f' at {sure}' if undecided.mass > 0 else ''}",
             f"  boxes        {len(self.boxes):,} of {self.looked_at:,} that were looked at, "
             f"{self.simulations:,} simulations in {self.seconds:z.1f} s, stopped: {self.stopped}",
             "  verified     the system in discrete time as it is simulated, in real arithmetic and "
@@ -178,7 +185,7 @@ class Verification(Drawn, InNotebook):
         return [picture_html(self.plot()), frame_html(self.table)]
 
     def check_same(self, problem: Problem, precision: str) -> None:
-        """Refuse to go on with the result of another problem.
+        """Refuse another problem than the one that was verified.
 
         **Raises:** `ValueError` that says what differs.
         """
@@ -186,9 +193,53 @@ class Verification(Drawn, InNotebook):
             then = getattr(self, what)
             if then != now:
                 raise ValueError(
-                    f"verify cannot go on with the result of another problem: its {what} was "
-                    f"{then!r}, and is {now!r} now"
+                    f"this verification is of another problem: its {what} was {then!r}, and is "
+                    f"{now!r} now; verify this problem"
                 )
+
+    def left(self, problem: Problem, precision: str) -> Rest:
+        """Return what is left of the feature space where neither all points fail nor none does.
+
+        **Raises:** as `check_same`.
+        """
+        self.check_same(problem, precision)
+        return Rest(self.boxes, (PROVED, BROKEN))
+
+    @property
+    def note(self) -> str:
+        """A sentence on simulations of the rest."""
+        share = format_percent(self.proved.mass)
+        return f"{share} of the prior is proved and not simulated; all rates are of the rest"
+
+    def rest(self, problem: Problem, precision: str = "float32") -> Problem:
+        """Return the problem without what is proved, for searches that spend nothing there.
+
+        Its constraint refuses the boxes that are proved, so that rates are those of the rest.
+
+        **Arguments:**
+
+        - `problem`: the problem that was verified.
+        - `precision`: the precision of the simulations of the rest, in which it was verified.
+
+        **Raises:** `ValueError` for another problem or precision, and where nothing is left.
+        """
+        self.check_same(problem, precision)
+        left = Rest(self.boxes, (PROVED,))
+        if not left.mass:
+            raise ValueError(f"all of {problem.name!r} is proved: nothing is left to search")
+        return replace(problem, space=RestSpace(problem.space, left))
+
+    def report(self, path: str | Path, **options: Any) -> Path:
+        """Write the evidence report on the verification as HTML, and its claims as JSON.
+
+        **Arguments:**
+
+        - `path`: the path of the HTML file.
+        - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`.
+
+        **Returns:** the path.
+        """
+        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
 
     def save(self, path: str | Path) -> Path:
         """Write the result as JSON; `load_verification` reads it.
@@ -210,12 +261,21 @@ class Verification(Drawn, InNotebook):
         return Path(path)
 
 
+def as_verification(result: "Verification | str | Path") -> Verification:
+    """Return a result, read from its file where that is given.
+
+    **Raises:** as `load_verification`.
+    """
+    return load_verification(result) if isinstance(result, str | Path) else result
+
+
 def described(problem: Problem) -> dict[str, Any]:
     """Return what a result records of its problem."""
     return {
         "name": problem.name,
         "features": {name: repr(domain) for name, domain in problem.space.domains.items()},
         "formulas": {name: str(formula) for name, formula in problem.formulas.items()},
+        "model": digest_of_model(problem),
     }
 
 

@@ -91,7 +91,7 @@ class _RowByRow(System):
 
     @property
     def exact_step(self) -> bool:
-        """True for a simulator that says that its step is part of the system."""
+        """True if the simulator declares its step a part of the system."""
         return as_system(self.simulation.function).exact_step
 
     def passing(self, features: Features) -> Passing:

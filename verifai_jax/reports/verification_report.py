@@ -1,0 +1,150 @@
+"""The report on a verification: what is proved, broken and undecided, and by which boxes."""
+
+from typing import Any
+
+from verifai_jax.core.text import format_percent
+from verifai_jax.problem.model_digest import digest_of_model
+from verifai_jax.problem.problem import Problem
+from verifai_jax.reports.claims import Claim, about_json, claims_json
+from verifai_jax.reports.markup import Child, bullets, paragraph, picture, preformatted, table
+from verifai_jax.reports.page import Page, Section
+from verifai_jax.reports.provenance import Model, chained
+from verifai_jax.reports.run_question import About
+from verifai_jax.reports.sections import (
+    MODEL,
+    answers_section,
+    claims_section,
+    model_answer,
+    model_warnings,
+    problem_content,
+    provenance_content,
+)
+from verifai_jax.reports.studies import png
+from verifai_jax.verification.result import Verification
+
+DISCRETE = (
+    "What is verified is the system in discrete time as it is simulated, in real arithmetic and "
+    "with the rounding of its precision; no differential equation."
+)
+"""Assumption of what is proved and of what is broken."""
+SAMPLED = (
+    "The bound on what is undecided rests on independent samples of it, and holds whenever one "
+    "stops."
+)
+"""Assumption of the upper bound of the failure probability."""
+MAX_BOXES = 40
+"""Boxes of a table, the most probable of each verdict."""
+
+
+def verification_page(result: Verification, about: About, problem: Problem | None) -> Page:
+    """Make the report on a verification.
+
+    **Arguments:**
+
+    - `result`: the verification.
+    - `about`: units and reasons of the features.
+    - `problem`: what was asked; None if it is not at hand.
+    """
+    model = Model.of([result.sources], None if problem is None else problem.sources())
+    links = tuple(chained(model.inputs))
+    proved, broken, undecided = result.proved, result.broken, result.undecided
+    shares = [format_percent(part.mass) for part in (proved, broken, undecided)]
+    headline = f"{shares[0]} of the prior is proved, {shares[1]} broken, {shares[2]} undecided."
+    low, high = result.probability
+    sure = format_percent(result.confidence)
+    bounds = f"{format_percent(low)} at least, {format_percent(high)} at most"
+    boxes, samples = f"{len(result.boxes):,} boxes", f"{int(result.boxes.samples.sum()):,} samples"
+    claims = [
+        Claim("C1", f"No simulation fails in {shares[0]} of the prior.", (boxes,),
+              (MODEL, DISCRETE)),
+        Claim("C2", f"The failure probability is {bounds}, at {sure}.", (boxes, samples),
+              (MODEL, DISCRETE, SAMPLED)),
+    ]  # fmt: skip
+    if broken.mass:
+        found = f"Boxes of {shares[1]} of the prior contain a point that fails for certain."
+        claims.append(Claim("C3", found, (boxes,), (MODEL, DISCRETE)))
+    parts: list[tuple[str, Child, Child]] = [
+        (name, format_percent(part.mass), format_percent(part.volume))
+        for name, part in (
+            ("proved: no point fails", proved),
+            ("broken: a point fails for certain", broken),
+            ("of these, every point fails", result.throughout),
+            ("undecided", undecided),
+        )
+    ]
+    columns = ["verdict", "mass", "lowest", "highest", "failure_bound"]
+    ends = [f"{name} {end}" for name in result.columns for end in ("from", "to")]
+    largest: Any = result.table.groupby("verdict", sort=False).head(MAX_BOXES // 3)
+    rows = [
+        [v if isinstance(v, str) else f"{v:z.4g}" for v in values]
+        for values in largest[[*columns, *ends]].itertuples(index=False)
+    ]
+    asked = [] if problem is None else problem_content(problem, about)
+    sections = (
+        answers_section(
+            [
+                ("What was claimed?", headline, "claims"),
+                ("What was the prior?", "see what was asked", "asked"),
+                ("How many boxes are there?", boxes, "found"),
+                ("How probable is a failure?", f"{bounds}, at {sure}", "found"),
+                ("Which assumption is under what is proved?", DISCRETE, "limits"),
+                model_answer(model),
+            ]
+        ),
+        Section(
+            "asked",
+            "What was asked",
+            (paragraph(f"Where no simulation of {result.name} fails, for certain."), *asked),
+        ),
+        Section(
+            "found",
+            "What was found",
+            (
+                table(["part", "of the prior", "of the volume"], parts),
+                picture(png(result.plot()), "The parts, two coordinates at a time"),
+                table(
+                    [*columns, *ends], rows,
+                    "The most probable boxes; ends are shares of the range of a feature.",
+                ),
+            ),
+        ),
+        Section(
+            "limits",
+            "What was not shown",
+            (
+                bullets(
+                    [
+                        f"{shares[2]} of the prior is undecided; at most "
+                        f"{format_percent(result.failure_bound)} of it fails, at {sure}.",
+                        DISCRETE, SAMPLED, MODEL, *result.notes,
+                    ]
+                ),
+            ),
+        ),
+        claims_section(claims),
+        Section(
+            "reproduce",
+            "How to reproduce it",
+            (
+                preformatted(
+                    f"vj.verify(problem, boxes={result.looked_at}, precision={result.precision!r}, "
+                    f"confidence={result.confidence})"
+                ),
+                paragraph(f"Made with verifai_jax {result.version}."),
+                *provenance_content(links, model),
+            ),
+        ),
+    )  # fmt: skip
+    subject: dict[str, Any] = {}
+    if problem is not None:
+        digest = "" if model.changes else digest_of_model(problem)
+        entries = problem.requirement_entries()
+        subject = about_json("verification", result.formulas, entries, digest)
+    return Page(
+        title=f"{result.name}: evidence report on a verification",
+        headline=headline,
+        tone="fails" if broken.mass else "open",
+        sections=sections,
+        claims=claims_json(result.name, claims, links[-1].chain if links else "", subject),
+        warnings=model_warnings(model),
+    )

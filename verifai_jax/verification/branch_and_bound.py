@@ -1,0 +1,182 @@
+"""Looking at boxes: simulations say which may be decided, sets decide them, and the rest is split.
+
+work = BranchAndBound(problem, enclosure, Boxes.whole(enclosure), seed=0)
+work.go_on(end=time.perf_counter() + 60, limit=None)
+work.boxes
+"""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from verifai_jax.core.cores import available_cores
+from verifai_jax.core.progress import say_done
+from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.problem.problem import Problem
+from verifai_jax.verification.boxes import BROKEN, OPEN, OUTSIDE, PROVED, Boxes
+from verifai_jax.verification.enclosure import TOGETHER, Enclosure
+
+REACH = 0.45
+"""Where a box is sampled, as a share of its width from the middle: inside, not on its faces."""
+CANDIDATES = 4096
+"""Failing points that are confirmed when the budget is spent, those of the largest boxes first."""
+
+
+class BranchAndBound:
+    """The boxes, and what looks at them.
+
+    `wanted` says which boxes are worth a look; all are, unless somebody sets it.
+    """
+
+    def __init__(self, problem: Problem, enclosure: Enclosure, boxes: Boxes, seed: int) -> None:
+        self.wanted: Callable[[Boxes], Bool[np.ndarray, " n"]] = lambda boxes: boxes.state == OPEN
+        self.problem, self.enclosure, self.boxes, self.seed = problem, enclosure, boxes, seed
+        self.looked_at = self.contradicted = 0
+        self.evaluator = Evaluator(problem, 4096, precision=enclosure.precision, seed=seed)
+
+    def go_on(self, end: float | None, limit: int | None) -> str:
+        """Look at boxes, the most probable first; return why it stopped."""
+        top, count, rate = TOGETHER * available_cores(), 32, 1e6
+        try:
+            while True:
+                now = time.perf_counter()
+                open_ones = np.flatnonzero((self.boxes.state == OPEN) & self.wanted(self.boxes))
+                can = self.boxes[open_ones].splittable(self.enclosure).any(1)
+                new = np.isinf(self.boxes.lowest[open_ones])
+                open_ones = open_ones[can | new]
+                if not len(open_ones):
+                    return "all boxes are decided or too narrow"
+                if end is not None:
+                    count = min(count, max(int(rate * (end - now)), 0))
+                if limit is not None:
+                    count = min(count, limit - self.looked_at)
+                if count < 1:
+                    return "the budget is spent"
+                mass = self.boxes.mass[open_ones]
+                self.look_at(open_ones[np.argsort(-mass, kind="stable")[:count]])
+                rate = count / (time.perf_counter() - now)
+                count = min(2 * count, top)
+                decided = float(self.boxes.mass[self.boxes.state != OPEN].sum())
+                say_done(self.looked_at, limit, f"{100 * decided:z.3g} % decided")
+        except KeyboardInterrupt:
+            return "interrupted"
+
+    def look_at(self, rows: Int[np.ndarray, " m"]) -> None:
+        """Decide boxes, or split them."""
+        some = self.boxes[rows]
+        self.looked_at += len(rows)
+        robustness, failing = self.star(some)
+        proper = np.isfinite(robustness).all(1)
+        # Simulations say which boxes may be decided, and only these are worth the sets.
+        slope = np.abs(robustness[:, 1::2] - robustness[:, 2::2]).sum(1) / (4.2 * REACH)
+        passes = proper & ~failing.any(1) & (robustness[:, 0] - slope >= 0)
+        fails = proper & failing.all(1) & (robustness[:, 0] + slope <= 0)
+        worth = np.flatnonzero(passes | fails | ~proper)
+        moves = np.zeros(some.low.shape)
+        if len(worth):
+            bounds = self.enclosure(some.low[worth], some.high[worth])
+            some.lowest[worth], some.highest[worth] = bounds.low, bounds.high
+            moves[worth] = bounds.moves
+            state = np.where(bounds.holds, PROVED, np.where(bounds.high < 0, BROKEN, OPEN))
+            # A box that the constraint cuts is split until it does so no more: its mass is unknown.
+            state = np.where(bounds.inside, state, OPEN)
+            state = np.where(bounds.outside, OUTSIDE, state)
+            # A simulation outside of its bounds would be a mistake of this program.
+            seen = robustness[worth]
+            wrong = (np.nanmin(seen, 1, initial=np.inf) < bounds.low) & ~bounds.outside
+            wrong |= (np.nanmax(seen, 1, initial=-np.inf) > bounds.high) & bounds.inside
+            self.contradicted += int(wrong.sum())
+            some.state[worth] = np.where(wrong, OPEN, state)
+        some.confirmed[:] = some.state == BROKEN
+        can = some.splittable(self.enclosure)
+        split = (some.state == OPEN) & can.any(1)
+        kept = np.ones(len(self.boxes), bool)
+        kept[rows[split]] = False
+        for name in ("state", "lowest", "highest", "witness", "confirmed"):
+            getattr(self.boxes, name)[rows] = getattr(some, name)
+        along = self.influence(some, robustness, moves, can)
+        halves = some[split].halves(along[split], self.enclosure)
+        self.boxes = self.boxes[kept].with_more(halves)
+
+    def star(self, some: Boxes) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
+        """Simulate the middle of boxes, and both sides of it along each coordinate.
+
+        **Returns:** the robustness, NaN without a verdict, and which of them fail. A point that
+        fails becomes the witness of its box.
+        """
+        dim = some.low.shape[1]
+        offsets = np.concatenate([np.zeros((1, dim)), *(
+            REACH * sign * np.eye(dim)[j : j + 1] for j in range(dim) for sign in (1, -1)
+        )])  # fmt: skip
+        points = some.low[:, None] + (0.5 + offsets) * (some.high - some.low)[:, None]
+        points = points.astype(np.float32)
+        verdicts = self.evaluator(points.reshape(-1, dim))
+        robustness = verdicts.lowest.reshape(len(some), -1).astype(float)
+        failing = verdicts.violated.reshape(robustness.shape)
+        if self.problem.space.where is not None:
+            refused = ~np.asarray(self.problem.space.accepts_points(points.reshape(-1, dim)))
+            refused = refused.reshape(robustness.shape)
+            robustness, failing = np.where(refused, np.nan, robustness), failing & ~refused
+        worst = np.argmin(np.where(failing, robustness, np.inf), axis=1)
+        any_failing = failing.any(1)
+        rows = np.flatnonzero(any_failing)
+        some.witness[rows] = points[rows, worst[rows]]
+        return robustness, failing
+
+    def influence(
+        self, some: Boxes, robustness: np.ndarray, moves: np.ndarray, can: np.ndarray
+    ) -> Int[np.ndarray, " n"]:
+        """Return the coordinate along which each box is to be split.
+
+        That is the one that changes the robustness most, or, as far as bounds are wider than what
+        simulations see, the one that moves the signals most, and with them what is not linear.
+        """
+        # What counts most is that a point has a verdict, or is accepted, and its neighbour is not.
+        values = np.where(np.isnan(robustness), 1e30, np.clip(robustness, -1e29, 1e29))
+        middle, up, down = values[:, :1], values[:, 1::2], values[:, 2::2]
+        change = np.abs(up - down) + 2 * np.abs(up + down - 2 * middle)
+        seen = values.max(1) - values.min(1) + 1e-30
+        wide = np.clip(some.highest - some.lowest, 1e-30, 1e29)
+        loose = np.where(moves.any(1), np.clip(1 - seen / wide, 0, 1), 0)[:, None]
+        # A coordinate without influence at these points may have one between them.
+        width = 0.1 * _relative(some.high - some.low)
+        score = (1 - loose) * _relative(change) + loose * _relative(moves) + width
+        return np.argmax(np.where(can, score, -1.0), axis=1)
+
+    def confirm(self) -> None:
+        """Find out which failing points of open boxes fail for certain."""
+        open_ones = (self.boxes.state == OPEN) & self.boxes.has_witness & ~self.boxes.confirmed
+        rows = np.flatnonzero(open_ones)
+        rows = rows[np.argsort(-self.boxes.mass[rows], kind="stable")[:CANDIDATES]]
+        if len(rows):
+            bounds = self.enclosure(self.boxes.witness[rows], self.boxes.witness[rows])
+            self.boxes.confirmed[rows] = (bounds.high < 0) & bounds.inside
+
+    def sample(self, count: int) -> None:
+        """Simulate points of what is open, drawn from the prior."""
+        self.boxes.failures[:] = self.boxes.samples[:] = 0
+        rows = np.flatnonzero((self.boxes.state == OPEN) & ~self.boxes.confirmed)
+        mass = self.boxes.mass[rows]
+        if not count or not mass.sum() > 0:
+            return
+        random = np.random.default_rng((self.seed, len(self.boxes)))
+        chosen = rows[random.choice(len(rows), count, p=mass / mass.sum())]
+        low, high = self.boxes.low[chosen], self.boxes.high[chosen]
+        points = (low + random.random(low.shape) * (high - low)).astype(np.float32)
+        points = np.clip(points, low, high).astype(np.float32)
+        verdicts = self.evaluator(points)
+        # What gives no verdict is not known to be safe.
+        failing = verdicts.violated | ~verdicts.proper
+        if self.problem.space.where is not None:
+            failing &= np.asarray(self.problem.space.accepts_points(points))
+        np.add.at(self.boxes.samples, chosen, 1)
+        np.add.at(self.boxes.failures, chosen, failing)
+        failed = np.flatnonzero(verdicts.violated & failing)
+        self.boxes.witness[chosen[failed]] = points[failed]
+
+
+def _relative(numbers: Float[np.ndarray, "n dim"]) -> Float[np.ndarray, "n dim"]:
+    """Return numbers as shares of the greatest in their row."""
+    return numbers / np.maximum(numbers.max(1, keepdims=True), 1e-300)
