@@ -196,6 +196,11 @@ class Engine:
             return self._derivatives[1] if self.gradient else as_traced(self._trace("evaluate"))
 
     @property
+    def padded(self) -> int:
+        """Rows of the program of a batch."""
+        return self.layout.padded
+
+    @property
     def row_identity(self) -> str | None:
         """A hash of all that the function of one row computes; None if that has no hash."""
         if not self.gradient:
@@ -270,11 +275,11 @@ class Engine:
             count = len(jax.tree.leaves(rows)[0])
             temperatures = np.asarray(temperature, np.float32)
             if temperatures.ndim:
-                temperatures = pad_rows(temperatures, self.layout.padded)
+                temperatures = pad_rows(temperatures, self.padded)
             else:
-                temperatures = np.full(self.layout.padded, temperatures)
+                temperatures = np.full(self.padded, temperatures)
             # In NumPy: of an array of JAX each first use of this kind compiles a program.
-            rows = jax.tree.map(lambda leaf: pad_rows(leaf, self.layout.padded), rows)
+            rows = jax.tree.map(lambda leaf: pad_rows(leaf, self.padded), rows)
             program = self._executable(mode)
             numbers = self._vectors[mode]
             if self.alone:
@@ -282,9 +287,7 @@ class Engine:
                 packed = program(one, _one_key(key), temperatures[0], shared, numbers)
                 packed = jax.tree.map(lambda leaf: np.asarray(leaf)[None], packed)
             else:
-                number = (
-                    _pad_keys(key, self.layout.padded) if self.own_keys else (key, np.int32(first))
-                )
+                number = _pad_keys(key, self.padded) if self.own_keys else (key, np.int32(first))
                 packed = program(rows, number, temperatures, shared, numbers)
             return self._packing[mode].unpack(packed, count)
 
@@ -396,7 +399,7 @@ class Engine:
         if list(self.layout.devices) != jax.local_devices()[: len(self.layout.devices)]:
             return None  # A program from a file runs on the first ones.
         shape = (
-            self.layout.padded,
+            self.padded,
             self.layout.chunks,
             self.own_keys,
             self.alone,
@@ -421,7 +424,7 @@ class Engine:
     def _arguments(self) -> tuple[Any, ...]:
         """Shapes and types of the arguments of the programs of batches."""
         first = jax.ShapeDtypeStruct((), jnp.int32)
-        leading = () if self.alone else (self.layout.padded,)
+        leading = () if self.alone else (self.padded,)
         key = _key_form()
         return (
             jax.tree.map(

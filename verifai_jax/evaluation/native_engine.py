@@ -89,7 +89,7 @@ class NativeEngine:
     @property
     def padded(self) -> int:
         """Rows of the program of XLA."""
-        return self._begun.layout.padded
+        return self._begun.padded
 
     @property
     def compile_seconds(self) -> float:
