@@ -341,7 +341,7 @@ class _WholeRounds:
         if len(keys) not in self._programs:
             enable_compile_cache()
             program = spread_over_devices(self._on_device, (True, True, False))
-            traced = self.engine.differentiable(
+            traced = self.engine.program.differentiable(
                 lambda: jax.jit(partial(program)).lower(state, keys, first)
             )
             self._programs[len(keys)] = traced.compile()
@@ -362,7 +362,7 @@ class _WholeRounds:
             rows = first + i * batch + jnp.arange(batch, dtype=jnp.int32)
             keys = jax.vmap(partial(simulation_key, key))(rows)
             temperature = search.temperature(state) if search.wants.gradient else 1.0
-            simulate = jax.vmap(self.engine.row, in_axes=(0, 0, None))
+            simulate = jax.vmap(self.engine.program.row, in_axes=(0, 0, None))
             row = simulate(u, keys, jnp.float32(temperature))
             lowest = jnp.min(row.rho, axis=-1)
             gradient = row.derivatives.get("gradient")
