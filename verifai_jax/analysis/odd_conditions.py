@@ -116,7 +116,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Reference:
-    """Whether another module holds."""
+    """A condition that holds where another module holds."""
 
     module: str
     holds: bool

@@ -123,7 +123,7 @@ class OperationalDomain:
 
     @property
     def is_box(self) -> bool:
-        """Whether no condition couples attributes: each has its own values."""
+        """True if no condition couples attributes, so that each has its own values."""
         each = [condition for name in self.roots for condition in self.modules[name].conditions()]
         groups = [condition for condition in each if isinstance(condition, Group)]
         tests = [condition for condition in each if isinstance(condition, Test)]

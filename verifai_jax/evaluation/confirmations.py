@@ -139,7 +139,7 @@ class Confirmation(InNotebook):
 
     @property
     def transferable(self) -> bool | None:
-        """Whether it is confirmed in each of the engines; None without another engine."""
+        """True if it is confirmed in each engine; None without another engine."""
         return self.confirmed if engines_of(self.rho) else None
 
     def __str__(self) -> str:
@@ -264,7 +264,7 @@ class Confirmations(InNotebook):
 
     @property
     def transferable(self) -> Bool[np.ndarray, " n"] | None:
-        """Which rows are confirmed in each of the engines; None without another engine."""
+        """True for rows confirmed in each engine; None without another engine."""
         return self.verdict == "confirmed" if engines_of(self.checks) else None
 
     @property

@@ -38,7 +38,7 @@ among them: with vectors of 512 bits its arctangent is wrong (0.10.2)."""
 
 
 class Layout(NamedTuple):
-    """How the rows of a batch are laid out.
+    """The layout of the rows of a batch.
 
     - `devices`: JAX devices, of which each has an equal share.
     - `chunks`: parts of a share, worked through one after the other.

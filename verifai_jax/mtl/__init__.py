@@ -61,11 +61,11 @@ __all__ = [
     "TimeColumnError", "Watch", "always", "anneal", "boolean", "dense_gradient",
     "dense_robustness", "dense_signal", "distinguish", "domain_monitor", "draw", "duration",
     "during", "eventually", "examples", "explain", "export_c", "export_fmu", "fall", "hard",
-    "historically", "judge", "latex", "lint", "mine", "mutants", "next_", "nnf", "normalize", "once", "online",
-    "parse", "phase", "predictive_monitor", "prev", "read", "read_requirements", "resample",
-    "rise", "robustness", "robustness_signal", "satisfied", "signal", "simplify", "since",
-    "smooth", "smoothing_error", "sometime_during", "templates", "until", "watch",
-    "write_requirements",
+    "historically", "judge", "latex", "lint", "mine", "mutants", "next_", "nnf", "normalize",
+    "once", "online", "parse", "phase", "predictive_monitor", "prev", "read",
+    "read_requirements", "resample", "rise", "robustness", "robustness_signal", "satisfied",
+    "signal", "simplify", "since", "smooth", "smoothing_error", "sometime_during",
+    "templates", "until", "watch", "write_requirements",
 ]  # fmt: skip
 
 
