@@ -167,7 +167,7 @@ class Engine:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was decided, once compiled, that a user may not expect."""
+        """Decisions that a user may not expect, once the program is compiled."""
         return self.program.notes
 
     @property

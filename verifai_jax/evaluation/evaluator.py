@@ -233,7 +233,7 @@ class Evaluator:
             np.asarray(points), np.arange(first, first + len(points)), temperature, simulate
         )
 
-    def part(self) -> Part | None:
+    def part(self) -> "Part | None":
         """Return what is kept of work that goes on where an earlier process was killed, if any."""
         work = None if self._keeps_traces else present()
         if work is not None and (self._kept is None or self._kept.of is not work):

@@ -4,15 +4,22 @@ work = present()                                    # an `Unfinished`; None if n
 """
 
 from contextvars import ContextVar
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
-if TYPE_CHECKING:
-    from verifai_jax.evaluation.unfinished import Unfinished
+from verifai_jax.problem.problem import Problem
 
-PRESENT: "ContextVar[Unfinished | None]" = ContextVar("unfinished", default=None)
+
+class KeptWork(Protocol):
+    """The part of an `evaluation.unfinished.Unfinished` that evaluators need; few processes import it."""
+
+    def part(self, problem: Problem, *mode: object) -> Any:
+        """Return the `Part` of the next evaluator."""
+
+
+PRESENT: ContextVar[KeptWork | None] = ContextVar("unfinished", default=None)
 """The work; set by `evaluation.unfinished.keeping`."""
 
 
-def present() -> "Unfinished | None":
+def present() -> KeptWork | None:
     """Return the work whose simulations are kept now, or None if there is none."""
     return PRESENT.get()
