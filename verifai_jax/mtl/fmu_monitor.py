@@ -180,7 +180,7 @@ def export_fmu(
     if path.suffix != ".fmu":
         raise ValueError(f"the name of an FMU ends in .fmu; got {path.name}")
     plan = streams(formulas, dt, semantics, every)
-    front = margin_code(plan.leaves, plan.top == 1, sizes or {})
+    front = margin_code(plan, sizes or {})
     inputs = [n if i is None else f"{n}[{i}]" for n, i in front.columns]
     outputs = [f"{key or 'robustness'}{kind}" for key in plan.formulas for kind in KINDS]
     twice = sorted({name for name in inputs + outputs if (inputs + outputs).count(name) > 1})
