@@ -1,4 +1,4 @@
-"""The GPU beside the CPU of the same machine: throughput, monitor, MJX, training and a sweep.
+"""The GPU and the CPU of one machine: throughput, monitor, MuJoCo, frames, training, a sweep.
 
     python benchmarks/gpu.py                            # ten minutes; writes its section
     python benchmarks/gpu.py --tiny --only cpu --print  # a look at the code, without a GPU
@@ -89,15 +89,68 @@ def monitor(tiny):
             yield f"`{text}`{name}, {batch:,} traces", "million samples/s", best(call, amount)
 
 
-def mjx(tiny):
-    """Measure MuJoCo in MJX: the pole on its cart and the hopper, with contacts."""
+def humanoid():
+    """Return MuJoCo's own humanoid, that stands for a second and falls; its feet touch."""
+    import mujoco
+
+    import verifai_jax as vj
+
+    model = Path(mujoco.__file__).parent / "mjx/test_data/humanoid/humanoid.xml"
+    system = vj.mujoco(
+        str(model),
+        duration=1.0,
+        control_period=0.02,
+        bind={"bend": "joint/knee_right/qpos", "gravity": "option/gravity[2]"},
+        signals={"height": "body/torso/xpos[2]"},
+    )
+    space = vj.FeatureSpace({"bend": vj.Box(-1.5, 0.0), "gravity": vj.Box(-10.5, -9.0)})
+    return vj.Problem("humanoid", space, system, "always (height >= 0.3)")
+
+
+def mujoco(tiny):
+    """Measure MuJoCo as it is used: MJX on an accelerator, native MuJoCo on a processor."""
+    import jax
+
     from specs import hopper, mujoco_cartpole
 
-    chosen = ((mujoco_cartpole.balance, "pole"), (hopper.upright, "hopper"))
-    for problem, name in chosen[:1] if tiny else chosen:
+    backend = "native" if jax.default_backend() == "cpu" else "mjx"
+    chosen = {"pole": mujoco_cartpole.balance}
+    if not tiny:
+        chosen |= {"hopper": hopper.upright, "humanoid": humanoid()}
+    for name, problem in chosen.items():
+        steps = problem.system.loop.periods * problem.system.loop.substeps
         for batch in (16,) if tiny else (1024, 8192):
-            found = simulations(problem.on_backend("mjx"), batch)
-            yield f"MJX {name}, batch {batch:,}", "simulations/s", found
+            speed, compiling = simulations(problem.on_backend(backend), batch)
+            yield f"MuJoCo {name}, batch {batch:,}", "physics steps/s", (speed * steps, compiling)
+
+
+def frames(tiny):
+    """Measure the images of a whole scene, and the detector that looks at them."""
+    import jax
+
+    from envs import cones
+    from envs.train_cones import SPACES
+
+    count = 64 if tiny else 16_384
+    points = jax.random.uniform(jax.random.key(0), (count, SPACES["wide"].dim))
+    network = cones.load_detector(cones.NETWORKS["wide"])
+    size = min(count, 8 if jax.default_backend() == "cpu" else 2048)
+
+    def image(u):
+        f = SPACES["wide"].unflatten(u)
+        pose = cones.Pose(-f["ahead"], f["offset"], f["heading"])
+        return cones.render(f, pose, f["present"] > 0, *network.shape)
+
+    def seen(u):
+        return network(image(u)).presence
+
+    for name, function in (("drawn", lambda u: image(u).mean()), ("drawn and looked at", seen)):
+        program = jax.jit(lambda u, function=function: jax.lax.map(function, u, batch_size=size))
+
+        def call(program=program):
+            jax.block_until_ready(program(points))
+
+        yield f"frames of 24 x 48 {name}", "frames/s", best(call, count)
 
 
 def training(tiny):
@@ -106,18 +159,18 @@ def training(tiny):
     from verifai_jax.rl import PPO
     from verifai_jax.rl.batched_training import BatchedTraining, Configuration
 
-    count, steps = (2, 1024) if tiny else (64, 32_768)
+    for count, steps in ((2, 1024),) if tiny else ((64, 32_768), (256, 32_768)):
 
-    def train():
-        runs = [
-            Configuration(CartPoleTask(), PPO(learning_rate=1e-4 * (1 + i)), steps, seed=i)
-            for i in range(count)
-        ]
-        batch = BatchedTraining(runs)
-        for number in batch.advance(dict.fromkeys(range(count), steps)):
-            batch.policy(number)
+        def train(count=count, steps=steps):
+            runs = [
+                Configuration(CartPoleTask(), PPO(learning_rate=1e-4 * (1 + i)), steps, seed=i)
+                for i in range(count)
+            ]
+            batch = BatchedTraining(runs)
+            for number in batch.advance(dict.fromkeys(range(count), steps)):
+                batch.policy(number)
 
-    yield f"PPO, {count} trainings", "environment steps/s", best(train, count * steps)
+        yield f"PPO, {count} trainings", "environment steps/s", best(train, count * steps)
 
 
 def sweep(tiny):
@@ -141,7 +194,8 @@ def sweep(tiny):
 PARTS = {
     "throughput": throughput,
     "monitor": monitor,
-    "mjx": mjx,
+    "mujoco": mujoco,
+    "frames": frames,
     "training": training,
     "sweep": sweep,
 }
@@ -170,7 +224,8 @@ def measure(parts, tiny):
 
 def side(platforms, parts, tiny):
     """Measure in a process of its own; return what it said of its device, and its figures."""
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    paths = [str(Path(__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     environment.pop("JAX_PLATFORMS", None)
     if platforms is not None:
         environment["JAX_PLATFORMS"] = platforms

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from verifai_jax import rl as rl
     from verifai_jax import search as search
     from verifai_jax.analysis import boundary as boundary
+    from verifai_jax.analysis import odd_of as odd_of
+    from verifai_jax.analysis import read_odd as read_odd
     from verifai_jax.augmentation import Augmentation as Augmentation
     from verifai_jax.augmentation import SupervisedTask as SupervisedTask
     from verifai_jax.augmentation import augment as augment

@@ -42,7 +42,7 @@ study = vj.Study(
 """
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_study_is_hardened(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "spec.py").write_text(textwrap.dedent(SPEC))

@@ -102,3 +102,34 @@ def test_a_formula_becomes_a_monitor_in_c(tmp_path):
         assert "--export-c goes with --dt SECONDS, and with no RECORDING" in result.output
     result = CliRunner().invoke(main, ["monitor", "x > 0"])
     assert "give a RECORDING to judge, or --export-c FILE.h" in result.output
+
+
+def test_a_gap_keeps_the_last_value_if_that_is_asked_for():
+    lines = ["time,dist,p[0],p[1]", "0,5,3,4", "0.5,,nan,0", "1,-1,1,"]
+    holds, said, read = follow("always (dist > -1 & norm(p) < 9)", lines, hold=True)
+    assert (holds, read) == (False, 4)
+    assert said == "whatever follows 1 s, it fails, with robustness at most 0"
+    assert follow("always (p[0] > 2 | dist < 5)", lines, hold=True)[2] == 4
+    with pytest.raises(CommandError, match=r"signal 'dist' is NaN at 0\.5 s"):
+        follow("always dist > -1", lines)
+    with pytest.raises(CommandError, match="signal 'dist' is NaN at 0 s"):
+        follow("always dist > -1", ["time,dist", "0,", "1,2"], hold=True)
+
+
+@pytest.mark.parametrize(
+    ("missing", "why"),
+    [
+        ("drop", "leaves instants out, and samples of a stream are evenly spaced"),
+        ("interpolate", "needs the value after a gap, which a stream has not had yet"),
+    ],
+)
+def test_a_treatment_of_gaps_that_no_stream_allows_says_why(missing, why):
+    command = ["monitor", "always dist > 1", "-", "--missing", missing]
+    result = CliRunner().invoke(main, command, input="time,dist\n0,5\n1,4\n")
+    assert result.exit_code == 2
+    assert f"--missing {missing} {why}: use --missing hold" in " ".join(result.output.split())
+    held = CliRunner().invoke(
+        main, [*command[:3], "--missing", "hold"], input="time,dist\n0,5\n1,\n"
+    )
+    assert held.exit_code == 0
+    assert "undecided at the end" in held.output

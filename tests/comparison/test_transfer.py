@@ -44,7 +44,7 @@ def compared(one, other, **options):
     )
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_planted_difference_is_found(tmp_path):
     found = compared(plant(name="without drag"), plant(drag=0.5, name="with drag"))
     assert found.differs

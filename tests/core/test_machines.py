@@ -15,8 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import verifai_jax as vj
-from verifai_jax.evaluation.engine import Engine, chunks_and_lanes
+from verifai_jax.core.precision import in_precision
+from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.evaluation.layout import chunks_and_lanes
 from verifai_jax.mtl import _robustness as lane_chunks
 from verifai_jax.mtl import parallel, sequential, windows
 from verifai_jax.rl import batched_training
@@ -128,7 +130,7 @@ def test_a_block_of_a_worker_has_the_lanes_of_one_machine_whatever_its_devices()
     for count in (1, len(jax.local_devices())):
         devices = jax.local_devices()[:count]
         engine = Engine(LINE, lanes * count, devices=devices, lanes=lanes)
-        assert (engine.lanes, engine.chunks) == (lanes, 1)
+        assert (engine.layout.lanes, engine.layout.chunks) == (lanes, 1)
         key = Evaluator(LINE, 700).key
         first = engine.evaluate(u[: lanes * count], key, 0).rho
         np.testing.assert_array_equal(first, whole[: lanes * count])
@@ -154,3 +156,14 @@ def test_the_section_on_accelerators_is_written_once_where_it_belongs():
     assert once.index("## First") < once.index(gpu.HEADING) < once.index(gpu.BEFORE)
     assert gpu.written(once, text) == once
     assert gpu.BEFORE in (ROOT / "benchmarks" / "RESULTS.md").read_text()
+
+
+def test_an_accelerator_multiplies_matrices_in_whole_precision(monkeypatch):
+    def product(a):
+        return a @ a
+
+    with in_precision("float32"):
+        assert "HIGHEST" not in str(jax.make_jaxpr(product)(np.eye(2)))
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    with in_precision("float32"):
+        assert "HIGHEST" in str(jax.make_jaxpr(product)(np.eye(2)))

@@ -167,7 +167,7 @@ def same(one, other):
 @pytest.mark.slow
 @pytest.mark.parametrize("search", ["portfolio", "gradient", "cross_entropy", "bayes"])
 def test_a_search_is_the_same_recalled(folder, monkeypatch, search):
-    from verifai_jax.search.proposals import compiled_search
+    from verifai_jax.search.search_program import compiled_search
 
     def rows():
         compiled_search.cache_clear()

@@ -316,7 +316,7 @@ def test_the_command(edges, tmp_path):
     assert (tmp_path / "run" / f"shrunk-{run.best.name}.png").exists()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("d", [2, 5, 10, 20])
 def test_half_spaces(d):
     a = np.random.default_rng(d).normal(size=d)

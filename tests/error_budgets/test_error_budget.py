@@ -234,7 +234,7 @@ new = vj.Problem("new", {"a": vj.Box(0.0, 2.0)}, SYSTEM, "always x > 0.4")
 """
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_commands_say_it_too(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "spec.py").write_text(SPEC)

@@ -293,7 +293,7 @@ def test_random_systems_keep_their_numbers_and_their_precision():
     # With its own key each row comes again.
     assert found.counts == {"confirmed": len(found)}
     assert found.checked.startswith("when simulated again and one rounding of the features away")
-    finer = confirm(run, int(run.best.name), simulator=noisy)
+    finer = confirm(run, int(run.best.name), engines=noisy)
     assert finer.verdict == "confirmed"
 
 
@@ -492,18 +492,23 @@ def test_another_simulator_has_to_agree(circles):
         duration=10.0,
     )
     row = int(circles.best.name)
-    agreed = confirm(circles, row, simulator=exact)
+    agreed = confirm(circles, row, engines=exact)
     assert agreed.verdict == "confirmed"
-    assert agreed.rho["simulator"] == pytest.approx(1.5 - circles.best["a"], abs=1e-2)
+    assert agreed.transferable
+    assert "The failure is transferable. Robustness" in str(agreed)
+    assert confirm(circles, row).transferable is None
+    assert agreed.rho["engine.the other engine"] == pytest.approx(1.5 - circles.best["a"], abs=1e-2)
     calm = replace(exact, initial=lambda f, key: {"x": 0.1 * f["a"], "v": 0.0 * f["a"]})
-    other = confirm(circles, row, simulator=replace(circles.problem, system=calm))
+    calmer = replace(circles.problem, system=calm)
+    other = confirm(circles, row, engines={"exact": exact, "calm": calmer})
     assert other.verdict == "fragile"
-    assert other.why == "it holds in the other simulator"
-    with pytest.raises(ValueError, match="no backends; simulator must be a system or a Problem"):
-        confirm(circles, row, simulator="native")
+    assert other.why == "it holds in calm"
+    assert other.transferable is False
+    with pytest.raises(ValueError, match="no backends; an engine must be a system or a Problem"):
+        confirm(circles, row, engines="native")
     stranger = vj.Problem("other", {"b": vj.Box(0.5, 2.0)}, exact, "always x <= 1")
-    with pytest.raises(UnknownNameError, match="unknown feature of the simulator 'b'"):
-        confirm(circles, row, simulator=stranger)
+    with pytest.raises(UnknownNameError, match="unknown feature of the engine 'b'"):
+        confirm(circles, row, engines=stranger)
 
 
 def test_errors_say_what_to_do(circles, tmp_path):
@@ -613,12 +618,16 @@ def test_mujoco_on_both_engines(backend):
     )
     other = "mjx" if backend == "native" else "native"
     row = int(run.best.name)
-    found = confirm(run, row, simulator=other)
-    assert found.verdict == "confirmed"
-    assert found.rho["simulator"] == pytest.approx(found.rho["as_run"], abs=1e-4)
+    found = confirm(run, row, engines="all")
+    assert found.transferable
+    assert found.rho[f"engine.{other}"] == pytest.approx(found.rho["as_run"], abs=1e-4)
     assert {"half_step", "quarter_step"} <= found.rho.keys()
     assert found.rho["half_step"] != found.rho["as_run"]
-    assert len(confirm(run)) == len(run.table.counterexamples)
+    every = confirm(run, engines=[other])
+    assert len(every) == len(run.table.counterexamples)
+    assert every.transferable is not None
+    assert every.transferable.any()
+    assert " transferable" in str(every)
 
 
 def test_the_page_says_what_comes_out():

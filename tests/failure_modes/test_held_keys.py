@@ -64,7 +64,7 @@ def test_a_black_box_with_a_seed_is_one_that_draws():
     assert all(mode.replay().violated for mode in found)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_with_chance_of_its_own_modes_say_how_often_a_point_fails_within_the_budget():
     rng, count = np.random.default_rng(0), [0]
 

@@ -107,7 +107,7 @@ def found():
     return vj.modes(planted(), budget=20_000, progress=False)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_planted_modes_have_their_probabilities(found):
     masses = norm.sf([3.5, 3.8, 4.0])
     assert len(found) == 3

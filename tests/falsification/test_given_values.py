@@ -50,7 +50,7 @@ def as_forms(rows):
     yield [{**row, "rho": 1.0, "status": "ok"} for row in rows]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("problem", [PROBLEM, BLACK_BOX], ids=["traced", "black box"])
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_every_form_is_simulated_as_it_is(problem, precision):

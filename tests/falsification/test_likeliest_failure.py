@@ -74,7 +74,7 @@ WORLDS = {
 }  # fmt: skip
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WORLDS)
 def test_it_is_that_of_dynamic_programming(name):
     world = WORLDS[name]
@@ -105,7 +105,7 @@ HALF = vj.Problem(
 )
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_it_is_the_nearest_point_of_a_half_space():
     run = vj.falsify(HALF, objective="likelihood", budget=1024, progress=False)
     small = vj.shrink(run, by="likelihood", budget=800, progress=False)

@@ -9,6 +9,7 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax import faults
+from verifai_jax.core.fingerprint import programs_in
 from verifai_jax.core.trace import Status
 from verifai_jax.faults.kinds import KINDS as KINDS_OF_FAULTS
 
@@ -91,6 +92,27 @@ def same_bits(one, other):
         np.asarray(one[name]).tobytes() == np.asarray(other[name]).tobytes()
         for name in other.signals
     )
+
+
+def work(program):
+    """Count the operations of a program, without those of loops that may have no pass."""
+    return sum(
+        1 + (0 if step.primitive.name == "while" else sum(map(work, programs_in(step))))
+        for step in program.eqns
+    )
+
+
+@pytest.mark.thorough
+def test_a_fault_that_is_off_in_a_whole_batch_is_a_loop_without_a_pass(all_of_them):
+    def traced(problem, features):
+        rows = jax.tree.map(lambda leaf: jnp.stack([jnp.asarray(leaf)] * 2), features)
+        keys = jax.random.split(KEY)
+        return work(jax.make_jaxpr(jax.vmap(problem.system))(rows, keys).jaxpr)
+
+    off = all_of_them.space.coerce(all_of_them.nominal)
+    alone = traced(problem(), {"push": off["push"]})
+    # Without its arithmetic: the entries that pass, whether it acts, and the draw of its seed.
+    assert traced(all_of_them, off) - alone < 32 * len(KINDS)
 
 
 def severest(fault):
@@ -218,7 +240,7 @@ def test_faults_of_one_channel_apply_in_their_order():
     assert other.space == problem().space  # Nothing of it varies.
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_line_between_two_samples(all_of_them):
     """Onset and duration move in whole samples: only over a few of them is there a slope."""
     weight = jnp.linspace(1, 2, STEPS + 1)

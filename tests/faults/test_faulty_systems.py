@@ -182,7 +182,7 @@ REMOTE = [
 ]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_remote_simulators_get_the_numbers_by_message():
     with vj.remote(timeout=20.0, patience=20.0) as system:
         problem = vj.Problem("far", {"x0": vj.Box(0, 1)}, system, "always x >= -2", nominal=None)

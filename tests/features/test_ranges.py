@@ -21,7 +21,7 @@ SPACE = vj.FeatureSpace(
 )  # fmt: skip
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_ranges_contain_the_values_and_are_not_wide(precision):
     ranges, random = FeatureRanges(SPACE, precision), np.random.default_rng(0)

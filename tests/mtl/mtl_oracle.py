@@ -7,7 +7,15 @@ import operator
 from hypothesis import strategies as st
 
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal, signal
+from verifai_jax.mtl.expression import (
+    Arithmetic,
+    Component,
+    Duration,
+    Number,
+    Signal,
+    duration,
+    signal,
+)
 
 DT = 0.5
 COMPARE = {
@@ -42,6 +50,10 @@ class Oracle:
         match e:
             case Number(value):
                 return value
+            case Duration(_, counted, window):
+                now = min(i, self.length - 1)
+                ago = max(0, now - round(window / DT) + 1)
+                return DT * sum(self.holds(counted, k) for k in range(ago, now + 1))
             case Signal(name):
                 return self.signals[name][min(i, self.length - 1)]
             case Component(Signal(name), k):
@@ -216,11 +228,25 @@ def _grown(inner):
     )
 
 
-def formulas(depth=4):
-    grown = _leaves
+@st.composite
+def _counted(draw):
+    """A comparison of what is counted, of formulas that look back."""
+    x, y = (draw(_signals) > draw(_quarters) for _ in range(2))
+    past = st.sampled_from([
+        x, x & ~y, ast.Once(x, draw(intervals())), ~ast.Since(x, y, draw(intervals())),
+        ast.Prev(x, True), ast.Historically(duration(y, 2 * DT) > 0.5, draw(intervals())),
+    ])  # fmt: skip
+    seconds = duration(draw(past), draw(st.integers(1, 5)) * DT)
+    other = draw(st.one_of(_quarters.map(Number), _expressions))
+    return ast.Predicate(draw(st.sampled_from(["<", "<=", ">", "=="])), seconds, other)
+
+
+def formulas(depth=4, counted=False):
+    leaves = st.one_of(_leaves, _counted()) if counted else _leaves
+    grown = leaves
     for _ in range(depth):
-        grown = st.one_of(_leaves, _grown(grown))
-    return _grown(grown) if depth else _leaves
+        grown = st.one_of(leaves, _grown(grown))
+    return _grown(grown) if depth else leaves
 
 
 def numbers(size):

@@ -47,7 +47,7 @@ def test_hard_and_boolean_equal_the_definitions(formula, recording, end):
     np.testing.assert_array_equal(verdicts, [oracle.holds(formula, i) for i in range(trace.length)])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @given(formulas(), recordings(), st.sampled_from([1e-3, 0.1, 3.0]))
 @UNCOMPILED
 def test_smooth_stays_within_its_certificate(formula, recording, tau):

@@ -50,7 +50,7 @@ def check_guarantees(sets, further):
     return [np.mean(each) for each in (false, above, strange, caught)]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_alarms_are_false_as_seldom_as_they_say():
     false, above, strange, caught = check_guarantees(12, 40)
     assert max(false, above, strange) < 0.16
@@ -73,6 +73,8 @@ def test_a_run_is_followed_sample_by_sample():
         np.testing.assert_allclose(forecast, expected, rtol=1e-9)
     with pytest.raises(UnknownNameError, match="the sample has no signal 'gap'"):
         monitor.start()({"speed": 1.0})
+    alone = mtl.predictive_monitor("always gap > 0", traces, 0.5, signals=["gap"]).start()
+    assert alone({"gap": 3.0}).low < 3.0
 
 
 def test_an_input_far_from_all_that_was_tested_raises_an_alarm():

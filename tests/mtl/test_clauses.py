@@ -12,7 +12,7 @@ from verifai_jax.core.clauses import CLAUSES as TOLD
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import parse, robustness, smooth
 from verifai_jax.mtl.clauses import ABSENT, GOALS, goals_of
-from verifai_jax.search.gradient import NOTHING
+from verifai_jax.search.clause_values import NOTHING
 
 FORMULAS = (
     "x < 1",

@@ -176,3 +176,13 @@ def test_what_cannot_be_shown_is_refused():
         mtl.examples("true")
     with pytest.raises(ValueError, match="give a longer period dt"):
         mtl.distinguish("always[0, 3600] x > 1", "always[0, 3600] eventually[0, 0.01] x > 1")
+
+
+def test_limits_of_what_is_counted_are_told_apart():
+    one, other = (f"always duration(x > 3, 10) <= {limit}" for limit in (3, 4))
+    found = mtl.distinguish(one, other)
+    assert found.trace is not None
+    assert not mtl.satisfied(one, found.trace)
+    assert mtl.satisfied(other, found.trace)
+    shown = mtl.examples("always duration(x > 3, 3600) <= 10.1")  # on no clock of tenths
+    assert {"satisfying", "breaking"} <= set(shown.traces)

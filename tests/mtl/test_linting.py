@@ -206,6 +206,25 @@ def test_units_come_from_requirements_recordings_and_names(tmp_path):
     assert "compares m/s with km/h" in str(mtl.lint("always speed_mps < limit_kmh"))
 
 
+def test_a_number_in_a_product_may_have_a_unit(drives):
+    for text in (
+        "always dist > 0.1 * speed",
+        "always dist - speed / 10 > 0",
+        "always (2 * speed < 60 & dist > 1)",
+    ):
+        assert "units" not in {each.kind for each in mtl.lint(text, drives, units=UNITS)}, text
+    said = [
+        each
+        for each in mtl.lint("always dist > speed", drives, units=UNITS)
+        if each.kind == "units"
+    ]
+    assert [each.sentence for each in said] == ["dist > speed compares m with m/s"]
+
+
+def test_few_seconds_that_are_counted_are_near_their_limit(drives):
+    assert not mtl.lint("always duration(speed > 28, 10) <= 3", drives, units=UNITS)
+
+
 def test_a_formula_alone_is_looked_at_without_recordings():
     assert [f.kind for f in mtl.lint("always (x > 5 & x < 3)")] == ["always false"]
     assert not mtl.lint("always (x > 5 -> eventually[0, 2] y < 3)")

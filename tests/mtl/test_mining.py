@@ -18,7 +18,7 @@ def trace(dt=0.1, **signals):
     return Trace({name: np.array(values, float) for name, values in signals.items()}, dt=dt)
 
 
-@given(formulas(), recordings(), st.sampled_from(["hold", "truncate"]))
+@given(formulas(counted=True), recordings(), st.sampled_from(["hold", "truncate"]))
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 def test_values_in_numpy_are_those_of_the_definitions(formula, recording, end):
     signals = {name: np.asarray(v, float) for name, v in recording.items()}
@@ -73,6 +73,18 @@ def test_all_recordings_or_a_share_of_them():
     assert (mined.broken.failures, mined.broken.simulations) == (2, 20)
     assert "2.5, the greatest that is satisfied" in mined.summary()
     assert "18 of 20 recordings" in str(mined)
+
+
+@pytest.mark.parametrize("text", ["always x > ?d", "always (x > 2 -> eventually[0, ?T] x < ?d)"])
+def test_what_many_recordings_satisfy_is_what_each_of_them_does(text):
+    rng = np.random.default_rng(3)
+    drives = [trace(x=rng.uniform(0, 5, 8).round(2)) for _ in range(12)]
+    together = mtl.mine(text, drives)
+    for corner in together.front:
+        numbers = read_parametric(together.text).formula(corner)
+        assert all(mtl.satisfied(numbers, each) for each in drives)
+    again = mtl.mine(text, drives[::-1])
+    assert again.front == together.front
 
 
 def dominating(pairs, signs):
@@ -164,3 +176,12 @@ def test_a_front_is_drawn(tmp_path):
     assert (tmp_path / "front.png").stat().st_size > 1000
     with pytest.raises(ValueError, match="no front to draw"):
         mtl.mine("always x > ?d", trace(x=[5.5, 6.1])).plot()
+
+
+@given(formulas(counted=True), recordings(), st.sampled_from(["hold", "truncate"]), st.booleans())
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+def test_the_first_sample_alone_has_the_same_value(formula, recording, end, boolean):
+    signals = {name: np.asarray(v, float) for name, v in recording.items()}
+    alone, every = (HostValues.of(Trace(signals, dt=DT), end) for _ in range(2))
+    expected = (every.truth if boolean else every)(formula)[0]
+    np.testing.assert_array_equal(alone.first(formula, boolean), expected)

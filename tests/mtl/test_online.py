@@ -22,7 +22,7 @@ def bounded(formula):
         return None
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @given(formulas(3), recordings(sizes=(1, 5, 7)))
 @UNCOMPILED
 def test_every_prefix_equals_the_offline_value_and_lies_in_the_interval(formula, recording):

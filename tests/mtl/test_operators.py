@@ -103,7 +103,7 @@ def test_an_operator_made_of_others_is_written_and_looked_at_as_any(weak_since):
     assert goals_of([weak_since]) == goals_of([expand(weak_since)])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_an_operator_made_of_others_has_every_semantics(weak_since):
     plain = expand(weak_since)
     assert plain != weak_since

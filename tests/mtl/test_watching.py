@@ -81,20 +81,24 @@ def compiler(monkeypatch, tmp_path_factory):
     monkeypatch.setenv("VERIFAI_JAX_CACHE", str(tmp_path_factory.mktemp("cache")))
 
 
-@given(formulas(3), recordings(sizes=(1, 5, 7)))
+@given(formulas(3, counted=True), recordings(sizes=(1, 5, 7)))
 @QUICK
 def test_every_prefix_has_its_offline_value(formula, recording):
     check_prefixes({"f": formula}, recording)
 
 
-@given(formulas(3), recordings(sizes=(1, 5, 7)), st.booleans())
+@given(formulas(3, counted=True), recordings(sizes=(1, 5, 7)), st.booleans())
 @QUICK
 def test_every_instant_has_its_offline_value(formula, recording, boolean):
     check_every_instant({"f": formula}, recording, boolean)
 
 
 @pytest.mark.thorough
-@given(st.lists(formulas(3), min_size=9, max_size=12), recordings(sizes=(9,)), st.booleans())
+@given(
+    st.lists(formulas(3, counted=True), min_size=9, max_size=12),
+    recordings(sizes=(9,)),
+    st.booleans(),
+)
 @settings(QUICK, max_examples=3)
 def test_compiled_monitors_have_the_same_values(compiler, some, recording, boolean):
     named = dict(zip(NAMES, some, strict=False))
@@ -201,7 +205,7 @@ int main(void) {
 
 
 @pytest.mark.thorough
-@given(st.lists(formulas(3), min_size=9, max_size=12), st.integers(0, 2**31))
+@given(st.lists(formulas(3, counted=True), min_size=9, max_size=12), st.integers(0, 2**31))
 @settings(QUICK, max_examples=2)
 def test_the_exported_header_is_sound_c_and_has_the_same_values(tmp_path_factory, some, seed):
     tool = next(filter(None, map(shutil.which, ("gcc", "clang"))), None)

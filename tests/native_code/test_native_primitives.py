@@ -11,6 +11,7 @@ from jax import lax
 from verifai_jax.native_code.library import library_name, load
 from verifai_jax.native_code.source import translate
 from verifai_jax.native_code.values import Untranslatable
+from verifai_jax.systems.any_lane import changed_if_needed
 
 pytestmark = pytest.mark.thorough
 
@@ -258,6 +259,7 @@ def test_loops_and_branches():
         )
         halved = lax.while_loop(lambda v: v > 1, lambda v: v * 0.5, jnp.clip(row[3], 0, 100))
         counted = lax.while_loop(lambda v: v[0] < 5, lambda v: (v[0] + 1, v[1] + row[0]), (0, 0.0))
+        once = changed_if_needed(lambda v, by: (v[0] * by, v[1]), row[0] > 0, (row[1], row), row[2])
         by_lane = lax.cond(row[0] > 0, lambda v: v * 2, lambda v: v - 1, row[1])
         chosen = lax.switch(
             jnp.clip(row[2], -1, 4).astype(int), [lambda v=v: row * v for v in (1.0, 2.0, 3.0)]
@@ -276,6 +278,7 @@ def test_loops_and_branches():
             by_lane,
             chosen,
             swapped,
+            *jax.tree.map(lambda new, old: jnp.where(row[0] > 0, new, old), once, (row[1], row)),
         )
 
     rows = np.clip(np.nan_to_num(rows_of(4)), -50, 50)

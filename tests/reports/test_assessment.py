@@ -21,7 +21,7 @@ slow = vj.Problem("slow", {"a": vj.Box(0.0, 1.0)}, vj.blackbox(simulate),
 """
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_sections_of_an_assessment(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "spec.py").write_text(SPEC)

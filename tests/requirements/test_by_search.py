@@ -20,6 +20,7 @@ def problem():
     return vj.Problem("falls", space, falling, "always x > 0")
 
 
+@pytest.mark.slow
 def test_the_tightest_bound_that_no_search_breaks(problem):
     mined = mtl.mine("always x > ?d", problem, budget=1500)
     assert mined.values["d"] == pytest.approx(2.0, abs=0.02)

@@ -11,7 +11,7 @@ from scipy.optimize import linprog
 from verifai_jax.core.cube import Cube
 from verifai_jax.mtl.clauses import ABSENT
 from verifai_jax.search import Gradient, Observations, Portfolio
-from verifai_jax.search.gradient import HALVINGS, minimax_direction
+from verifai_jax.search.linear_steps import HALVINGS, minimax_direction
 
 D, K = 5, 4
 FREE = np.ones(D, bool)
@@ -102,7 +102,7 @@ def ridge(u):
     return jnp.array([one, two, ABSENT, ABSENT])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_maximum_of_clauses_does_not_stall_a_descent():
     cube = Cube((0,) * D)
     u = jax.random.uniform(jax.random.key(0), (200_000, D))

@@ -61,7 +61,8 @@ def play(search):
 def histories():
     """Those of the portfolio, and of one whose descents never begin."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(interior, "BEGINS", np.inf)
+        patch.setattr(descent, "BEGINS", np.inf)
+        patch.setattr(descent, "EARLY", np.inf)
         without = play(Portfolio())
     return play(Portfolio()), without
 
@@ -69,7 +70,7 @@ def histories():
 @pytest.mark.proves
 def test_what_comes_early_is_what_came_without_them(histories):
     (u, _, cost), (same, _, _) = histories
-    before = cost < descent.BEGINS
+    before = cost < descent.EARLY
     assert before.sum() > 100 * SEEDS
     np.testing.assert_array_equal(u[before], same[before])
     assert all(np.any(u[i] != same[i]) for i in range(SEEDS))
@@ -81,7 +82,7 @@ def test_failures_inside_the_space_are_found(histories):
     assert found >= without + 2
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_most_descents_are_given_up_early():
     search, cube = Descent(), Cube((0,) * D)
     ask, tell = jax.jit(search.ask, static_argnums=(1, 2)), jax.jit(search.tell, static_argnums=1)
@@ -101,7 +102,10 @@ def test_most_descents_are_given_up_early():
 def shares(**changes):
     zero = jnp.zeros(())
     state = descent.begin(jax.random.key(0), Cube((0, 0)), 1)
-    state = state._replace(idle=zero + 200, spent=zero + 200, own=zero + 2, theirs=zero + 1)
+    late = zero + descent.BEGINS
+    state = state._replace(
+        cost=late, idle=zero + 200, spent=zero + 200, own=zero + 2, theirs=zero + 1
+    )
     return float(descent._share(state._replace(**changes)))
 
 
@@ -114,5 +118,10 @@ def test_shares_follow_the_evidence():
     assert shares(own=jnp.array(20.0), spent=jnp.array(0.0)) == pytest.approx(most)
     assert shares(idle=jnp.array(0.0)) == pytest.approx(least)
     assert shares(theirs=jnp.array(0.0)) == 0.0
+    # Early on they go on while they get somewhere, for longer where they have.
+    early = {"cost": jnp.array(descent.EARLY)}
+    for since, spent, share in ((0.0, 0.0, most), (24.0, 24.0, 0.0), (60.0, 100.0, most)):
+        given = {"since": jnp.array(since), "spent": jnp.array(spent)}
+        assert shares(**early, **given) == pytest.approx(share)
     dead = descent.begin(jax.random.key(0), Cube((0, 0)), 1).descent._replace(useless=jnp.int32(2))
     assert shares(descent=dead) == pytest.approx(least)

@@ -56,9 +56,11 @@ def test_rounds_of_many_points_begin_without_descents():
 
 def test_descents_into_the_interior_come_last():
     state = begin(4)
-    waited = state.interior._replace(cost=jnp.float32(descent.BEGINS))
+    waited = state.interior._replace(cost=jnp.float32(descent.EARLY))
     assert Portfolio().stage(state._replace(interior=waited), CUBE, 4) == Portfolio()
-    # Where the others have failures they have no turn.
+    # Where they get nowhere they wait, and so they do where the others have failures.
+    spent = waited._replace(since=jnp.float32(descent.TRIAL), spent=jnp.float32(descent.TRIAL))
+    assert Portfolio().stage(state._replace(interior=spent), CUBE, 4) == DESCENDS
     failing = waited._replace(theirs=jnp.float32(0))
     assert Portfolio().stage(state._replace(interior=failing), CUBE, 4) == DESCENDS
     # But what they have earned they spend.
@@ -81,10 +83,10 @@ def test_a_search_for_diverse_failures_has_the_stages_of_the_one_inside():
     assert search.stage(state._replace(inner=inner), CUBE, 4) is search
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_stage_proposes_what_the_whole_proposes():
-    points, states = zip(*play(Portfolio(), begin(4), 4, 60), strict=True)
-    same, others = zip(*play(DESCENDS, begin(4), 4, 60), strict=True)
+    points, states = zip(*play(Portfolio(), begin(4), 4, 40), strict=True)
+    same, others = zip(*play(DESCENDS, begin(4), 4, 40), strict=True)
     np.testing.assert_array_equal(points, same)
     whole, stage = states[-1], others[-1]
     # And what decides about the next stage is counted alike.

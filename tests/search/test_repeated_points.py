@@ -77,7 +77,7 @@ def test_memory_is_bounded():
     assert len(repetition.codes) == MEMORY
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("search", ["portfolio", "gradient"])
 def test_seeds_differ_after_the_first_corner_and_no_point_comes_twice(search):
     for dim, batch in ((1, 4), (3, 1)):
@@ -91,7 +91,7 @@ def test_seeds_differ_after_the_first_corner_and_no_point_comes_twice(search):
         assert len({tuple(each[:4].ravel()) for each in points}) == 3
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_verifais_test_of_bayesian_optimization_by_the_default_search():
     """tests/test_bayesianOptimization.py: in 9 of 10 runs of 20 simulations the least is found."""
     found = 0

@@ -37,7 +37,7 @@ def test_no_failure_and_nothing_but_failures_reach_the_ends():
     assert stratified_rate((20, 20), (5, 5), share=0.2).high == 1
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_exact_by_enumeration():
     # Of all outcomes of 8 trials, those whose interval misses the rate have 5 % at most.
     from scipy.stats import binom

@@ -292,7 +292,7 @@ def shaken_problem():
     )
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_least_failure_probability_is_found_and_checked(shaken_problem):
     found = synthesize(shaken_problem, ["gain"], 4000, aim="probability", held_out=1000)
     assert found.parameters["gain"] == pytest.approx(0.3, abs=0.15)
@@ -305,7 +305,7 @@ def test_the_least_failure_probability_is_found_and_checked(shaken_problem):
     assert not found.holds
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_repair_may_aim_at_it_too(shaken_problem):
     mended = repair(shaken_problem, ["gain"], 4000, aim="probability", held_out=1000)
     assert mended.parameters["gain"] == pytest.approx(0.3, abs=0.15)

@@ -11,6 +11,8 @@ from verifai_jax.analysis.clustering.clusters import Clusters, clusters
 from verifai_jax.analysis.data.columns import Column
 from verifai_jax.analysis.data.samples import Samples
 from verifai_jax.analysis.neighbours import Neighbours, k_closest, nearest, random_rows
+from verifai_jax.analysis.odd_coverage import OddCoverage
+from verifai_jax.analysis.operational_domain import OperationalDomain, odd_of, read_odd
 from verifai_jax.analysis.overview import Analysis, analyze
 from verifai_jax.analysis.sensitivity.gradients import gradient_sensitivity
 from verifai_jax.analysis.sensitivity.morris import morris
@@ -19,10 +21,11 @@ from verifai_jax.analysis.sensitivity.sobol import sobol_indices
 
 __all__ = [
     "Analysis", "Boundary", "Clusters", "Column", "Components", "Coverage", "Diverse",
-    "FrequentPatterns", "Importance", "Neighbours", "Rule", "Rules", "Samples", "Sensitivity",
+    "FrequentPatterns", "Importance", "Neighbours", "OddCoverage", "OperationalDomain", "Rule",
+    "Rules", "Samples", "Sensitivity",
     "analyze", "boundary", "clusters", "coverage", "diverse", "frequent_patterns",
-    "gradient_sensitivity", "importance", "k_closest", "morris", "nearest", "pca", "random_rows",
-    "rules", "sobol_indices",
+    "gradient_sensitivity", "importance", "k_closest", "morris", "nearest", "odd_of", "pca",
+    "random_rows", "read_odd", "rules", "sobol_indices",
 ]  # fmt: skip
 
 

@@ -93,7 +93,7 @@ def structure_of(policy: Any) -> str:
 
 
 def digest(policy: Any, number: int = 0) -> str:
-    """Hash a policy's structure and numbers; of its `number` where it has no numbers."""
+    """Hash a policy's structure and numbers, or its index if it has no numbers."""
     if not is_numeric(policy):
         return f"policy-{number}"
     policy = jax.tree.map(_on_host, policy)

@@ -222,8 +222,10 @@ class _Program:
                 keys = jax.vmap(partial(simulation_key, key))(numbers)
                 engine = Engine(problem_with(self.problem_of, policy), self.lanes)
                 if mode == "holds":
-                    return (jax.vmap(engine.row_holds)(u[i], keys),)
-                rows = jax.vmap(engine.row, in_axes=(0, 0, None))(u[i], keys, jnp.float32(1.0))
+                    return (jax.vmap(engine.program.row_holds)(u[i], keys),)
+                rows = jax.vmap(engine.program.row, in_axes=(0, 0, None))(
+                    u[i], keys, jnp.float32(1.0)
+                )
                 return rows.rho, rows.status
 
             if not _one_by_one(self.devices):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import FOLDER, PROBLEM, RUN, load_judged_run
+from verifai_jax.cli.arguments import FOLDER, ODD, PROBLEM, RUN, load_judged_run
 from verifai_jax.cli.json_output import command, give_result
 
 
@@ -18,7 +18,23 @@ from verifai_jax.cli.json_output import command, give_result
     metavar="POINTS",
     help="Learn where the boundary runs, and say so many points to simulate next.",
 )
-def analyze(folder: Path, target: str | None, into: Path | None, boundary: int | None) -> None:
+@ODD
+@click.option(
+    "--next",
+    "count",
+    type=click.IntRange(1),
+    default=10,
+    show_default=True,
+    help="Points of --odd to simulate next.",
+)
+def analyze(
+    folder: Path,
+    target: str | None,
+    into: Path | None,
+    boundary: int | None,
+    odd: Path | None,
+    count: int,
+) -> None:
     """Report rules, importance, kinds of failures and coverage of the run in RUN."""
     from verifai_jax.core.text import printable
 
@@ -35,4 +51,12 @@ def analyze(folder: Path, target: str | None, into: Path | None, boundary: int |
         points = found.next_points(boundary)
         click.echo(printable(points.to_string(index=False)))
         give_result(boundary=found.calibration, brier=found.brier, next_points=points)
+    if odd is not None:
+        from verifai_jax.analysis import read_odd
+
+        covered = read_odd(odd).coverage(run)
+        click.echo(printable(str(covered)))
+        points = covered.next_points(count)
+        click.echo(printable(points.to_string(index=False)) if len(points) else "  all is covered")
+        give_result(attributes=covered.table, uncovered=points)
     give_result(text=str(analysis), report=path)

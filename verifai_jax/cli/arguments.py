@@ -147,6 +147,14 @@ ERRORS = click.option(
 )
 """Simulations by which the parts of an error are measured."""
 
+ODD = click.option(
+    "--odd",
+    type=click.Path(path_type=Path),
+    metavar="YAML",
+    help="The operational design domain, a file of OpenODD: say what is covered of it.",
+)
+"""The file of a domain."""
+
 EVEN_IF_CHANGED = click.option(
     "--even-if-changed",
     is_flag=True,

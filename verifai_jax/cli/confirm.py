@@ -14,14 +14,20 @@ from verifai_jax.cli.json_output import as_plain, command, give_result
 @RUN
 @ROW
 @PROBLEM
-@click.option("--simulator", help="Another backend of the system that has to agree.")
+@click.option(
+    "--engine",
+    "engines",
+    multiple=True,
+    metavar="NAME",
+    help="Another backend of the system that has to agree, or `all`.",
+)
 @EVEN_IF_CHANGED
 @fail_on(unconfirmed="if any is not confirmed", counterexample="if any is confirmed")
 def confirm(
     folder: Path,
     row: int | None,
     target: str | None,
-    simulator: str | None,
+    engines: tuple[str, ...],
     even_if_changed: bool,
     fail_on: Gate | None,
 ) -> None:
@@ -30,13 +36,16 @@ def confirm(
     from verifai_jax.core.text import printable
 
     run = load_judged_run(folder, target)
-    result = counterexamples.confirm(run, row, simulator=simulator)
+    result = counterexamples.confirm(run, row, engines=engines or None)
     click.echo(printable(str(result)))
     if isinstance(result, counterexamples.Confirmation):
         confirmed, examined = int(result.confirmed), 1
     else:
         confirmed, examined = len(result.confirmed), len(result)
-    give_result(confirmed=confirmed, examined=examined, **as_plain(result))
+    transferable = None if result.transferable is None else confirmed
+    give_result(
+        confirmed=confirmed, examined=examined, transferable=transferable, **as_plain(result)
+    )
     if isinstance(result, counterexamples.Confirmations):
         give_result(counts=result.counts, rows=result.table)
     check_gate(fail_on, {"unconfirmed": confirmed < examined, "counterexample": confirmed > 0})

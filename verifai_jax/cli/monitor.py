@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     "header",
     type=click.Path(path_type=Path),
     metavar="FILE.h",
-    help="Write FORMULA as a monitor in C instead, for samples --dt seconds apart.",
+    help="Write FORMULA as a monitor in C (or FILE.fmu) instead, for samples --dt seconds apart.",
 )
 @click.option("--explain", is_flag=True, help="Say which predicate decides, and when.")
 @PLOT
@@ -87,7 +87,8 @@ def monitor(
     With - as RECORDING, lines of CSV are read from the standard input as they come, until the
     verdict is certain whatever follows: tail -f log.csv | verifai-jax monitor FORMULA -
 
-    With --export-c FILE.h nothing is judged: FORMULA becomes a monitor in C.
+    With --export-c FILE.h nothing is judged: FORMULA becomes a monitor in C, and with FILE.fmu one
+    as an FMU.
     """
     import jax
 
@@ -101,9 +102,12 @@ def monitor(
         if recording or dt is None:
             raise click.UsageError("--export-c goes with --dt SECONDS, and with no RECORDING")
         name = re.sub(r"\W", "_", header.stem)
-        text = mtl.export_c(mtl.parse(formula, numbers, named), dt, name)
-        with replacing(header) as partial:
-            partial.write_text(text, encoding="utf-8")
+        parsed = mtl.parse(formula, numbers, named)
+        if header.suffix == ".fmu":
+            mtl.export_fmu(parsed, dt, header)
+        else:
+            with replacing(header) as partial:
+                partial.write_text(mtl.export_c(parsed, dt, name), encoding="utf-8")
         click.echo(f"monitor {header}")
         give_result(formula=formula, header=str(header))
         return
@@ -121,13 +125,19 @@ def monitor(
     (file,) = recording
     parsed = mtl.parse(formula, numbers, named)
     if str(file) == "-":
-        whole = (plot, compat, period, missing)
+        whole = (plot, compat, period)
         if explain or end != "hold" or any(option is not None for option in whole):
             raise click.UsageError(
-                "a stream goes with --dt, --time, --const, --define and --fail-on; other options "
-                "need the whole recording"
+                "a stream goes with --dt, --time, --missing hold, --const, --define and --fail-on; "
+                "other options need the whole recording"
             )
-        holds = monitor_stream(parsed, sys.stdin, time, dt)
+        if missing in ("drop", "interpolate"):
+            why = {
+                "drop": "leaves instants out, and samples of a stream are evenly spaced",
+                "interpolate": "needs the value after a gap, which a stream has not had yet",
+            }[missing]
+            raise click.UsageError(f"--missing {missing} {why}: use --missing hold")
+        holds = monitor_stream(parsed, sys.stdin, time, dt, hold=missing == "hold")
         give_result(formula=str(parsed), holds=holds)
         check_gate(fail_on, {"violation": not holds, "incomplete": not holds})
         return

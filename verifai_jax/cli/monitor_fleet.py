@@ -94,5 +94,5 @@ def load_requirements(
 
 
 def _is_file(formula: str) -> bool:
-    """Return whether a word names a file of requirements, also one of a form that is refused."""
+    """Return whether an argument names a file of requirements, whether or not it can be read."""
     return Path(formula).suffix.lower() in (".toml", ".csv", ".yaml", ".yml", ".reqif")

@@ -31,8 +31,9 @@ class Sample(NamedTuple):
 
 
 def monitor_stream(
-    formula: "Formula", lines: Iterable[str], time: str, dt: float | None, show: Any = click.echo
-) -> bool:
+    formula: "Formula", lines: Iterable[str], time: str, dt: float | None, show: Any = click.echo,
+    hold: bool = False,
+) -> bool:  # fmt: skip
     """Monitor samples until the verdict is certain whatever follows, or until they end.
 
     **Arguments:**
@@ -41,6 +42,7 @@ def monitor_stream(
     - `time`: the column of sample times in seconds, or of dates (ISO 8601).
     - `dt`: the sampling period in seconds, instead of a column of times.
     - `show`: what prints a line.
+    - `hold`: whether a gap keeps the last value of its signal.
 
     **Returns:** whether the formula holds; with the last sample held, if the samples have ended.
 
@@ -57,7 +59,7 @@ def monitor_stream(
         mtl.watch(formula, period, semantics=semantics, sizes=vectors)
         for semantics in (mtl.hard, mtl.boolean)
     )
-    count, begin = 0, None
+    count, begin, last = 0, None, dict[str, Any]()
     for count, sample in enumerate(samples, 1):
         begin = sample.time if begin is None else begin
         due = (count - 1) * period + (begin or 0.0)
@@ -69,6 +71,9 @@ def monitor_stream(
                 "spaced; if its times are rounded, give the period, --dt SECONDS; otherwise "
                 "record it, and use --resample"
             )
+        if hold:
+            last = {name: _held(last.get(name), value) for name, value in sample.signals.items()}
+            sample = sample._replace(signals=last)
         _refuse_nan(sample, now)
         robustness.step(sample.signals)
         truth.step(sample.signals)
@@ -190,6 +195,13 @@ def _number(cells: dict[str, str], line: int, separator: str, name: str) -> floa
         raise ValueError(
             f"line {line} of {SOURCE} has {text!r} in column {name!r}, which is no number"
         ) from None
+
+
+def _held(last: Any, value: Any) -> Any:
+    """Return a number, or those of a vector, with the last ones where there are gaps."""
+    if isinstance(value, list):
+        return list(map(_held, last or value, value))
+    return last if math.isnan(value) and last is not None else value
 
 
 def _refuse_nan(sample: Sample, now: float) -> None:

@@ -33,6 +33,7 @@ from verifai_jax.cli.json_output import command, give_result
     metavar="SIMULATIONS",
     help="Add all ways of failing of a run and their probabilities, by so many simulations.",
 )
+@arguments.ODD
 @click.option(
     "--assessment",
     is_flag=True,
@@ -50,6 +51,7 @@ def report(
     traces: int | None,
     studies: bool | None,
     modes: int | None,
+    odd: Path | None,
     assessment: bool,
     without_problem: bool,
 ) -> None:
@@ -74,6 +76,8 @@ def report(
         result = (
             arguments.read_run(folder) if without_problem else arguments.load_run(folder, target)
         )
+    if odd is not None:
+        from verifai_jax.analysis import read_odd
     path = write_report(
         result,
         output,
@@ -82,6 +86,7 @@ def report(
         traces=traces,
         studies=studies,
         modes=modes,
+        odd=None if odd is None else read_odd(odd),
         assessment=assessment,
         problem=problem,
     )

@@ -37,6 +37,13 @@ _OPTIONS: dict[XlaOptimization, dict[str, Any]] = {
     "least": {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0},
 }
 
+_WHOLE_LOOPS = {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
+"""Without the pass that splits a loop over cores: each time it is waited for takes longer than a
+step of a simulation."""
+_WIDE = {"xla_cpu_prefer_vector_width": 512}
+"""The widest vectors of any processor, of which XLA takes half by itself: with them simulations ran
+up to 1.25 times as fast."""
+
 _running: dict[int, tuple[str, float]] = {}
 """What is being compiled: a name for people, and when it began."""
 _lock = threading.Lock()
@@ -59,12 +66,19 @@ class Compilation:
     """
 
     def __init__(
-        self, name: str, lowered: jax.stages.Lowered, effort: XlaOptimization = "most"
+        self,
+        name: str,
+        lowered: jax.stages.Lowered,
+        effort: XlaOptimization = "most",
+        splits: bool = True,
+        wide: bool = False,
     ) -> None:
         self.name = name
-        self._effort: XlaOptimization = effort
+        self._how: tuple[XlaOptimization, bool, bool] = effort, splits, wide
         self._lowered: jax.stages.Lowered | None = lowered
-        self._future: Future[jax.stages.Compiled] = _pool().submit(_compiled, name, lowered, effort)
+        self._future: Future[jax.stages.Compiled] = _pool().submit(
+            _compiled, name, lowered, effort, splits, wide
+        )
         self._program: jax.stages.Compiled | None = None
 
     def result(self) -> jax.stages.Compiled:
@@ -84,7 +98,7 @@ class Compilation:
                 self._program = self._future.result()
             except CancelledError:
                 assert self._lowered is not None
-                self._program = _compiled(self.name, self._lowered, self._effort)
+                self._program = _compiled(self.name, self._lowered, *self._how)
             except KeyboardInterrupt:
                 # Or else the process would not end before all others are compiled.
                 _cancel_waiting()
@@ -111,7 +125,11 @@ def _count_waiting(seconds: float) -> None:
 
 
 def compile_soon(
-    name: str, lowered: jax.stages.Lowered, effort: XlaOptimization = "most"
+    name: str,
+    lowered: jax.stages.Lowered,
+    effort: XlaOptimization = "most",
+    splits: bool = True,
+    wide: bool = False,
 ) -> Compilation:
     """Compile a program in the background.
 
@@ -120,9 +138,13 @@ def compile_soon(
     - `name`: the name of the program, for people: "the search".
     - `lowered`: the program, lowered by JAX.
     - `effort`: how much XLA does to make it fast; accelerators always do the most.
+    - `splits`: whether its loops may be split over cores; not of a program that runs on all of
+      them.
+    - `wide`: whether it may have the widest vectors of the processor; only a program without
+      functions of XLA's own, of which one is wrong with these.
     """
     enable_compile_cache()
-    return Compilation(name, lowered, effort)
+    return Compilation(name, lowered, effort, splits, wide)
 
 
 def while_compiling(work: Callable[[], object], after: float = LONG) -> None:
@@ -199,22 +221,35 @@ def _cancel_waiting() -> None:
 
 
 def _compiled(
-    name: str, lowered: jax.stages.Lowered, effort: XlaOptimization
+    name: str, lowered: jax.stages.Lowered, effort: XlaOptimization, splits: bool, wide: bool
 ) -> jax.stages.Compiled:
     with _said(name):
-        options = options_of(effort)
-        return lowered.compile(compiler_options=options) if options else lowered.compile()
+        options = _wanted_options(effort, splits, wide)
+        if not options:
+            return lowered.compile()
+        try:
+            return lowered.compile(options)
+        except jax.errors.JaxRuntimeError:
+            # An XLA that does not know one of the options; asking before takes longer.
+            known = known_options(options)
+            if known == options:
+                raise
+            return lowered.compile(known)
+
+
+def _wanted_options(
+    effort: XlaOptimization, splits: bool = True, wide: bool = False
+) -> dict[str, Any]:
+    # The user of this switch wants the least of all programs.
+    if jax.default_backend() != "cpu" or jax.config.read("jax_disable_most_optimizations"):
+        return {}
+    return _OPTIONS[effort] | ({} if splits else _WHOLE_LOOPS) | (_WIDE if wide else {})
 
 
 @cache
 def options_of(effort: XlaOptimization) -> dict[str, Any] | None:
-    """Return XLA's options for this effort; None if it does the most."""
-    options = _OPTIONS[effort]
-    if not options or jax.default_backend() != "cpu":
-        return None
-    if jax.config.read("jax_disable_most_optimizations"):
-        return None  # The user of this switch wants the least of all programs.
-    return known_options(options) or None
+    """Return XLA's options for this effort, as far as XLA knows them; None if there are none."""
+    return known_options(_wanted_options(effort)) or None
 
 
 def known_options(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -79,7 +79,7 @@ def format_seconds(seconds: float, digits: int = 6) -> str:
     rest = round(rest, 6 if digits > 4 else 2)
     if rest:
         parts.append(f"{rest:z.8g} s")
-    return f"{'-' * (seconds < 0)}{' '.join(parts)}"
+    return f"{'-' if seconds < 0 else ''}{' '.join(parts)}"
 
 
 MAX_ENTRIES = 4

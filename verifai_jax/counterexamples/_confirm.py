@@ -2,14 +2,14 @@
 
     print(confirm(run, run.best))                       # one row
     confirm(run).table                                  # all of them, a row each
-    confirm(run, 12, simulator="native")                # also by another simulator
+    confirm(run, engines="all").transferable            # which fail in every engine
 
 `verifai_jax.evaluation.confirmer` says what is checked.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, TypeAlias, overload
+from typing import Any, overload
 
 import numpy as np
 import pandas as pd
@@ -20,14 +20,11 @@ from verifai_jax.counterexamples.selection import Row
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.confirmations import Confirmation, Confirmations, Repetitions
 from verifai_jax.evaluation.confirmer import Confirmer
+from verifai_jax.evaluation.other_engines import Engines
 from verifai_jax.falsification.run import Run
-from verifai_jax.problem.problem import Problem
 
 BLOCK = 128
 """Rows of a run that are checked at once; what is finished survives Ctrl-C."""
-
-Simulator: TypeAlias = Callable[..., Any] | Problem | str | None
-"""A system, a problem with one, or the name of a backend."""
 
 
 @overload
@@ -35,7 +32,7 @@ def confirm(
     run: Run,
     row: None = None,
     *,
-    simulator: Simulator = None,
+    engines: Engines = None,
     max_rows: int | None = None,
     progress: bool | None = None,
 ) -> Confirmations: ...
@@ -44,7 +41,7 @@ def confirm(
     run: Run,
     row: int | np.integer | pd.Series | Mapping[str, Any],
     *,
-    simulator: Simulator = None,
+    engines: Engines = None,
     max_rows: int | None = None,
     progress: bool | None = None,
 ) -> Confirmation: ...
@@ -54,7 +51,7 @@ def confirm(
     run: Run,
     row: Row = None,
     *,
-    simulator: Simulator = None,
+    engines: Engines = None,
     max_rows: int | None = None,
     progress: bool | None = None,
 ) -> Confirmation | Confirmations:
@@ -65,8 +62,9 @@ def confirm(
     - `run`: a run of a problem.
     - `row`: a row number, a row of the table, or a mapping with its feature columns; all
       counterexamples of the table when left out.
-    - `simulator`: another system for the same features and signals, a problem with one, or the
-      name of another backend, that has to agree.
+    - `engines`: that have to agree: names of other backends, such as `"mjx"` or `"native"`, `"all"`
+      for those that are installed, another system for the same features and signals, a problem with
+      one, or several of these by name. What is confirmed in each of them is `transferable`.
     - `max_rows`: how many rows are replayed at least, by default 256, and more where a row takes
       few replays; of more, the worst and those nearest to zero, until the rest
       is far from it (see `evaluation.confirmer.Confirmer`).
@@ -74,8 +72,8 @@ def confirm(
 
     **Returns:** a `Confirmation` for a row, `Confirmations` for all; after Ctrl-C what is finished.
 
-    **Raises:** `ValueError` for a run without its problem, a row that is not a counterexample, a
-    simulator that does not fit; `IndexError` for a row that is not in the table.
+    **Raises:** `ValueError` for a run without its problem, a row that is not a counterexample, an
+    engine that does not fit; `IndexError` for a row that is not in the table.
     """
     if not isinstance(run, Run):
         raise TypeError(f"confirm needs a Run; got {type(run).__name__}")
@@ -86,7 +84,7 @@ def confirm(
         )
     # On the backend of the run, whose verdicts these are.
     problem = resolved(run.problem, wanted=run.backend).problem
-    confirmer = Confirmer(problem, run.precision, run.seed, simulator=simulator, max_rows=max_rows)
+    confirmer = Confirmer(problem, run.precision, run.seed, engines=engines, max_rows=max_rows)
     known = run.table.counts.repetitions
     confirmer.wavers, confirmer.flips = known.moved > 0, known.lost > 0
     if row is None:

@@ -11,12 +11,13 @@ from jaxtyping import Float
 
 from verifai_jax.core.text import listed
 from verifai_jax.evaluation.confirmations import (
-    CHECK_TEXTS,
     FINER,
     NOT_CLAIMED,
     RAISED,
     SINGLE,
     Confirmations,
+    describe_check,
+    engines_of,
 )
 from verifai_jax.evaluation.verdicts import Verdicts
 
@@ -51,7 +52,8 @@ def decide(
     rho = {name: verdicts.lowest for name, verdicts in replayed.items()}
     found.rho.update(rho)
     base = next((name for name in ("float64", "again") if name in replayed), "")
-    finest = next((n for n in ("quarter_step", base, "simulator") if n in replayed), "")
+    engines = engines_of(replayed)
+    finest = next((n for n in ("quarter_step", base, *engines) if n in replayed), "")
     step = rounding = np.zeros(len(found))
     if "half_step" in replayed:
         step = _moved(rho["half_step"], rho["quarter_step"])
@@ -65,7 +67,7 @@ def decide(
         found.why[:] = untraceable
         return found
     deciding = [name for name in (*FINER, SINGLE) if name in replayed] or [base]
-    deciding = [name for name in (*deciding, "simulator") if name in replayed]
+    deciding = [name for name in (*deciding, *engines) if name in replayed]
     failing = {name: verdicts.violated for name, verdicts in replayed.items()}
     holding = {name: v.proper & ~v.violated for name, v in replayed.items()}
     raised = {name: np.isin(v.status, RAISED) for name, v in replayed.items()}
@@ -173,7 +175,7 @@ def describe_disagreement(
 
 
 def _and(names: Sequence[str]) -> str:
-    return listed([CHECK_TEXTS[name] for name in names])
+    return listed(list(map(describe_check, names)))
 
 
 def _moved(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

@@ -7,7 +7,7 @@ describe_checks(found.checks)                       # "in double precision and a
 """
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -49,9 +49,10 @@ CHECK_TEXTS = {
     "quarter_step": "at a quarter of the step",
     SINGLE: "at a quarter of the step in float32",
     "nudged": "one rounding of the features away",
-    "simulator": "in the other simulator",
 }
-"""Each check as people read it."""
+"""Each check as people read it, engines apart."""
+ENGINE = "engine."
+"""Beginning of the names of checks by other engines, before the name of the engine."""
 EXACT_STEP = "exact_step"
 """Stands among the names of checks for one that is not needed: the step belongs to the system."""
 ROUNDED = 1e-4
@@ -84,13 +85,22 @@ def describe_checks(checks: Collection[str], *, of_step: bool = True) -> str:
         parts.append("at a half and a quarter of the step")
     if "nudged" in checks:
         parts.append("one rounding of the features away")
-    if "simulator" in checks:
-        parts.append("in the other simulator")
+    parts += map(describe_check, engines_of(checks))
     text = listed(parts)
     if text and of_step and "quarter_step" not in checks:
         exact = EXACT_STEP in checks
         text += "; the step belongs to the system" if exact else "; no finer step could be tried"
     return text
+
+
+def engines_of(checks: Iterable[str]) -> list[str]:
+    """Return those checks that other engines make."""
+    return [name for name in checks if name.startswith(ENGINE)]
+
+
+def describe_check(name: str) -> str:
+    """Write a check as people read it."""
+    return CHECK_TEXTS.get(name) or f"in {name.removeprefix(ENGINE)}"
 
 
 @dataclass(frozen=True, repr=False)
@@ -127,12 +137,20 @@ class Confirmation(InNotebook):
         """True if the counterexample failed in every replay."""
         return self.verdict == "confirmed"
 
+    @property
+    def transferable(self) -> bool | None:
+        """True if it is confirmed in each engine; None without another engine."""
+        return self.confirmed if engines_of(self.rho) else None
+
     def __str__(self) -> str:
         which = f"row {self.row} of {self.name}" if self.row is not None else f"{self.name}"
         text = f"{which}: {self.verdict}, {MEANING[self.verdict]}"
         if self.why and self.why not in self.notes:
             text += f": {self.why}"
-        words = {"as_run": f"as run ({self.precision})", **CHECK_TEXTS}
+        if self.transferable is not None:
+            text += f". The failure is {'' if self.transferable else 'not '}transferable"
+        words = {name: describe_check(name) for name in self.rho}
+        words["as_run"] = f"as run ({self.precision})"
         values = [f"{rho:z.4g} {words[n]}" for n, rho in self.rho.items() if not np.isnan(rho)]
         text += f". Robustness {', '.join(values)}" if values else ""
         text = ". ".join([text, *(note[0].upper() + note[1:] for note in self.notes)]) + "."
@@ -153,14 +171,14 @@ class Confirmations(InNotebook):
     - `verdict`: `[n]`: `confirmed`: it fails in every check, and by more than replays move it (if
       all that can be done is to simulate it once more, and no row of the run held then, it is
       enough that it fails again); `refuted`: none of the finer checks fails (half and quarter of
-      the step and the other simulator, or double precision if the step cannot be refined);
+      the step and the other engines, or double precision if the step cannot be refined);
       `fragile`: the checks disagree, one of them gave no robustness, the row fails by less than
       that, or it did not fail when it was simulated again; `raised`: a check raised, and the others
       fail; `unexamined`: left out, see `Confirmer`; empty for a row that was not to be checked.
     - `rho`: for each check made, by name, the robustness `[n]` of the worst formula; NaN without
       one. Names are `float64` (or `again`, in the precision of the run), `half_step`,
       `quarter_step`, `quarter_step_float32`, `nudged` (at the finest step, with features one
-      rounding of float32 away) and `simulator`.
+      rounding of float32 away), and `engine.NAME` of another engine.
     - `band`: `[n]`, how much the robustness moved: between half and quarter of the step, which is
       what a method of order 1 is still off at the quarter (Richardson's extrapolation), or by
       rounding: between two precisions, two neighbouring features, or the run and its replay if
@@ -245,6 +263,11 @@ class Confirmations(InNotebook):
         return describe_checks(self.checks)
 
     @property
+    def transferable(self) -> Bool[np.ndarray, " n"] | None:
+        """True for rows confirmed in each engine; None without another engine."""
+        return self.verdict == "confirmed" if engines_of(self.checks) else None
+
+    @property
     def counts(self) -> dict[str, int]:
         """Number of rows with each verdict that occurs."""
         counted = Counter(self.verdict.tolist())
@@ -268,6 +291,9 @@ class Confirmations(InNotebook):
         )
         counted = "1 counterexample" if len(self) == 1 else f"{len(self)} counterexamples"
         lines = [*warnings, f"{self.name}: of {counted}, {counts}"]
+        if self.transferable is not None:
+            count = int(np.sum(self.transferable))
+            lines.append(f"  {count} of {counted} {'is' if count == 1 else 'are'} transferable")
         doubtful = self.table.loc[~self.table["verdict"].isin(["confirmed", "unexamined"])]
         reasons = [
             (rows.index, str(verdict), str(why))

@@ -15,7 +15,7 @@ earlier simulations or draws numbers that do not come from its key.
 `confirmation_rules.py` decides from the replays, `confirmations.py` has the results.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -24,10 +24,8 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.core.errors import check_names
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import in_precision
-from verifai_jax.core.trace import Trace
 from verifai_jax.evaluation.confirmation_rules import decide, hold_to_run, lowest_failing
 from verifai_jax.evaluation.confirmations import (
     EXACT_STEP,
@@ -36,7 +34,10 @@ from verifai_jax.evaluation.confirmations import (
     SINGLE,
     Confirmations,
     came_otherwise,
+    describe_check,
+    engines_of,
 )
+from verifai_jax.evaluation.other_engines import Engines, engines_for
 from verifai_jax.evaluation.resimulate import (
     LANES,
     ONE_BY_ONE,
@@ -46,7 +47,6 @@ from verifai_jax.evaluation.resimulate import (
 )
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
-from verifai_jax.systems.base import System
 
 if TYPE_CHECKING:
     from verifai_jax.core.executors import Executor
@@ -93,8 +93,7 @@ class Confirmer:
     - `problem`: on the backend that it ran on.
     - `precision`: the precision of the run.
     - `seed`: the seed of the run; a simulation gets the random key that it had.
-    - `simulator`: another system for the same features and signals, or a problem with one, that
-      has to agree.
+    - `engines`: that have to agree, as `engines_for` reads them.
     - `max_rows`: how many rows are examined whatever comes; by default 256, and more where a row
       takes few replays: 2048 where the step stays. Of more, those nearest to zero are, and
       further ones until the rest is ten times farther from zero than any replay has moved a row;
@@ -117,7 +116,7 @@ class Confirmer:
         precision: str = "float32",
         seed: int = 0,
         *,
-        simulator: System | Callable[..., Trace] | Problem | str | None = None,
+        engines: Engines = None,
         max_rows: int | None = None,
         executor: "Executor | None" = None,
         target: str | None = None,
@@ -129,7 +128,7 @@ class Confirmer:
         in_precision(precision)
         self.problem, self.precision, self.seed, self.max_rows = problem, precision, seed, max_rows
         self.executor, self.target = executor, target
-        self.other = None if simulator is None else _other(problem, simulator)
+        self.others = engines_for(problem, engines)
         self.examined, self.band, self.worst = 0, 0.0, np.inf
         self.wavers = self.flips = self._came_again = False
         self.check_names: tuple[str, ...] = ()
@@ -144,7 +143,7 @@ class Confirmer:
 
         An error in it is reported once there are rows.
         """
-        if self.problem.black_box or self.other is not None:
+        if self.problem.black_box or self.others:
             return
         with suppress(Exception):
             self._plan()
@@ -271,12 +270,12 @@ class Confirmer:
                 notes.append(f"not checked at a finer step: {reason}")
             if not problem.black_box:
                 checks["nudged"] = base, FINER["quarter_step"] if reason is None else 1
-        if self.other is not None:
-            other, of_other, raised_too = finest_replays(self.other, run, key)
-            notes += [f"the other simulator: {note}" for note in of_other]
-            raised = raised or (raised_too and f"the other simulator: {raised_too}")
-            if other is not None:
-                checks["simulator"] = other, 1
+        for name, other in self.others.items():
+            replays, of_other, raised_too = finest_replays(other, run, key)
+            notes += [f"{describe_check(name)}: {note}" for note in of_other]
+            raised = raised or (raised_too and f"{describe_check(name)}: {raised_too}")
+            if replays is not None:
+                checks[name] = replays, 1
         self._checks, self._notes, self._untraceable = checks, tuple(notes), raised
         self._planned = True
 
@@ -290,7 +289,7 @@ class Confirmer:
         """Whether a check simulates more finely than the run, so that it may refute a row."""
         checks = self._checks
         more_precise = "float64" in checks and self.precision != "float64"
-        return more_precise or "quarter_step" in checks or "simulator" in checks
+        return more_precise or "quarter_step" in checks or bool(engines_of(checks))
 
     def _block_size(
         self,
@@ -419,22 +418,3 @@ def _order(run: Float[np.ndarray, " n"]) -> np.ndarray:
     order = np.argsort(np.abs(run), kind="stable")
     worst = int(np.argmin(run))
     return np.concatenate([[worst], order[order != worst]])
-
-
-def _other(problem: Problem, simulator: System | Callable[..., Trace] | Problem | str) -> Problem:
-    """Return the problem with another system."""
-    if isinstance(simulator, str):
-        if not problem.system.backends:
-            raise ValueError(
-                f"the system of problem {problem.name!r} has no backends; simulator must be a "
-                f"system or a Problem, got {simulator!r}"
-            )
-        other = problem.on_backend(simulator)
-    else:
-        system: Any = simulator.system if isinstance(simulator, Problem) else simulator
-        if isinstance(simulator, Problem):
-            check_names("feature of the simulator", simulator.space.columns, problem.space.columns)
-            check_names("feature", problem.space.columns, simulator.space.columns)
-        other = replace(problem, system=system)
-    other.check()
-    return other

@@ -30,10 +30,10 @@ from verifai_jax.core.executors import (
     ship,
 )
 from verifai_jax.core.programs import Slot, power_of_two
-from verifai_jax.evaluation.engine import chunks_and_lanes
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.layout import chunks_and_lanes
 from verifai_jax.evaluation.remarks import Remarks
 from verifai_jax.evaluation.verdicts import RowVerdict, Verdicts
 from verifai_jax.evaluation.worker import ARRAYS, BlockMode, evaluate_block, question_of

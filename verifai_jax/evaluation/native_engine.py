@@ -27,6 +27,7 @@ from verifai_jax.core.programs import Slot
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine, Wanted
 from verifai_jax.evaluation.verdicts import Verdicts, violations
+from verifai_jax.mtl.expression import durations_in
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.tree import Term, postorder
 from verifai_jax.native_code.library import (
@@ -146,7 +147,7 @@ class NativeEngine:
             return False
         if self._wanted == "native":
             return True
-        return self._budget * self.engine.work >= WORTH
+        return self._budget * self.engine.program.work >= WORTH
 
     @cached_property
     def _xla(self) -> Engine:
@@ -215,8 +216,11 @@ class NativeEngine:
 def _greatest(formula: Formula) -> float:
     """Return the greatest of 1, the numbers that a formula compares with, and its finite reach.
 
-    Rounding is relative to what is compared, and adds up over time.
+    Rounding is relative to what is compared, and adds up over time. It is infinite where samples
+    are counted: whether one counts may be decided by rounding.
     """
+    if durations_in(formula):
+        return math.inf
     numbers = [node.number or 0.0 for node in postorder(formula) if isinstance(node, Term)]
     reach = filter(math.isfinite, (formula.horizon(), formula.history()))
     return max([1.0, *map(abs, numbers), *reach])
@@ -228,7 +232,7 @@ def _cut(temperature: Temperature, which: slice | np.ndarray) -> Temperature:
 
 
 def _alike(ours: np.ndarray, theirs: np.ndarray) -> bool:
-    """Return whether derivatives agree, but for those of few chaotic simulations."""
+    """Return whether derivatives agree, except in a few chaotic simulations."""
     ours, theirs = ours.reshape(len(ours), -1), theirs.reshape(len(theirs), -1)
     size = np.max(np.abs(theirs), axis=1, keepdims=True) + 1e-6
     same = np.isclose(ours, theirs, rtol=0, atol=10 * AGREES * size, equal_nan=True)
@@ -247,13 +251,13 @@ class _Program:
     @cached_property
     def draws(self) -> bool:
         """True where the system uses its random key, or may do so."""
-        return self.engine.gradient or self.engine.draws()
+        return self.engine.gradient or self.engine.program.draws()
 
     @cached_property
     def traced(self) -> tuple[Any, str | None]:
         """The program of a row, its random key by its number; and its identity."""
-        function = self.engine.traced_row()
-        *_, numbers = self.engine._arguments
+        function = self.engine.program.traced_row()
+        *_, numbers = self.engine.program.forms
 
         def of_row(
             row: Array, words: Array, number: Array, temperature: Array, numbers: Array
@@ -272,8 +276,8 @@ class _Program:
                 jax.ShapeDtypeStruct((), jnp.float32),
                 numbers,
             )
-            program = self.engine.differentiable(lambda: jax.make_jaxpr(of_row)(*forms))
-            return program, self.engine.row_identity
+            program = self.engine.program.differentiable(lambda: jax.make_jaxpr(of_row)(*forms))
+            return program, self.engine.program.identity
 
     def begin(self) -> None:
         """Begin to compile, where that has not begun."""
@@ -312,9 +316,9 @@ class _Program:
         library = self.ready()
         temperatures = np.broadcast_to(np.asarray(temperature, np.float32), (len(rows),))
         words = np.asarray(jax.random.key_data(key))
-        threads = len(self.engine.devices)
-        packed = library(rows, words, first, temperatures, self.engine.numbers, threads)
-        unpacked: Any = self.engine.unpack({"uint32": packed}, len(rows))
+        threads = len(self.engine.layout.devices)
+        packed = library(rows, words, first, temperatures, self.engine.program.numbers(), threads)
+        unpacked: Any = self.engine.program.unpack("evaluate", {"uint32": packed}, len(rows))
         rho, status, features, more = unpacked
         # What is exactly zero is decided by XLA.
         broken = violations(rho, status, lambda: np.ones(rho.shape, bool))

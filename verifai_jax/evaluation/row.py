@@ -325,11 +325,15 @@ def streaming_monitor(problem: Problem) -> Monitor | None:
         # It looks ahead without end; or its clock is wrong, which the engine says better.
         return None
 
+    form = problem.form()
+    # A part of the state is finite where the last state is, which the status says.
+    known_finite, count = ((), None) if form is None else (form.finite, form.length)
+
     def update(carry: PyTree, sample: Mapping[str, Array]) -> PyTree:
         states, finite = carry
         for name in problem.monitored:
             signal = jnp.asarray(sample[name])
-            if jnp.issubdtype(signal.dtype, jnp.inexact):
+            if name not in known_finite and jnp.issubdtype(signal.dtype, jnp.inexact):
                 finite &= jnp.all(jnp.isfinite(signal))
         stepped = [m.step(state, sample) for m, state in zip(monitors, states, strict=True)]
         return tuple(stepped), finite
@@ -337,7 +341,7 @@ def streaming_monitor(problem: Problem) -> Monitor | None:
     def monitor(features: PyTree, key: Key[Array, ""]) -> tuple[Array, Array]:
         start = (tuple(monitor.init() for monitor in monitors), jnp.array(True))
         (states, finite), status = system.fold(features, key, start, update)
-        rho = jnp.stack([m.finish(state) for m, state in zip(monitors, states, strict=True)])
+        rho = jnp.stack([m.finish(state, count) for m, state in zip(monitors, states, strict=True)])
         return with_status(rho, status, finite)
 
     return monitor

@@ -341,7 +341,7 @@ class _WholeRounds:
         if len(keys) not in self._programs:
             enable_compile_cache()
             program = spread_over_devices(self._on_device, (True, True, False))
-            traced = self.engine.differentiable(
+            traced = self.engine.program.differentiable(
                 lambda: jax.jit(partial(program)).lower(state, keys, first)
             )
             self._programs[len(keys)] = traced.compile()
@@ -349,7 +349,7 @@ class _WholeRounds:
 
     def _on_device(self, state: PyTree, keys: Array, first: Array) -> PyTree:
         # Blocks of seeds whose simulations fit the cache together.
-        blocks = max(1, self.engine.together // self.batch)
+        blocks = max(1, self.problem.system.lanes // self.batch)
         return jax.lax.map(
             lambda seed: self._one_seed(seed[0], seed[1], first), (state, keys), batch_size=blocks
         )
@@ -362,13 +362,16 @@ class _WholeRounds:
             rows = first + i * batch + jnp.arange(batch, dtype=jnp.int32)
             keys = jax.vmap(partial(simulation_key, key))(rows)
             temperature = search.temperature(state) if search.wants.gradient else 1.0
-            simulate = jax.vmap(self.engine.row, in_axes=(0, 0, None))
+            simulate = jax.vmap(self.engine.program.row, in_axes=(0, 0, None))
             row = simulate(u, keys, jnp.float32(temperature))
             lowest = jnp.min(row.rho, axis=-1)
             gradient = row.derivatives.get("gradient")
             gradient = None if gradient is None else gradient.astype(jnp.float32)
             valid = row.status == Status.OK
             observations = Observations(u, lowest.astype(jnp.float32), valid, gradient)
+            if search.wants.no_verdict_rows:
+                rho = jnp.where(valid, observations.rho, jnp.nan)
+                observations = observations._replace(rho=rho, valid=jnp.ones(batch, bool))
             if search.learns:
                 state = search.tell(state, cube, observations)
             return state, (u, lowest, row.status)

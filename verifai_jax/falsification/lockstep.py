@@ -24,8 +24,8 @@ from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.confirm_seeds import SeedConfirmer
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Observations, Search
-from verifai_jax.search.proposals import optimization_of
 from verifai_jax.search.repetition import Repetition
+from verifai_jax.search.search_program import optimization_of
 
 VALUES_AT_ONCE = 256
 """Simulations of one call without derivatives."""

@@ -35,7 +35,7 @@ from verifai_jax.falsification.simulations import MEASURED, Simulations
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
-from verifai_jax.search.proposals import compiled_search
+from verifai_jax.search.search_program import compiled_search
 
 if TYPE_CHECKING:
     import pandas as pd

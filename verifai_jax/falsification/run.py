@@ -422,7 +422,7 @@ class Run(InNotebook):
 
         - `path`: the path of the HTML file.
         - `options`: the options of `reports.write_report`: `units` and `reasons` of features,
-          `traces`, `studies`, `modes`.
+          `traces`, `studies`, `modes`, `odd`, `assessment`.
 
         **Returns:** the path.
         """

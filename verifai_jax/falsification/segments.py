@@ -60,7 +60,7 @@ class Segment:
 
     @property
     def damage(self) -> str:
-        """Say what has become of the file; empty if it is as it was written."""
+        """Describe how the file differs from what was written; an empty text if it does not."""
         try:
             own = checksum(self.path.read_bytes())
         except OSError as error:

@@ -31,9 +31,9 @@ from verifai_jax.core.progress import SimulationProgress
 from verifai_jax.core.sources import Sources, list_changes
 from verifai_jax.core.text import one_line
 from verifai_jax.evaluation.backends import resolved
-from verifai_jax.evaluation.engine import chunks_and_lanes
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.executor_engine import TOGETHER
+from verifai_jax.evaluation.layout import chunks_and_lanes
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.evaluation.worker import ARRAYS, evaluate_block
 from verifai_jax.falsification._falsify import falsify

@@ -1,8 +1,10 @@
 """A fault in the loop of a system: the link that observations or actions pass through."""
 
+import operator
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial, reduce
 from typing import Any
 
 import jax
@@ -12,11 +14,12 @@ from jaxtyping import Array, Key, PyTree
 
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.faults.chance import uniform
-from verifai_jax.faults.fault import AtMost, Fault, Moment
+from verifai_jax.faults.fault import AtMost, Fault, Moment, Vector
 from verifai_jax.faults.kinds import WrongChannel
 from verifai_jax.faults.smoothing import blend
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
+from verifai_jax.systems.any_lane import changed_if_needed
 from verifai_jax.systems.channels import Channels, Entries, Instant, Link, Passing, Side
 
 SLACK = 1e-3
@@ -99,21 +102,53 @@ class Injected(Link):
         return jax.random.key_data(jax.random.fold_in(key, number))[-2:], memory
 
     def through(self, state: PyTree, value: PyTree, now: Instant) -> tuple[PyTree, PyTree]:
-        xp, number = now.xp, self.numbers(now.features)
+        xp, number, possible = now.xp, self.numbers(now.features), self._happens(now.features)
         seed, memory = state if self.draws else (None, state)
-        good = self.entries.take(value, xp)
-        since = now.time - number["onset"]
+        other = None if self.other is None else self.other.take(value, xp)
+        leaves, form = jax.tree.flatten(value)
+        parts = [xp.asarray(leaves[i]) for i, _ in self.entries.parts]
+        passing = (parts, memory), now.time, now.ended, possible, number, seed, other
+        if xp is np:
+            parts, memory = self._faulty(now, *passing)
+        else:
+            needed = jnp.asarray(possible & self._severe(number))
+            parts, memory = changed_if_needed(partial(self._faulty, now), needed, *passing)
+        for (i, _), part in zip(self.entries.parts, parts, strict=True):
+            leaves[i] = part
+        return jax.tree.unflatten(form, leaves), memory if seed is None else (seed, memory)
+
+    def _severe(self, number: Mapping[str, Any]) -> Any:
+        """Return whether it acts at any time."""
+        named = [name for name in (self.fault.severity, "duration") if name in number]
+        off = {"duration": 0.0, self.fault.severity: self.fault.off}
+        return reduce(operator.and_, (number[name] != off[name] for name in named), np.bool_(True))
+
+    def _faulty(
+        self,
+        now: Instant,
+        passing: tuple[list[Any], PyTree],
+        time: Any,
+        ended: Any,
+        possible: Any,
+        number: Mapping[str, Any],
+        seed: Any,
+        other: Vector | None,
+    ) -> tuple[list[Any], PyTree]:
+        """Return the parts of a value as the fault makes them, and what it remembers then."""
+        xp, (parts, memory) = now.xp, passing
+        within = self.entries._replace(
+            parts=tuple((i, index) for i, (_, index) in enumerate(self.entries.parts))
+        )
+        good, now = within.take(parts, xp), now._replace(time=time, ended=ended)
+        since = time - number["onset"]
         lead = since / now.period
         # A fault that never ends has ended in no sample, and its end moves nothing.
         trail = (since - number["duration"]) / now.period if "duration" in number else -2.0
-        possible = self._happens(now.features)
         live = possible & (lead >= -SLACK) & (trail < -SLACK)
-        severity = self.fault.severity
-        on = live if severity == "duration" else live & (number[severity] != self.fault.off)
+        on = live & self._severe(number)
         at = Moment(
-            xp, number, live, xp.maximum(since, 0.0), now.time, now.period, now.step == 0,
-            self.side == "action", None if self.other is None else self.other.take(value, xp),
-            lambda count: uniform(seed, now.step, count, xp),
+            xp, number, live, xp.maximum(since, 0.0), time, now.period, now.step == 0,
+            self.side == "action", other, lambda count: uniform(seed, now.step, count, xp),
         )  # fmt: skip
         bad, after = self.fault.corrupt(good, memory, at)
         after = after if xp is np else jax.tree.map(_like, after, memory)
@@ -123,7 +158,7 @@ class Injected(Link):
         else:
             edges = (jnp.asarray(edge, good.dtype) for edge in (lead, trail))
             faulty = blend(on, live, jnp.asarray(possible), *edges, bad, good)
-        return self.entries.put(value, faulty, xp), after if seed is None else (seed, after)
+        return within.put(parts, faulty, xp), now.kept(memory, after)
 
     def _happens(self, features: PyTree) -> Any:
         if self.choice is None:

@@ -13,13 +13,13 @@ from verifai_jax.mtl.calibrated import (
     domain_monitor,
     predictive_monitor,
 )
-from verifai_jax.mtl.counting import durations
 from verifai_jax.mtl.dense import dense_gradient, dense_robustness, dense_signal
 from verifai_jax.mtl.distinguishing import Distinction, distinguish
 from verifai_jax.mtl.evaluate import End, IntervalError
 from verifai_jax.mtl.exemplary import Examples, examples
-from verifai_jax.mtl.expression import Expression, signal
+from verifai_jax.mtl.expression import Expression, duration, signal
 from verifai_jax.mtl.findings import Finding, Findings
+from verifai_jax.mtl.fmu_monitor import export_fmu
 from verifai_jax.mtl.formula import FALSE, TRUE, Formula
 from verifai_jax.mtl.grammar import FormulaSyntaxError
 from verifai_jax.mtl.judgement import Judgement
@@ -59,13 +59,13 @@ __all__ = [
     "IntervalError", "Judgement", "Mined", "Mutant", "Mutants", "Online", "PredictiveMonitor",
     "Requirement", "SamplingError", "Semantics", "SmoothingError", "Template",
     "TimeColumnError", "Watch", "always", "anneal", "boolean", "dense_gradient",
-    "dense_robustness", "dense_signal", "distinguish", "domain_monitor", "draw", "durations",
-    "during", "eventually", "examples", "explain", "export_c", "fall", "hard", "historically",
-    "judge", "latex", "lint", "mine", "mutants", "next_", "nnf", "normalize", "once", "online",
-    "parse", "phase", "predictive_monitor", "prev", "read", "read_requirements", "resample",
-    "rise", "robustness", "robustness_signal", "satisfied", "signal", "simplify", "since",
-    "smooth", "smoothing_error", "sometime_during", "templates", "until", "watch",
-    "write_requirements",
+    "dense_robustness", "dense_signal", "distinguish", "domain_monitor", "draw", "duration",
+    "during", "eventually", "examples", "explain", "export_c", "export_fmu", "fall", "hard",
+    "historically", "judge", "latex", "lint", "mine", "mutants", "next_", "nnf", "normalize",
+    "once", "online", "parse", "phase", "predictive_monitor", "prev", "read",
+    "read_requirements", "resample", "rise", "robustness", "robustness_signal", "satisfied",
+    "signal", "simplify", "since", "smooth", "smoothing_error", "sometime_during",
+    "templates", "until", "watch", "write_requirements",
 ]  # fmt: skip
 
 

@@ -4,7 +4,7 @@ latex(eventually(signal("x") <= 2, 0, 4))    # \Diamond_{[0, 4]} \left(\mathit{x
 """
 
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl.expression import PRECEDENCE, Arithmetic, Component, Number, Signal
+from verifai_jax.mtl.expression import PRECEDENCE, Arithmetic, Component, Duration, Number, Signal
 from verifai_jax.mtl.formula import Formula, Term, surface
 from verifai_jax.mtl.tree import missing_case
 from verifai_jax.mtl.words import COMPARISONS, OPERATORS, number_text
@@ -36,6 +36,9 @@ def _expression_latex(e: Term, outer: int = 0) -> str:
     match e:
         case Number(value):
             return f"({number_text(value)})" if value < 0 and outer > 0 else number_text(value)
+        case Duration(_, operand, window):
+            text = rf"\mathrm{{duration}}_{{{number_text(window)}}}"
+            return rf"{text}\left({latex(operand)}\right)"
         case Signal(name):
             return rf"\mathit{{{name.replace('_', chr(92) + '_')}}}"
         case Component(vector, index):

@@ -26,6 +26,7 @@ from verifai_jax.core.errors import missing_name
 from verifai_jax.core.gaps import with_gaps
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import Evaluator
+from verifai_jax.mtl.expression import durations_in
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.semantics import Kind, Semantics, hard
 from verifai_jax.mtl.stepping import advance, first_cells
@@ -73,12 +74,17 @@ class Online:
         """Return the lowest and the greatest robustness at time 0 that further samples allow."""
         return _end_with(self, state, -math.inf), _end_with(self, state, math.inf)
 
-    def finish(self, state: State) -> Float[Array, ""]:
+    def finish(self, state: State, count: int | None = None) -> Float[Array, ""]:
         """Return the robustness at time 0 if the trace ends here and is held: the offline value.
 
         NaN before the first sample.
+
+        **Arguments:**
+
+        - `count`: number of samples that came, where it is known while JAX traces; a program then
+          does nothing for windows that are past.
         """
-        return _end_with(self, state, None)
+        return _end_with(self, state, None, count)
 
     @property
     def memory(self) -> int:
@@ -100,6 +106,8 @@ def online(formula: Formula | str, dt: float, semantics: Semantics = hard) -> On
     """
     formula = parse(formula) if isinstance(formula, str) else formula
     monitor = Online(formula, dt, semantics.kind)
+    if counted := durations_in(formula):
+        raise ValueError(f"{counted[0]} is counted by watch and export_c, and not by online")
     _plan(monitor)
     return monitor
 
@@ -124,25 +132,30 @@ def _step(monitor: Online, state: State, sample: dict[str, Any]) -> State:
     return State(state.count + 1, last, cells)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 2), inline=True)
-def _end_with(monitor: Online, state: State, unknown: float | None) -> Array:
+@functools.partial(jax.jit, static_argnums=(0, 2, 3), inline=True)
+def _end_with(
+    monitor: Online, state: State, unknown: float | None, count: int | None = None
+) -> Array:
     """Compute the value at time 0 if all further margins are `unknown` (the last, if None)."""
     plan, leaves = monitor.plan, state.last
     if unknown is not None:
         unknown = max(-plan.top, min(plan.top, unknown))
         leaves = tuple(jnp.full_like(leaf, unknown) for leaf in leaves)
     settling, ends = plan.outputs[0].wait - 1, plan.outputs[0].ends
+    now = state.count if count is None else count
 
     def more(i: Array, cells: tuple[Array, ...]) -> tuple[Array, ...]:
-        return advance(plan, state.count + i, leaves, cells)[1]
+        return advance(plan, now + i, leaves, cells)[1]
 
     def settled() -> tuple[Array, ...]:
         return jax.lax.fori_loop(0, settling, more, state.cells)
 
-    if settling and ends:
+    if not (settling and ends):
+        cells = settled()
+    elif count is not None:
+        cells = state.cells if count > settling else settled()
+    else:
         # Once every window is past nothing changes any more: all that came is enough.
         cells = jax.lax.cond(state.count > settling, lambda: state.cells, settled)
-    else:
-        cells = settled()
-    (value,), _ = advance(plan, state.count + settling, leaves, cells)
+    (value,), _ = advance(plan, now + settling, leaves, cells)
     return value

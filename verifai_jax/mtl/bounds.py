@@ -8,6 +8,7 @@ from verifai_jax.mtl.expression import (
     Signal,
     constant_value,
     expression,
+    with_counted,
 )
 from verifai_jax.mtl.formula import Formula, Predicate, Term
 
@@ -18,7 +19,7 @@ def signal_bounds(formula: Formula, signal: str) -> list[tuple[Formula, list[Exp
     `abs(x - 1) <= 0.2` bounds x by 1.2 and 0.8, `y >= 2 * x` bounds y by 2 * x.
     """
     bounds = []
-    for part in predicates_of(formula):
+    for part in (part for whole in with_counted(formula) for part in predicates_of(whole)):
         # An expression by itself holds where it is above zero.
         sides = part.terms() if part.compared else (*part.terms(), Number(0))
         left, right = map(expression, sides)

@@ -10,10 +10,10 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
-from verifai_jax.mtl.c_margins import MarginCode, margin_code
 from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.margins import Margins, Step, margins
 from verifai_jax.mtl.semantics import Semantics, hard
-from verifai_jax.mtl.streams import Op, Plan, streams
+from verifai_jax.mtl.streams import Count, Op, Plan, streams
 from verifai_jax.mtl.tree import missing_case
 from verifai_jax.mtl.words import number_text
 
@@ -51,6 +51,20 @@ static inline double vj_truth(double margin, bool at_zero)
 static inline void vj_fill(double *to, int32_t n, double number)
 {
   for (int32_t i = 0; i < n; i++) { to[i] = number; }
+}
+
+/* Seconds of the last n samples in which something held; NaN while one of them is unknown. */
+static inline double vj_count(
+  double *ring, int32_t n, int32_t *at, double *held, double *unknown, double dt, double truth)
+{
+  const bool is_nan = (truth != truth);
+  const double now = is_nan ? 2.0 : ((truth > 0.0) ? 1.0 : 0.0);
+  const double before = ring[*at];
+  ring[*at] = now;
+  *at = ((*at + 1) < n) ? (*at + 1) : 0;
+  *held += ((now == 1.0) ? 1.0 : 0.0) - ((before == 1.0) ? 1.0 : 0.0);
+  *unknown += (is_nan ? 1.0 : 0.0) - ((before == 2.0) ? 1.0 : 0.0);
+  return (*unknown > 0.0) ? (double)NAN : (*held * dt);
 }
 
 /* The value n samples ago. */
@@ -233,7 +247,7 @@ def export_c(
             f"the name of a monitor in C is a letter, then letters, digits and _; got {name!r}"
         )
     plan = streams(formulas, dt, semantics, every)
-    front = margin_code(plan.leaves, plan.top == 1, sizes or {})
+    front = margins(plan, sizes or {})
     columns = [
         f"x[{k}] {n}{'' if i is None else f'[{i}]'}" for k, (n, i) in enumerate(front.columns)
     ]
@@ -247,9 +261,13 @@ def export_c(
     return f"/*{comment}\n */\n#ifndef {guard}\n#define {guard}\n\n{HEAD}{HELPERS}{body}\n#endif\n"
 
 
-def monitor_code(plan: Plan, front: MarginCode, name: str) -> str:
+def monitor_code(plan: Plan, front: Margins, name: str) -> str:
     """Return the type of a monitor and its functions, without what they need."""
     code = _Code(plan.top)
+    inner, counts = [], []
+    for k, (count, (own, columns)) in enumerate(zip(plan.counts, front.counts, strict=True)):
+        inner.append(monitor_code(count.plan, own, f"{name}_counted{k}"))
+        counts += code.count(k, count, columns, f"{name}_counted{k}")
     values = [
         f"({_number(op.number)})" if op.kind == "number" else f"v{k}"
         for k, op in enumerate(plan.ops)
@@ -260,16 +278,54 @@ def monitor_code(plan: Plan, front: MarginCode, name: str) -> str:
         for k, o in enumerate(plan.outputs)
     ]
     waits = [output.wait for output in plan.outputs]
-    given = [f"m->leaf[{k}] = {text};" for k, text in enumerate(front.leaves)]
+    lines, texts = _margin_lines(front)
+    given = [f"m->leaf[{k}] = {texts[i]};" for k, i in enumerate(front.leaves)]
     parts = {
         "outputs": len(outputs), "leaves": max(1, len(front.leaves)),
         "columns": max(1, len(front.columns)), "fields": _lines(code.fields),
         "starts": _lines(code.starts), "ops": _lines([*ops, *outputs]),
-        "margins": _lines([*front.lines, *given] or ["(void)x;"]), "longest": max(waits),
+        "margins": _lines([*counts, *lines, *given] or ["(void)x;"]), "longest": max(waits),
         "waits": ", ".join(map(str, waits)), "lowest": _number(-plan.top), "top": _number(plan.top),
     }  # fmt: skip
     text = re.sub(r"@(name)", name, MONITOR)
-    return re.sub(r"@(\w+)", lambda found: str(parts[found[1]]), text)
+    return "".join([*inner, re.sub(r"@(\w+)", lambda found: str(parts[found[1]]), text)])
+
+
+def _margin_lines(front: Margins) -> tuple[list[str], list[str]]:
+    """Return a line for each operation, and the text by which its result is read."""
+    lines: list[str] = []
+    texts: list[str] = []
+    for step in front.steps:
+        match step.kind:
+            case "column" | "count":
+                text = ("x[{}]" if step.kind == "column" else "n{}").format(int(step.number))
+            case "number":
+                text = f"({step.number!r})"
+            case _:
+                text = f"a{len(lines)}"
+                of = _operation(step, [texts[i] for i in step.inputs])
+                lines.append(f"const double {text} = {of};")
+        texts.append(text)
+    return lines, texts
+
+
+def _operation(step: Step, v: Sequence[str]) -> str:
+    match step.kind:
+        case "+" | "-" | "*" | "/":
+            return f"{v[0]} {step.kind} {v[1]}"
+        case "neg":
+            return f"-{v[0]}"
+        case "min" | "max":
+            sign = 1 if step.kind == "max" else -1
+            return functools.reduce(lambda a, b: f"vj_best({sign}, {a}, {b})", v)
+        case "norm":
+            return f"sqrt({' + '.join(f'({a} * {a})' for a in v)})"
+        case "power":
+            return f"vj_power({v[0]}, {int(step.number)})"
+        case "truth":
+            return f"vj_truth({v[0]}, {str(bool(step.number)).lower()})"
+    function = {"abs": "fabs", "**": "pow"}.get(step.kind, step.kind)
+    return f"{function}({', '.join(v)})"
 
 
 def _lines(lines: Sequence[str]) -> str:
@@ -304,6 +360,20 @@ class _Code:
         self.fields.append(f"int32_t {name};")
         self.starts.append(f"m->{name} = 0;")
         return f"&m->{name}"
+
+    def count(self, k: int, count: Count, columns: Sequence[int], kind: str) -> list[str]:
+        """Return the lines that count, by a monitor of the `kind` within this one."""
+        self.fields.append(f"{kind} m{k};")
+        self.starts.append(f"{kind}_start(&m->m{k});")
+        ring, at = self.array(f"c{k}", count.n, 0.0), self.index(f"j{k}")
+        sums = f"{self.number(f'h{k}', 0.0)}, {self.number(f'u{k}', 0.0)}"
+        given = ", ".join(f"x[{column}]" for column in columns) or "0.0"
+        rooms = f"{ring}, {count.n}, {at}, {sums}, {count.dt!r}"
+        return [
+            f"const double y{k}[] = {{ {given} }};",
+            f"{kind}_step(&m->m{k}, y{k});",
+            f"const double n{k} = vj_count({rooms}, m->m{k}.out[0]);",
+        ]
 
     def stream(self, k: int, op: Op, names: Sequence[str]) -> str:
         """Return the lines that compute an operation."""

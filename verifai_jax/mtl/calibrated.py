@@ -14,10 +14,11 @@ all its samples at once, and over the calibrating runs and the further one toget
 Source: L. Lindemann et al., "Conformal prediction for STL runtime verification", ICCPS 2023.
 """
 
+import abc
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -31,6 +32,7 @@ from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
 from verifai_jax.statistics.conformal import conformal_p_value, conformal_threshold
 
+Said = TypeVar("Said")
 Rows = Float[np.ndarray, "time columns"]
 TAUGHT = 20_000
 """Samples that a model learns from at most: quadratic models gain nothing from more."""
@@ -78,13 +80,26 @@ class Distance(NamedTuple):
     alarm: bool
 
 
+class _Follows(abc.ABC, Generic[Said]):
+    """A monitor that says something of rows of numbers, and so of runs and of their samples."""
+
+    _columns: "_Columns"
+
+    @abc.abstractmethod
+    def _said(self, rows: Rows) -> list[Said]: ...
+
+    def start(self) -> Callable[[Mapping[str, Any]], Said]:
+        """Return what takes one sample of a run after another, and says something of each."""
+        return self._columns.follow(lambda row: self._said(row)[0])
+
+
 @dataclass(frozen=True)
-class PredictiveMonitor:
+class PredictiveMonitor(_Follows[Forecast]):
     """Foretells violations; made by `predictive_monitor`.
 
     - `horizon`: seconds that it looks ahead.
     - `slack`: by how much a prediction is too high in at most a share `alpha` of runs.
-    - `caught`: the caught of the calibrating runs that violated the formula, those with an alarm
+    - `caught`: the rate of the calibrating runs that violated the formula, those with an alarm
       before that; None if there was none.
     """
 
@@ -99,13 +114,9 @@ class PredictiveMonitor:
 
     def forecasts(self, trace: Trace) -> list[Forecast]:
         """Return a forecast at every sample of a run."""
-        return self._forecasts(self._columns.rows(trace))
+        return self._said(self._columns.rows(trace))
 
-    def start(self) -> Callable[[Mapping[str, Any]], Forecast]:
-        """Return what takes one sample of a run after another and gives its forecast."""
-        return self._columns.follow(lambda row: self._forecasts(row)[0])
-
-    def _forecasts(self, rows: Rows) -> list[Forecast]:
+    def _said(self, rows: Rows) -> list[Forecast]:
         predicted = self._model.predict(rows)
         p_values = conformal_p_value(-self._lowest, -predicted)
         return [
@@ -119,6 +130,7 @@ def predictive_monitor(
     traces: Sequence[Trace],
     horizon: float,
     *,
+    signals: Sequence[str] | None = None,
     alpha: float = 0.05,
     lags: Sequence[int] = (0, 1, 4),
     model: Model | None = None,
@@ -131,6 +143,7 @@ def predictive_monitor(
     - `formula`: a requirement; of `always f` the robustness of `f` at each instant is foretold.
     - `traces`: runs of one system on one clock.
     - `horizon`: seconds ahead, a multiple of the sampling period.
+    - `signals`: names of those that a prediction sees; all if None.
     - `alpha`: probability of a false alarm in a run, and of a bound that is too high.
     - `lags`: samples ago that a prediction sees.
     - `model`: a regressor of scikit-learn's kind; a quadratic function if None.
@@ -141,13 +154,10 @@ def predictive_monitor(
     """
     formula = parse(formula) if isinstance(formula, str) else formula
     within = formula.operand if isinstance(formula, ast.Always) else formula
-    columns = _Columns.of(traces, formula.signals(), tuple(lags))
+    columns, rows, (teach, calibrate) = _learning(traces, signals, lags, seed)
     ahead = ast.Always(within, Interval(0.0, horizon))
-    rows = [columns.rows(trace) for trace in traces]
     values = [HostValues.of(trace) for trace in traces]
     margins, worst = ([np.broadcast_to(v(f), v.length) for v in values] for f in (within, ahead))
-    order = np.random.default_rng(seed).permutation(len(traces))
-    teach, calibrate = np.split(order, [len(traces) // 2])
     x, y = (np.concatenate([each[k] for k in teach]) for each in (rows, worst))
     if not np.isfinite(y).all():
         raise ValueError(f"the robustness of {within} is infinite or NaN, and cannot be foretold")
@@ -176,7 +186,7 @@ def _quadratic() -> Any:
 
 
 @dataclass(frozen=True)
-class DomainMonitor:
+class DomainMonitor(_Follows[Distance]):
     """Tells inputs that are unlike all that was tested; made by `domain_monitor`.
 
     - `reach`: distance beyond which it raises an alarm.
@@ -192,13 +202,9 @@ class DomainMonitor:
 
     def distances(self, trace: Trace) -> list[Distance]:
         """Return the distance of every sample of a run."""
-        return self._distances(self._columns.rows(trace))
+        return self._said(self._columns.rows(trace))
 
-    def start(self) -> Callable[[Mapping[str, Any]], Distance]:
-        """Return what takes one sample of a run after another and gives its distance."""
-        return self._columns.follow(lambda row: self._distances(row)[0])
-
-    def _distances(self, rows: Rows) -> list[Distance]:
+    def _said(self, rows: Rows) -> list[Distance]:
         far = np.asarray(self._tree.query((rows - self._mean) / self._scale)[0])
         p_values = conformal_p_value(self._farthest, far)
         return [
@@ -229,11 +235,7 @@ def domain_monitor(
     """
     from scipy.spatial import KDTree
 
-    columns = _Columns.of(traces, tuple(signals or traces[0].signals), tuple(lags))
-    rows = [columns.rows(trace) for trace in traces]
-    teach, calibrate = np.split(
-        np.random.default_rng(seed).permutation(len(rows)), [len(rows) // 2]
-    )
+    columns, rows, (teach, calibrate) = _learning(traces, signals, lags, seed)
     known = np.concatenate([rows[k] for k in teach])
     mean, scale = known.mean(axis=0), known.std(axis=0)
     scale[scale == 0] = 1.0
@@ -243,22 +245,26 @@ def domain_monitor(
     return DomainMonitor(alpha, reach, columns, tree, mean, scale, farthest)
 
 
+def _learning(
+    traces: Sequence[Trace], signals: Sequence[str] | None, lags: Sequence[int], seed: int
+) -> tuple["_Columns", list[Rows], list[np.ndarray]]:
+    """Return the columns, their rows in each run, and the runs that teach and that calibrate."""
+    if len(traces) < 2:
+        raise ValueError(
+            f"two runs or more are needed, to teach and to calibrate; got {len(traces)}"
+        )
+    columns = _Columns(tuple(signals or traces[0].signals), tuple(lags))
+    rows = [columns.rows(trace) for trace in traces]
+    order = np.random.default_rng(seed).permutation(len(rows))
+    return columns, rows, np.split(order, [len(rows) // 2])
+
+
 @dataclass(frozen=True)
 class _Columns:
     """The numbers of a sample and of earlier ones; before the first sample it stands for them."""
 
     signals: tuple[str, ...]
     lags: tuple[int, ...]
-
-    @classmethod
-    def of(
-        cls, traces: Sequence[Trace], signals: tuple[str, ...], lags: tuple[int, ...]
-    ) -> "_Columns":
-        if len(traces) < 2:
-            raise ValueError(
-                f"two runs or more are needed, to teach and to calibrate; got {len(traces)}"
-            )
-        return cls(signals, lags)
 
     def rows(self, trace: Trace) -> Rows:
         values = HostValues.of(trace).signals

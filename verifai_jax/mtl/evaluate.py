@@ -7,7 +7,7 @@ instants costs nothing, and an unbounded window need only reach that far.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from verifai_jax.core.text import format_seconds
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl import windows
-from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
+from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
 from verifai_jax.mtl.formula import Formula, Interval, Term
 from verifai_jax.mtl.semantics import compared
 from verifai_jax.mtl.tree import missing_case
@@ -46,6 +46,24 @@ def samples(time: float, dt: float, interval: Interval) -> float:
             f"{format_seconds(low * dt)} and {format_seconds(high * dt)}"
         )
     return round(n)
+
+
+def seconds_held(truth: Any, n: int, dt: float, xp: Any) -> Any:
+    """Return the seconds of the last `n` samples in which truth values were above zero.
+
+    **Arguments:**
+
+    - `truth`: `[time, *lanes]`; what is counted is NaN while one of the values is.
+    - `xp`: the module of its arrays, NumPy or `jax.numpy`.
+    """
+
+    def within(marks: Any) -> Any:
+        total = xp.cumsum(marks, axis=0)
+        return total - xp.concatenate([xp.zeros_like(total[:n]), total[:-n]])
+
+    if n > len(truth):
+        n = len(truth)
+    return xp.where(within(xp.isnan(truth)) > 0, xp.nan, within(truth > 0) * dt)
 
 
 def check_scalar(e: Term, shape: Sequence[int], lanes: int) -> None:
@@ -192,6 +210,8 @@ class Evaluator:
         match e:
             case Number(value):
                 return value
+            case Duration():
+                return self._duration(e)[start : stop + 1]
             case Signal(name):
                 signal = self.signals[name]
                 check_scalar(e, signal.shape, self.lanes)
@@ -209,6 +229,22 @@ class Evaluator:
             case Arithmetic():
                 return self._arithmetic(e, start, stop)
         raise missing_case("the value", e)
+
+    def _duration(self, e: Duration) -> Float[Array, "time *lanes"]:
+        if e not in self._memo:
+            boolean = replace(self, kind="boolean", nudges={}, _memo={}, _settled={})
+            truth = boolean.value(e.operand, 0, self._last)
+            dtype = next(iter(self.signals.values())).dtype
+            n = int(samples(e.window, self.dt, Interval(0.0, e.window))) * self.stride
+            seconds = seconds_held(truth, n, self.dt / self.stride, jnp).astype(dtype)
+            if self.valid is not None:  # After the end nothing is counted.
+                rows = jnp.minimum(self._index(0, seconds), self.valid - 1)
+                shape = jnp.broadcast_shapes(rows.shape, seconds.shape)
+                seconds = jnp.take_along_axis(
+                    jnp.broadcast_to(seconds, shape), jnp.broadcast_to(rows, shape), axis=0
+                )
+            self._memo[e] = seconds
+        return self._memo[e]
 
     def _arithmetic(self, e: Arithmetic, start: int, stop: int) -> Array | float:
         # In a loop: a sum of many terms leans to the left as deep as it is long.

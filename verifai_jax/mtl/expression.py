@@ -12,7 +12,7 @@ from operator import methodcaller
 
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.mtl.formula import Formula, Predicate, Term, formula
-from verifai_jax.mtl.tree import postorder
+from verifai_jax.mtl.tree import Node, postorder
 from verifai_jax.mtl.words import FUNCTIONS, NUMBERS, name_text, number_text
 
 CONSTANT: dict[str, Callable[..., float]] = {
@@ -209,6 +209,74 @@ class Signal(Expression):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
+class Duration(Signal):
+    """The seconds of the last `window` seconds in which a formula held, counted sample by sample.
+
+    Each sample stands for one period, and those before the first one do not count. It is like a
+    signal of the recording: with the end "hold" its last value is held.
+    """
+
+    operand: Formula
+    window: float
+
+    def __post_init__(self) -> None:
+        if not (self.window > 0 and math.isfinite(self.window)):
+            raise ValueError(
+                f"a duration is counted in a window of some seconds; got {self.window}"
+            )
+        for part in self.operand.subformulas(valued=True):
+            if part.side == "ahead":
+                raise ValueError(
+                    f"what is counted is known by now, and {part} looks ahead: use an operator "
+                    "that looks back, such as once"
+                )
+
+    @property
+    def is_signal(self) -> bool:
+        """False: its text is that of a function."""
+        return False
+
+    def below(self) -> tuple[Node, ...]:
+        """Return nothing: what walks over expressions meets no formula."""
+        return ()
+
+    def signals(self) -> tuple[str, ...]:
+        """Return the names of the signals of what is counted."""
+        return self.operand.signals()
+
+    def text(self, outer: int = 0) -> str:
+        """Return the text of the function."""
+        return self.name
+
+
+def duration(operand: Formula | Term, window: float) -> Duration:
+    """Count the seconds of the last `window` seconds in which a formula held.
+
+    `always(duration(signal("speed") > 30, 60) <= 3)` is "at most 3 s in any 60 s", in text
+    `always duration(speed > 30, 60) <= 3`.
+
+    **Raises:** `ValueError` for a formula that looks ahead, and a window that is not positive.
+    """
+    counted = formula(operand)
+    return Duration(f"duration({counted}, {number_text(window)})", counted, float(window))
+
+
+def durations_in(*formulas: Formula) -> tuple[Duration, ...]:
+    """Return the durations in formulas, each once."""
+    leaves = (leaf for f in formulas for leaf in f.subformulas())
+    parts = (part for leaf in leaves for term in leaf.terms() for part in postorder(term))
+    return tuple(dict.fromkeys(part for part in parts if isinstance(part, Duration)))
+
+
+def with_counted(*formulas: Formula) -> list[Formula]:
+    """Return formulas, and those that their durations count."""
+    found = list(formulas)
+    for each in found:
+        found += [d.operand for d in durations_in(each) if d.operand not in found]
+    return found
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Component(Expression):
     """One component of a vector signal `[time, k]`, counted from 0."""
 
@@ -216,7 +284,7 @@ class Component(Expression):
     index: int
 
     def __post_init__(self) -> None:
-        if not isinstance(self.vector, Signal):
+        if not (isinstance(self.vector, Signal) and self.vector.is_signal):
             raise ValueError(f"only a signal has components; got ({self.vector})[{self.index}]")
         if not isinstance(self.index, int) or self.index < 0:
             raise ValueError(
@@ -251,6 +319,8 @@ class Arithmetic(Expression):
         if minimum is not None and (n != 1 if minimum == 1 else n < minimum):
             wanted = "one argument" if minimum == 1 else "two arguments or more"
             raise ValueError(f"{self.name} takes {wanted}; got {n}")
+        if self.name == "norm" and isinstance(self.arguments[0], Duration):
+            raise ValueError(f"norm takes a vector signal; got {self}")
         values = [constant_value(argument) for argument in self.arguments]
         if self.name == "/" and values[1] == 0.0:
             raise ValueError(f"a division by zero: {self}")
@@ -266,7 +336,7 @@ class Arithmetic(Expression):
     def signals(self) -> tuple[str, ...]:
         """Return the names of the signals in it, in order of appearance."""
         leaves = (part for part in postorder(self) if isinstance(part, Signal))
-        return tuple(dict.fromkeys(leaf.name for leaf in leaves))
+        return tuple(dict.fromkeys(name for leaf in leaves for name in leaf.signals()))
 
     def text(self, outer: int = 0) -> str:
         """Return the text, in parentheses if its operator binds weaker than `outer`."""

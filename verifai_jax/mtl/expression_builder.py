@@ -11,7 +11,14 @@ from typing import Any, cast
 
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl.expression import Arithmetic, Expression, Number, Signal
+from verifai_jax.mtl.expression import (
+    Arithmetic,
+    Expression,
+    Number,
+    Signal,
+    constant_value,
+    duration,
+)
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.grammar import FormulaSyntaxError, Tree
 from verifai_jax.mtl.words import ANGLES, FUNCTIONS, NUMBERS
@@ -242,8 +249,16 @@ class ExpressionBuilder:
         if str(name) == "pow" and len(arguments) == 2:
             base, exponent = (self._expression(self._build(c)) for c in arguments)
             return Part(base**exponent, *span)
+        if str(name) == "duration" and len(arguments) == 2:
+            counted, window = map(self._build, arguments)
+            seconds = constant_value(self._expression(window))
+            if seconds is None:
+                raise self._fail(
+                    "the window of a duration is a number of seconds", window.start, window.end
+                )
+            return Part(duration(self._formula(counted), seconds), *span)
         if str(name) not in FUNCTIONS:
-            error = unknown_name("function", str(name), FUNCTIONS)
+            error = unknown_name("function", str(name), [*FUNCTIONS, "duration"])
             raise self._fail(str(error), name.start_pos, name.start_pos + len(name))
         parts = tuple(self._expression(self._build(c)) for c in arguments)
         try:

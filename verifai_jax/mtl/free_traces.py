@@ -19,7 +19,15 @@ from jaxtyping import Float
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl.bounds import predicates_of, signal_bounds
 from verifai_jax.mtl.evaluate import End
-from verifai_jax.mtl.expression import Arithmetic, Component, Number, constant_value, expression
+from verifai_jax.mtl.expression import (
+    Arithmetic,
+    Component,
+    Number,
+    constant_value,
+    durations_in,
+    expression,
+    with_counted,
+)
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.host_values import HostValues, Values
 from verifai_jax.mtl.tree import Tree, postorder
@@ -71,6 +79,7 @@ class FreeTraces:
 
         **Raises:** `ValueError` for windows that need a clock of more than 20 000 samples.
         """
+        formulas = with_counted(*formulas)
         dt, length, instants = _clock(formulas, dt, duration)
         names = dict.fromkeys(name for f in formulas for name in f.signals())
         levels = {name: _levels(name, formulas, like) for name in names}
@@ -174,9 +183,16 @@ def _clock(
     timed = [f for whole in formulas for f in postorder(whole) if isinstance(f, Tree) and f.side]
     intervals = [f.interval for f in timed if f.operator.timed]
     ends = [t for i in intervals for t in (i.start, i.end) if 0 < t < math.inf]
+    ends += [each.window for each in durations_in(*formulas)]
     if dt is None:
-        exact = [Fraction(repr(t)) for t in ends]
+        # Seconds that are counted are multiples of the period, too, and so are their limits.
+        counts = [leaf for f in formulas for leaf in predicates_of(f) if durations_in(leaf)]
+        limits = [number for leaf in counts for number in _numbers(leaf) if number > 0]
+        exact = [Fraction(repr(t)) for t in (*ends, *limits)]
         common = Fraction(1) if not exact else _common(exact)
+        if limits and sum(ends) > common * MAX_SAMPLES / 8:
+            exact = exact[: len(ends)]
+            common = _common(exact)
         # Where windows have few samples there are some between their ends.
         shortest = min(exact, default=Fraction(1))
         dt = float(common / max(1, math.ceil(4 / (shortest / common))))
@@ -236,7 +252,7 @@ def _levels(
 
 def states_of(formulas: Sequence[Formula]) -> set[str]:
     """Return the signals that are states, such as modes and flags: they equal a value or do not."""
-    leaves = (leaf for formula in formulas for leaf in predicates_of(formula))
+    leaves = (leaf for f in with_counted(*formulas) for leaf in predicates_of(f))
     equal = (f for f in leaves if f.compared is None or f.compared[1] in ("==", "!="))
     return {name for leaf in equal for name in leaf.signals()}
 

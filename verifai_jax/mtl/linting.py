@@ -22,6 +22,7 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.bounds import predicates_of
 from verifai_jax.mtl.distinguishing import free_difference
 from verifai_jax.mtl.evaluate import End
+from verifai_jax.mtl.expression import durations_in
 from verifai_jax.mtl.findings import Finding, Findings
 from verifai_jax.mtl.formula import FALSE, TRUE, Formula, surface
 from verifai_jax.mtl.free_traces import FreeTraces
@@ -298,8 +299,9 @@ class _Linter:
         """Return how far the margin of a predicate moves in the recordings."""
         every = np.concatenate([np.ravel(each.values(leaf)) for each in self.recordings])
         spread = float(np.ptp(every[np.isfinite(every)]))
-        names = leaf.signals()
-        sizes = [np.abs(e.values.signals[n]).max() for e in self.recordings for n in names]
+        # Seconds that are counted may be all of their window.
+        spread = max([spread, *(each.window for each in durations_in(leaf))])
+        sizes = [np.abs(e.values.signals[n]).max() for e in self.recordings for n in leaf.signals()]
         # Flags, modes and counts are often constant, so that a bound next to one says nothing.
         still = STILL * float(max(sizes)) if max(sizes) > 3 or max(sizes) % 1 else math.inf
         return spread or still
@@ -310,12 +312,11 @@ class _Linter:
             own = np.concatenate([np.ravel(e.values.signals[name]) for e in self.recordings])
             unit = f" {self.units[name]}" if name in self.units else ""
             ranges.append(f"{name} is from {np.nanmin(own):z.4g} to {np.nanmax(own):z.4g}{unit}")
-        each = self._all.replace("any", "all")
-        said = f"never holds in {self._all}" if never else f"always holds in {each}"
-        said = f"{leaf} {said}, and never by "
+        where = self._all if never else self._all.replace("any", "all")
+        said = f"{leaf} {'never' if never else 'always'} holds in {where}"
         return self._found(
             "never holds" if never else "never near", leaf,
-            f"{said}less than {nearest:z.3g}: {listed(ranges)}",
+            f"{said}, and never by less than {nearest:z.3g}: {listed(ranges)}",
             "Check the unit of the bound, as in 12deg for an angle in rad, or tighten it.",
         )  # fmt: skip
 
@@ -373,7 +374,7 @@ class _Linter:
             if len(known) > 1:
                 faults.append(f"{leaf} compares {known[0]} with {known[1]}")
             yield from (self._found("units", leaf, fault) for fault in faults)
-            for unit in known:
+            for unit in known[: 0 if faults else 1]:
                 owners.setdefault(unit, leaf)
         wanted = plain_unit(self.requirement.unit)
         if wanted and owners and wanted not in owners:

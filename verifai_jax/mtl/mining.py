@@ -189,17 +189,44 @@ class _Satisfied:
     values: Sequence[HostValues]
     needed: int
 
+    def __post_init__(self) -> None:
+        self._order = list(range(len(self.values)))
+
     def __call__(self, given: Mapping[str, float]) -> bool:
         formula = self.template.formula(given)
         allowed = len(self.values) - self.needed
-        for number, each in enumerate(self.values):
-            try:
-                allowed -= not each.holds(formula)
-            except ValueError as error:
-                raise type(error)(f"recording {number}: {error}") from None
+        for number in self._order:
+            allowed -= not self._holds(number, formula)
             if allowed < 0:
                 return False
         return True
+
+    def tightest(self, axis: "_Axis", given: Mapping[str, float], first: int = 0) -> int | None:
+        """Return the number of the tightest value of an axis, from `first` on; None if none is."""
+        if self.needed < len(self.values):
+            return axis.tightest(lambda value: self({**given, axis.name: value}), first, axis.last)
+        tight: int | None = axis.last
+        for number in list(self._order):
+            # Few recordings are tighter than all before them, and they come first next time.
+            holds = self._of_one(number, axis, given)
+            if tight is not None and not holds(axis.value(tight)):
+                tight = axis.tightest(holds, first, tight - 1)
+                self._order.remove(number)
+                self._order.insert(0, number)
+        return tight
+
+    def _of_one(
+        self, number: int, axis: "_Axis", given: Mapping[str, float]
+    ) -> Callable[[float], bool]:
+        return lambda value: self._holds(number, self.template.formula({**given, axis.name: value}))
+
+    def _holds(self, number: int, formula: Formula) -> bool:
+        try:
+            return self.values[number].holds(formula)
+        except ValueError as error:
+            raise type(error)(f"recording {number}: {error}") from None
+        finally:
+            self.values[number].forget()
 
 
 @dataclass(frozen=True)
@@ -217,11 +244,11 @@ class _Axis:
     bounded: bool
     sampled: bool
 
-    def tightest(self, holds: Callable[[float], bool], first: int = 0) -> int | None:
-        """Return the number of the tightest value that holds, or None if the loosest does not."""
-        if first > self.last or not holds(self.value(first)):
+    def tightest(self, holds: Callable[[float], bool], first: int, last: int) -> int | None:
+        """Return the number of the tightest value that holds, or None if the first does not."""
+        if first > last or not holds(self.value(first)):
             return None
-        low, high = first, self.last + 1
+        low, high = first, last + 1
         while high - low > 1:
             middle = (low + high) // 2
             low, high = (middle, high) if holds(self.value(middle)) else (low, middle)
@@ -310,7 +337,7 @@ def _double(ordinal: int) -> float:
 
 
 def _one(axis: _Axis, satisfied: _Satisfied) -> list[tuple[float, ...]]:
-    number = axis.tightest(lambda value: satisfied({axis.name: value}))
+    number = satisfied.tightest(axis, {})
     if number is None:
         raise ValueError(f"no value of ?{axis.name} satisfies {satisfied.template.text!r}")
     if axis.is_free(number):
@@ -326,12 +353,12 @@ def _staircase(one: _Axis, other: _Axis, satisfied: _Satisfied) -> list[tuple[fl
     number: int | None = 0
     while number is not None and len(corners) < MAX_CORNERS:
         a = one.value(number)
-        tight = other.tightest(lambda b, a=a: satisfied({one.name: a, other.name: b}))
+        tight = satisfied.tightest(other, {one.name: a})
         if tight is None:
             break
         b = other.value(tight)
         # The loosest value does hold here, and from there to the tightest that does.
-        number = one.tightest(lambda a, b=b: satisfied({one.name: a, other.name: b}), number)
+        number = satisfied.tightest(one, {other.name: b}, number)
         assert number is not None
         if not (one.is_free(number) or other.is_free(tight)):
             corners.append((one.value(number), b))

@@ -20,7 +20,14 @@ from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.distinguishing import free_difference
 from verifai_jax.mtl.evaluate import End, IntervalError
-from verifai_jax.mtl.expression import Arithmetic, Expression, Number, expression
+from verifai_jax.mtl.expression import (
+    Arithmetic,
+    Duration,
+    Expression,
+    Number,
+    duration,
+    expression,
+)
 from verifai_jax.mtl.formula import EVERYTHING, Formula, Interval, surface
 from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.mtl.recorded import Recordings, named_traces
@@ -256,6 +263,9 @@ def _changed_term(term: Expression) -> Iterator[Expression]:
             yield Number(float(f"{term.value * share:z.12g}"))
         if not term.value:
             yield from (Number(-MOVED), Number(MOVED))
+    elif isinstance(term, Duration):
+        for part, window in ((term.operand, 2 * term.window), (~term.operand, term.window)):
+            yield duration(part, window)
     elif isinstance(term, Arithmetic):
         if term.name == "abs":
             yield term.arguments[0]

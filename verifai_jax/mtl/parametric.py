@@ -17,7 +17,15 @@ from dataclasses import dataclass
 from verifai_jax.core.errors import check_names
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._parse import parse
-from verifai_jax.mtl.expression import Arithmetic, Number, Signal, constant_value, expression
+from verifai_jax.mtl.expression import (
+    Arithmetic,
+    Duration,
+    Number,
+    Signal,
+    constant_value,
+    duration,
+    expression,
+)
 from verifai_jax.mtl.formula import Formula, Interval, Term
 from verifai_jax.mtl.tree import postorder
 
@@ -62,22 +70,30 @@ class Parametric:
         check_names("parameter", values, self.names)
         return self._filled(self.tree, values, True)
 
-    def _filled(self, f: Formula, values: Mapping[str, float], positive: bool) -> Formula:
+    def _filled(self, f: Formula, values: Mapping[str, float], positive: bool | None) -> Formula:
+        """Return a formula with values; `positive` is None where its comparisons stay as they are.
+
+        What is counted can make the formula true, or false.
+        """
         match f:
             case ast.Predicate(comparison, left, right):
                 if not any(name in self.names for name in _parameters(left, right)):
                     return f
-                comparison = (_CLOSED if positive else _OPEN).get(comparison, comparison)
-                left, right = (_with_numbers(e, values) for e in (left, right))
+                equal = {True: _CLOSED, False: _OPEN, None: {}}[positive]
+                comparison = equal.get(comparison, comparison)
+                left, right = (self._with_numbers(e, values) for e in (left, right))
                 return ast.Predicate(comparison, left, right)
             case ast.Atom(e):
                 if not _parameters(e):
                     return f
                 number = Number(0.0)
-                return ast.Predicate(">=" if positive else ">", _with_numbers(e, values), number)
+                return ast.Predicate(
+                    ">=" if positive else ">", self._with_numbers(e, values), number
+                )
             case ast.Leaf():
                 return f
-        positive ^= isinstance(f, ast.Not)
+        if isinstance(f, ast.Not) and positive is not None:
+            positive = not positive
         operands = [self._filled(part, values, positive) for part in f.operands()]
         if not f.operator.timed:
             return ast.build(f.operator.word, operands)
@@ -86,6 +102,17 @@ class Parametric:
             for t in (f.interval.start, f.interval.end)
         ]
         return ast.build(f.operator.word, operands, Interval(*ends))
+
+    def _with_numbers(self, e: Term, values: Mapping[str, float]) -> Term:
+        match e:
+            case Duration():
+                return duration(self._filled(e.operand, values, None), e.window)
+            case Signal(name) if name.startswith("?"):
+                return Number(values[name[1:]])
+            case Arithmetic(name, arguments):
+                filled = tuple(expression(self._with_numbers(a, values)) for a in arguments)
+                return Arithmetic(name, filled)
+        return e
 
     def direction(self, name: str) -> int:
         """Return how the robustness changes as a parameter grows, as the tree has it.
@@ -183,21 +210,13 @@ def _parameters(*terms: Term) -> list[str]:
     return [name[1:] for term in terms for name in term.signals() if name.startswith("?")]
 
 
-def _with_numbers(e: Term, values: Mapping[str, float]) -> Term:
-    match e:
-        case Signal(name) if name.startswith("?"):
-            return Number(values[name[1:]])
-        case Arithmetic(name, arguments):
-            filled = tuple(expression(_with_numbers(a, values)) for a in arguments)
-            return Arithmetic(name, filled)
-    return e
-
-
 def _term_signs(e: Term, name: str) -> set[int]:
     """Return the directions in which an expression moves as a signal grows; 0 for unknown."""
     if name not in e.signals():
         return set()
     match e:
+        case Duration():
+            return {0}
         case Signal():
             return {1}
         case Arithmetic("+" | "min" | "max" | "sqrt" | "exp", arguments):

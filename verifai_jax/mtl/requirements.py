@@ -15,8 +15,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.errors import check_names, require
+from verifai_jax.core.errors import check_names
 from verifai_jax.core.reads import documents
+from verifai_jax.core.yaml import read_yaml
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.reqif import read_reqif, reqif_document
@@ -187,7 +188,7 @@ def _tables(
     kind = "TOML" if path.suffix.lower() == ".toml" else "YAML"
     try:
         text = path.read_text(encoding="utf-8")
-        whole: object = tomllib.loads(text) if kind == "TOML" else _read_yaml(text)
+        whole: object = tomllib.loads(text) if kind == "TOML" else read_yaml(text)
     except ValueError as error:
         raise ValueError(f"{path} is no {kind}: {error}") from None
     if not isinstance(whole, dict):
@@ -207,18 +208,6 @@ def _tables(
         if not isinstance(value, str):
             raise ValueError(f"{path}: definition {name!r} must be a text; got {value!r}")
     return entries, {**own, **numbers}, {**named, **parts}
-
-
-def _read_yaml(text: str) -> object:
-    """Read YAML without tags of Python.
-
-    **Raises:** `ValueError` for anything else.
-    """
-    yaml = require("yaml", "yaml")
-    try:
-        return yaml.safe_load(text)
-    except (yaml.YAMLError, RecursionError) as error:
-        raise ValueError(" ".join(str(error).split())) from None
 
 
 def _fields(where: str, entry: Mapping[str, object], need_formulas: bool) -> dict[str, str]:

@@ -16,6 +16,7 @@ from verifai_jax.core.trace import Samples, Trace, as_array, check_period
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.columns import LeftOut
 from verifai_jax.mtl.evaluate import End, Evaluator
+from verifai_jax.mtl.expression import durations_in
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.semantics import Semantics
 
@@ -113,7 +114,9 @@ def prepare(
     if trace.valid is not None and end == "hold":
         trace = trace.hold()
     trace = trace.finely()
-    valid = None if trace.valid is None or end == "hold" else jnp.asarray(trace.valid)
+    # Under "hold" only what is counted depends on where a trace ended.
+    ends = end != "hold" or durations_in(formula)
+    valid = jnp.asarray(trace.valid) if trace.valid is not None and ends else None
     signals = numbers_of_signals({name: trace.signals[name] for name in formula.signals()})
     setting = Setting(
         formula, trace.length, dt, semantics.kind, semantics.error, semantics.bound, end, compat,

@@ -15,9 +15,10 @@ from typing import NamedTuple
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import samples
+from verifai_jax.mtl.expression import Duration, durations_in
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.rewriting import expand, simplify
-from verifai_jax.mtl.semantics import Semantics, hard
+from verifai_jax.mtl.semantics import Semantics, boolean, hard
 from verifai_jax.mtl.tree import missing_case
 
 LARGEST = 2**27
@@ -64,12 +65,22 @@ class Output(NamedTuple):
     ends: bool
 
 
+class Count(NamedTuple):
+    """A duration that leaves read: the plan of what is counted in `n` samples, `dt` apart."""
+
+    duration: Duration
+    plan: "Plan"
+    n: int
+    dt: float
+
+
 class Plan(NamedTuple):
     """The operations of monitors of several formulas at each sample.
 
     - `formulas`: by name.
     - `leaves`: the leaves with the sign of their margin.
     - `top`: the greatest value: infinity, or 1 for truth values.
+    - `counts`: the durations that the leaves read.
     """
 
     formulas: Mapping[str, Formula]
@@ -77,12 +88,14 @@ class Plan(NamedTuple):
     ops: tuple[Op, ...]
     outputs: tuple[Output, ...]
     top: float
+    counts: tuple[Count, ...]
 
     @property
     def memory(self) -> int:
         """Samples that the windows hold."""
         held = {"delay": 1, "window": 1, "until": 2, "since": 2}
-        return sum(op.n * held.get(op.kind, 0) for op in self.ops)
+        counted = sum(count.n + count.plan.memory for count in self.counts)
+        return counted + sum(op.n * held.get(op.kind, 0) for op in self.ops)
 
 
 def streams(
@@ -117,7 +130,14 @@ def streams(
         slot, delay = plan.stream(f, 1) if every else (plan.at_start(f, 1), 0)
         wait = delay if every else plan.settling(f) + 1
         outputs.append(Output(slot, delay, wait, plan.ends(f)))
-    made = Plan(parsed, tuple(plan.leaves), tuple(plan.ops), tuple(outputs), plan.top)
+    counts = tuple(
+        Count(
+            each, streams(each.operand, dt, boolean, every=True),
+            int(samples(each.window, dt, ast.Interval(0.0, each.window))), dt,
+        )
+        for each in durations_in(*(f for f, _ in plan.leaves))
+    )  # fmt: skip
+    made = Plan(parsed, tuple(plan.leaves), tuple(plan.ops), tuple(outputs), plan.top, counts)
     if made.memory > LARGEST:
         raise ValueError(
             f"the windows hold {made.memory} samples, and a monitor may hold {LARGEST}: sample "

@@ -7,7 +7,7 @@ unit_of(term, units, faults)                            # 'm', and what does not
 import re
 from collections.abc import Iterable, Mapping
 
-from verifai_jax.mtl.expression import Arithmetic, Component, Signal
+from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Signal
 from verifai_jax.mtl.formula import Term
 
 IN_NAME = re.compile(r"[(\[]\s*([^()\[\]\d][^()\[\]]*?)\s*[)\]]\s*$")
@@ -50,11 +50,15 @@ def plain_unit(unit: str) -> str:
 def unit_of(e: Term, units: Mapping[str, str], faults: list[str]) -> str | None:
     """Return the unit of an expression; None if it is unknown, as for a number alone.
 
+    That of `2 * speed` is unknown, too, since the number may stand for seconds.
+
     **Arguments:**
 
     - `faults`: gets a sentence on each two units that are added, and on a sine of degrees.
     """
     match e:
+        case Duration():
+            return "s"
         case Signal(name):
             return units.get(name)
         case Component(vector, _):
@@ -68,8 +72,4 @@ def unit_of(e: Term, units: Mapping[str, str], faults: list[str]) -> str | None:
                 if len(known) > 1:
                     faults.append(f"{e} computes with {' and '.join(known)} together")
                 return known[0] if len(known) == 1 else None
-            if word in ("*", "/") and not arguments[1].signals():
-                return parts[0]
-            if word == "*" and not arguments[0].signals():
-                return parts[1]
     return None

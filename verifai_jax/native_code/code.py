@@ -27,7 +27,7 @@ _MADE = re.compile(r"\b([uvimw])\d+\b")
 
 
 class Piece:
-    """Straight code: lines for all simulations together, for each vector, and after these."""
+    """Code without branches: lines that run once before, for each vector, and once after."""
 
     def __init__(self) -> None:
         self.together: list[str] = []

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 import numpy as np
+from jax.extend.core import Literal
 
 from verifai_jax.core.fingerprint import operands_of_scan, programs_in
 from verifai_jax.native_code.translation import SINGLE, Translator, pairs, rule, words_of
@@ -13,6 +14,7 @@ from verifai_jax.native_code.values import (
     Equation,
     Form,
     Memory,
+    Params,
     Program,
     Value,
     constant,
@@ -196,6 +198,27 @@ def _while(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     asked, shared = inputs[:before], inputs[before : before + inside]
     start = inputs[before + inside :]
     forms = [each.aval for each in step.outvars]
+    switch = _only_once(params)
+
+    def emit_branch(carry: Carry) -> list[Value] | None:
+        # Nothing of it is computed in front of it, as it would be for a loop.
+        on = elements(start[switch or 0]).item()
+        mask = on if on.uniform else t.code.keep("b", False)
+        if not on.uniform:
+            t.code.assign([mask], [on])
+            t.code.control(f"{{ I on = I(); REPEAT on |= {mask.text}_[k]; if (any(on)) {{")
+        else:
+            t.code.control(f"{{ if ({on.text}) {{")
+        results = t.closed(params["body_jaxpr"], [*shared, *start])
+        if not on.uniform:
+            results = _chosen(t, mask, start, results, forms)
+        if carry.varies(results):
+            return None
+        carry.assign(results)
+        t.code.control("} else {")
+        carry.assign(start)
+        t.code.control("} }")
+        return carry.values
 
     def emit(carry: Carry) -> list[Value] | None:
         carry.assign(start)
@@ -210,17 +233,35 @@ def _while(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
             t.code.assign([mask], [on])
             t.code.control(f"{{ I on = I(); REPEAT on |= {mask.text}_[k]; if (!any(on)) break; }}")
             results = t.closed(params["body_jaxpr"], [*shared, *carry.values])
-            results = [
-                t.elementwise("select_n", {}, [_single(mask), old, new], kind_of(f.dtype), f.shape)
-                for old, new, f in zip(carry.values, results, forms, strict=True)
-            ]
+            results = _chosen(t, mask, carry.values, results, forms)
         if carry.varies(results):
             return None
         carry.assign(results)
         t.code.close_loop()
         return carry.values
 
-    return until_settled(t, forms, [is_uniform(value) for value in start], emit)
+    written = emit if switch is None else emit_branch
+    return until_settled(t, forms, [is_uniform(value) for value in start], written)
+
+
+def _chosen(
+    t: Translator, mask: Element, old: list[Value], new: list[Value], forms: Forms
+) -> list[Value]:
+    """Return the new values where the mask is set, and the old ones elsewhere."""
+    return [
+        t.elementwise("select_n", {}, [_single(mask), *each], kind_of(form.dtype), form.shape)
+        for *each, form in zip(old, new, forms, strict=True)
+    ]
+
+
+def _only_once(params: Params) -> int | None:
+    """Return which value decides on the only pass of a loop; None for one of more passes."""
+    (asked,), condition = params["cond_jaxpr"].jaxpr.outvars, params["cond_jaxpr"].jaxpr
+    if asked not in condition.invars[params["cond_nconsts"] :]:
+        return None
+    index = condition.invars.index(asked) - params["cond_nconsts"]
+    after = params["body_jaxpr"].jaxpr.outvars[index]
+    return index if isinstance(after, Literal) and not after.val else None
 
 
 @rule("cond")

@@ -46,7 +46,7 @@ def plot_overview(analysis: Analysis, path: str | Path | None = None) -> Figure:
     across, up = two_features(samples, [*used, *ranked])
     draw_samples(axes, samples, across, up)
     for number, rule in enumerate(rules.rules[:MAX_RULES] if rules else (), 1):
-        draw_rule(axes, samples, rule, across, up, f"rule {number}")
+        draw_rule(axes, samples, rule, across, up, number, "rule ")
     _mark_representatives(axes, analysis, across, up)
     if importance is not None:
         columns = {target: _NAMES[target] for target in importance.scores}

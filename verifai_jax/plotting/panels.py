@@ -36,7 +36,7 @@ def plot_rules(rules: Rules, path: str | Path | None = None) -> Figure:
     axes = figure.subplots()
     draw_samples(axes, samples, across, up)
     for number, rule in enumerate(rules.rules, 1):
-        draw_rule(axes, samples, rule, across, up, str(number))
+        draw_rule(axes, samples, rule, across, up, number)
     lines = [f"{i}  {rule}" for i, rule in enumerate(rules.rules[:3], 1)]
     title = "\n".join(_wrapped(line) for line in lines or [str(rules)])
     figure.suptitle(title, fontsize=8, x=0.02, ha="left")
@@ -88,9 +88,12 @@ def cells(
 
 
 def draw_rule(
-    axes: Axes, samples: Samples, rule: Rule, across: str, up: str, label: str = ""
+    axes: Axes, samples: Samples, rule: Rule, across: str, up: str, number: int, noun: str = ""
 ) -> None:
-    """Draw the boxes of a rule over two features, dashed where it has conditions on others."""
+    """Draw the boxes of a rule over two features, dashed where it has conditions on others.
+
+    The labels of four consecutive numbers are inside different corners, as boxes may share theirs.
+    """
     from matplotlib.patches import Rectangle
 
     features = {condition.feature for condition in rule.conditions}
@@ -113,9 +116,16 @@ def draw_rule(
                     linestyle="--" if projected else "-",
                 )
             )
-            if first and label:
+            if first:
+                right, down = number % 2 == 0, number % 4 in (0, 3)
                 axes.annotate(
-                    label, (x0, y1), xytext=(4, -11), textcoords="offset points", color=BOUND
+                    f"{noun}{number}",
+                    (x1 if right else x0, y0 if down else y1),
+                    xytext=(-4 if right else 4, 4 if down else -4),
+                    textcoords="offset points",
+                    ha="right" if right else "left",
+                    va="bottom" if down else "top",
+                    color=BOUND,
                 )
                 first = False
     axes.set_xlim(limits[0])

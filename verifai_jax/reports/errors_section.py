@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 from verifai_jax.error_budgets.result import ErrorBudget
 from verifai_jax.reports.claims import Claim
 from verifai_jax.reports.markup import Child, paragraph, table
-from verifai_jax.reports.page import Page, Section
+from verifai_jax.reports.page import Page, Section, before_limits
 
 ADDED = (
     "The parts are measured one by one and added. What two algorithms have in common, such as "
@@ -38,7 +38,5 @@ def with_errors(page: Page, errors: ErrorBudget) -> Page:
     )
     evidence = (f"{errors.simulations:,} simulations", "section errors")
     claim = Claim("E1", errors.total, evidence, (ADDED,))
-    index = next(i for i, each in enumerate(page.sections) if each.anchor == "limits")
-    sections = (*page.sections[:index], section, *page.sections[index:])
     claims = {**page.claims, "claims": [*page.claims["claims"], asdict(claim)]}
-    return replace(page, sections=sections, claims=claims)
+    return replace(before_limits(page, section), claims=claims)

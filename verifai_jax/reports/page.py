@@ -10,7 +10,7 @@ hashes: nothing is loaded, nothing is sent, and no text that came into the page 
 import base64
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,12 @@ class Page:
     claims: Mapping[str, Any]
     view: Mapping[str, Any] | None = field(default=None, repr=False)
     warnings: tuple[Markup, ...] = ()
+
+
+def before_limits(page: Page, section: Section) -> Page:
+    """Return a page with a section before the one on what was not shown."""
+    index = next(i for i, each in enumerate(page.sections) if each.anchor == "limits")
+    return replace(page, sections=(*page.sections[:index], section, *page.sections[index:]))
 
 
 def asset(name: str) -> str:

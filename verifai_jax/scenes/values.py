@@ -18,7 +18,7 @@ class Unsupported(Exception):
 
 
 def is_plain(*values: Any) -> bool:
-    """Return whether all are plain numbers of Python or NumPy."""
+    """Return whether all values are plain numbers of Python or NumPy."""
     return all(isinstance(value, int | float | np.generic) for value in values)
 
 

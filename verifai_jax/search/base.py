@@ -110,8 +110,8 @@ class Wants:
     - `clause_gradients`: `Observations.clause_gradients`, in the rounds whose plan says so.
     - `coverage_ids`: `Observations.coverage_ids`.
     - `outcomes`: `Observations.outcomes`.
-    - `no_verdict_rows`: simulations without a verdict as if they were valid, with the greatest
-      robustness so far, so that a model of the robustness learns to stay away from them.
+    - `no_verdict_rows`: simulations without a verdict as valid rows whose robustness is NaN, so
+      that a model of the robustness learns to stay away from them.
     - `traces`: a model of the traces that proposes some of the points, with these options.
     - `likelihood`: an objective by which failures are the better the likelier they are, in the
       place of the robustness.

@@ -6,35 +6,39 @@ Each round asks for a batch of points that might fail, by one of two rules.
   batches Hernandez-Lobato et al., Parallel and distributed Thompson sampling for large-scale
   accelerated exploration of chemical space, ICML 2017). The functions are whole ones, so the minima
   are sought in two steps: over candidates that all share, then around each function's best.
-- Expected improvement, with local penalization of the points already chosen for the batch
-  (Gonzalez, Dai, Hennig, Lawrence, Batch Bayesian optimization via local penalization,
-  AISTATS 2016).
+- Expected improvement (`improvement`).
+
+While no failure is known, every fourth point refines the best one: by a process of the points near
+it alone, over the box around them, almost without regard to what it does not know. Where
+simulations had no verdict another process says how likely one is.
 
 All failures are equally good: below zero the target is flat. Above it is logarithmic in the
 robustness over its lower quartile, and capped, so that huge values do not hide the rest.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import log_ndtr, ndtr
-from jaxtyping import Array, Bool, Float, Int, Key, UInt32
+from jax.scipy.special import log_ndtr
+from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Search, Wants, draw_uniform, standard_normal
-from verifai_jax.search.gaussian_process import (
-    Hyper,
-    Posterior,
-)
+from verifai_jax.search.gaussian_process import Hyper, Posterior, TrainingData
 from verifai_jax.search.halton import halton_points
+from verifai_jax.search.improvement import APART, PARENTS, already_simulated, improving
 from verifai_jax.search.process_data import (
+    LARGEST,
+    NO_VERDICT,
     encode,
     process_of,
     rows_to_keep,
+    scores,
     snap,
     training_data,
 )
@@ -45,11 +49,9 @@ from verifai_jax.search.process_data import (
 MAX_PATHS = 32  # functions drawn for a batch; larger batches take several points from each
 WAVES = 256  # random waves of such a function
 FIT_POINTS, FIT_STEPS = 192, 8
-PARENTS = 8  # best points around which candidates are drawn
-# Correlation with an observation, above which a point need not be simulated: a hundred and
-# more roundings of float32 below one.
-KNOWN = 1 - 1e-5
-LARGEST = 1e30  # robustness above which nothing differs: sums of such stay finite in float32
+MARGIN = 0.1  # of the box around the best points, on each side
+REFITS = 20  # steps of its fit, from the first hyper-parameters on
+GREEDY = 0.1  # factor on its standard deviations: it is there to refine
 PATIENCE = 80  # points without progress, after which half of them are those of the prior
 
 
@@ -60,7 +62,7 @@ class BayesState(NamedTuple):
     explored: UInt32[Array, ""]  # points of the prior among them
     results: UInt32[Array, ""]  # rows, in all
     u: Float[Array, "capacity d"]
-    score: Float[Array, " capacity"]  # robustness, 0 for all failures; infinite where no point is
+    score: Float[Array, " capacity"]  # as of `scores`; infinite where no point is
     luck: Float[Array, " capacity"]  # says which points are kept
     verdicts: Int[Array, ""]  # points with a verdict, in all
     fitted: Int[Array, ""]  # of which the last fit knew
@@ -126,7 +128,7 @@ class Bayes(Search[BayesState]):
     ) -> tuple[Float[Array, "batch d"], BayesState]:
         key = jax.random.fold_in(state.key, state.round)
         row = jnp.arange(batch, dtype=jnp.uint32)
-        present = jnp.isfinite(state.score)
+        present = state.score <= LARGEST
         spread = jnp.max(state.score, where=present, initial=0.0) > jnp.min(
             state.score, where=present, initial=jnp.inf
         )
@@ -164,12 +166,15 @@ class Bayes(Search[BayesState]):
         return jnp.where(prior[:, None], fresh, chosen), after
 
     def tell(self, state: BayesState, cube: Cube, observations: Observations) -> BayesState:
-        usable = observations.valid & (observations.rho < jnp.inf)
-        score = jnp.where(usable, jnp.clip(observations.rho, 0.0, LARGEST), jnp.inf)
+        score = scores(observations)
+        usable = jnp.isfinite(score)
         number = state.results + jnp.arange(len(score), dtype=jnp.uint32)
-        progress = jnp.min(score) < 0.99 * jnp.min(state.score)
+        # Where no failure is near, what is left above the lowest counts, not above zero.
+        lowest, ordered = jnp.min(state.score), jnp.sort(state.score)
+        middle = ordered[jnp.sum(ordered <= LARGEST) // 2]
+        progress = jnp.min(score) < lowest - 0.01 * jnp.where(middle <= LARGEST, middle - lowest, 0)
         progress |= jnp.any(score == 0)
-        count = jnp.sum(usable, dtype=jnp.int32)
+        count, verdicts = (jnp.sum(each, dtype=jnp.int32) for each in (usable, score <= LARGEST))
         # A Weyl sequence (in steps of the golden ratio): as good as random for choosing.
         luck = (number * np.uint32(2654435769) >> 8).astype(jnp.float32) / 2**24
         u = jnp.concatenate([jnp.where(usable[:, None], observations.u, 0.5), state.u])
@@ -181,7 +186,7 @@ class Bayes(Search[BayesState]):
             u=u[rows],
             score=score[rows],
             luck=luck[rows],
-            verdicts=state.verdicts + count,
+            verdicts=state.verdicts + verdicts,
             stale=jnp.where(progress, 0, state.stale + count),
         )
         due = (state.verdicts >= self.initial) & (
@@ -206,17 +211,15 @@ class Bayes(Search[BayesState]):
         anywhere: Float[Array, "half d"],
     ) -> Float[Array, "batch d"]:
         """Return the points that the acquisition function ranks first."""
-        posterior = process_of(cube).condition(
-            state.hyper, training_data(state.u, state.score, cube)
-        )
+        process, data = process_of(cube), training_data(state.u, state.score, cube)
+        posterior, risk = process.condition(state.hyper, data), _risk(state, cube)
         drawing, placing = jax.random.split(key)
         half, d = anywhere.shape
-        if self.acquisition == "thompson":
-            paths = min(batch, MAX_PATHS)
-            each = -(-batch // paths)  # points from each path
-            steps = (paths * each, max(self.candidates // (paths * each), 4))
-        else:
-            paths, each, steps = 0, 0, (PARENTS, max(half // PARENTS, 1))
+        paths = min(batch, MAX_PATHS)
+        each = -(-batch // paths)  # points from each path
+        steps = (paths * each, max(self.candidates // (paths * each), 4))
+        if self.acquisition != "thompson":
+            steps = (0, 0)
         # Half of the candidates are anywhere, half of them around the best points, far and near.
         children = steps[0] * steps[1]
         width = 3 + 2 * d
@@ -227,8 +230,74 @@ class Bayes(Search[BayesState]):
         near = _near(state.u[parent], first, cube, jnp.array([0.5, 0.01]))
         shared = jnp.concatenate([anywhere, near])
         if self.acquisition == "thompson":
-            return _minima(drawing, posterior, cube, shared, later, paths)[:batch]
-        return _improving(posterior, cube, shared, later[0], batch)
+            chosen = _minima(drawing, posterior, risk, cube, shared, later, paths)[:batch]
+        else:
+            chosen = improving(posterior, risk, cube, (0.0, 1.0), 1.0, shared, batch)
+        # Where no failure is known every fourth point refines the best one.
+        refined = _refined(state, risk, cube, anywhere, batch)
+        row = jnp.arange(batch, dtype=jnp.uint32)
+        turn = (jnp.min(state.score) > 0) & ((state.proposals + row) % 4 == 0)
+        return jnp.where(turn[:, None], refined, chosen)
+
+
+def _risk(state: BayesState, cube: Cube) -> Callable[[Float[Array, "m d"]], Float[Array, " m"]]:
+    """Return minus the log probability of a verdict as a function of points; zero if all had one.
+
+    By another process, of zero for simulations with a verdict and one for those without.
+    """
+    process, without = process_of(cube), state.score == NO_VERDICT
+    data = TrainingData(encode(state.u, cube), without * 1.0, jnp.isfinite(state.score))
+    some, n = jnp.any(without), len(without)
+    nothing = jnp.eye(n, dtype=jnp.float32), jnp.zeros(n, jnp.float32)
+    # Where all simulations had a verdict nothing of this is computed.
+    posterior = jax.lax.cond(
+        some,
+        lambda: process.condition(process.first(), data),
+        lambda: Posterior(process.first(), data.x, data.mask, data.y, *nothing),
+    )
+
+    def risk(u: Float[Array, "m d"]) -> Float[Array, " m"]:
+        def known() -> Float[Array, " m"]:
+            share, std = process.predict(posterior, encode(u, cube))
+            return -log_ndtr((0.5 - share) / std)
+
+        return jax.lax.cond(some, known, lambda: jnp.zeros(len(u), u.dtype))
+
+    return risk
+
+
+def _refined(
+    state: BayesState,
+    risk: Callable[[Float[Array, "m d"]], Float[Array, " m"]],
+    cube: Cube,
+    anywhere: Float[Array, "half d"],
+    batch: int,
+) -> Float[Array, "batch d"]:
+    """Return points of the greatest expected improvement by a process of those near the best.
+
+    Over the box around them, which shrinks with them, and by the values in it: so it tells
+    values apart that are the same to the process of all points.
+    """
+    process, count = process_of(cube), min(3 * (cube.dim + 2), len(state.score))
+    away = jnp.sum((state.u - state.u[jnp.argmin(state.score)]) ** 2, axis=1)
+    _, best = jax.lax.top_k(-jnp.where(state.score <= LARGEST, away, jnp.inf), count)
+    there = state.score[best] <= LARGEST
+    points = state.u[best]
+    low = jnp.min(points, axis=0, where=there[:, None], initial=1.0)
+    high = jnp.max(points, axis=0, where=there[:, None], initial=0.0)
+    margin = jnp.maximum(MARGIN * (high - low), APART)
+    low, high = jnp.maximum(low - margin, 0.0), jnp.minimum(high + margin, 1.0)
+    discrete = np.array(cube.levels) > 0
+    low, high = jnp.where(discrete, 0.0, low), jnp.where(discrete, 1.0, high)
+    box = (low, jnp.maximum(high - low, APART))
+    score = jnp.where(there, state.score[best] - jnp.min(state.score), jnp.inf)
+    x = jnp.where(discrete, encode(points, cube), (points - box[0]) / box[1])
+    _, y, mask = training_data(points, score, cube)
+    data = TrainingData(x, y, mask)
+    hyper = process.fit(process.first(), data, REFITS)
+    posterior = process.condition(hyper, data)
+    shared = jnp.concatenate([(points - box[0]) / box[1], anywhere])
+    return improving(posterior, risk, cube, box, GREEDY, shared, batch)
 
 
 # How far around its best candidate a function's minimum is sought, in two steps: the largest and
@@ -239,6 +308,7 @@ CLOSER = ((0.2, 0.02), (0.04, 0.004))
 def _minima(
     key: Key[Array, ""],
     posterior: Posterior,
+    risk: Callable[[Float[Array, "m d"]], Float[Array, " m"]],
     cube: Cube,
     shared: Float[Array, "m d"],
     random: Float[Array, "2 parents children r"],
@@ -251,9 +321,10 @@ def _minima(
     each = parents // count
 
     def basis(u: Float[Array, "m d"]) -> tuple[Array, Array]:
-        basis = process.basis(posterior, paths, encode(u, cube))
+        x = encode(u, cube)
+        basis = process.basis(posterior, paths, x)
         # Simulated already: to be chosen only if there is nothing else.
-        return basis, 100.0 * _already_simulated(posterior, basis[:, WAVES:])
+        return basis, risk(u) + 100.0 * already_simulated(x, posterior)
 
     shared = snap(shared, cube)
     terms, penalty = basis(shared)
@@ -281,56 +352,6 @@ def _minima(
     return best
 
 
-def _improving(
-    posterior: Posterior,
-    cube: Cube,
-    shared: Float[Array, "m d"],
-    random: Float[Array, "parents children r"],
-    batch: int,
-) -> Float[Array, "batch d"]:
-    """Return points with the largest expected improvement, each away from those before it."""
-    process = process_of(cube)
-    lowest = jnp.min(posterior.residual, where=posterior.mask, initial=jnp.inf)
-
-    def merit(u: Float[Array, "m d"]) -> tuple[Array, Array, Array]:
-        mean, std = process.predict(posterior, encode(u, cube))
-        z = (lowest - mean) / std
-        density = jnp.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
-        gain = std * (z * ndtr(z) + density)
-        # Far below zero the difference above is rounding errors; order by the distance instead.
-        worth = jnp.where(z > -4, jnp.log(jnp.maximum(gain, 1e-12)), -25 - z**2 / 2)
-        known = _already_simulated(posterior, process.cross(posterior, encode(u, cube)))
-        return jnp.where(known, worth - 1e6, worth), mean, std
-
-    shared = snap(shared, cube)
-    worth, mean, std = merit(shared)
-    _, best = jax.lax.top_k(worth, random.shape[0])
-    parent = jnp.repeat(shared[best], random.shape[1], axis=0)
-    near = _near(parent, random.reshape(len(parent), -1), cube, jnp.array(CLOSER[0]))
-    near = snap(near, cube)
-    u = jnp.concatenate([shared, near])
-    worth, mean, std = (
-        jnp.concatenate([one, two])
-        for one, two in zip((worth, mean, std), merit(near), strict=True)
-    )
-    x = encode(u, cube)
-    gradient = jax.grad(lambda x: jnp.sum(process.predict(posterior, x)[0]))(x)
-    steepest = jnp.maximum(jnp.sqrt(jnp.max(jnp.sum(gradient**2, axis=1))), 1e-3)
-    codes = np.array(process.unordered)
-
-    def choose(worth: Float[Array, " m"], _: None) -> tuple[Array, Array]:
-        best = jnp.argmax(worth)
-        # Codes that differ are as far apart as the cube is wide.
-        apart = jnp.where(codes, x != x[best], x - x[best])
-        distance = jnp.sqrt(jnp.sum(apart**2, axis=1))
-        # Probability that no point so good lies between there and the one chosen.
-        z = (steepest * distance - mean[best] + lowest) / std[best]
-        return (worth + log_ndtr(z)).at[best].set(-jnp.inf), best
-
-    _, chosen = jax.lax.scan(choose, worth, None, length=batch)
-    return u[chosen]
-
-
 def _near(
     parent: Float[Array, "n d"],
     random: Float[Array, "n r"],
@@ -348,7 +369,3 @@ def _near(
     # An unordered choice has no neighbours: any other.
     codes = np.array(process_of(cube).unordered)
     return jnp.where(moves, jnp.where(codes, noise, moved), parent)
-
-
-def _already_simulated(posterior: Posterior, cross: Float[Array, "m n"]) -> Bool[Array, " m"]:
-    return jnp.max(cross, axis=1) > KNOWN * jnp.exp(posterior.hyper.variance)

@@ -56,6 +56,7 @@ class CrossEntropyState(NamedTuple):
     score: Float[Array, " k"]  # robustness, 0 for all failures; infinite where there is no point
     stale: Int[Array, ""]  # rounds without progress
     explored: UInt32[Array, ""]  # how many points of the prior were asked for
+    highest: Float[Array, ""]  # robustness so far
 
 
 @dataclass(frozen=True)
@@ -102,6 +103,7 @@ class CrossEntropy(Search[CrossEntropyState]):
             score=jnp.full(k, jnp.inf, jnp.float32),
             stale=jnp.int32(0),
             explored=jnp.uint32(0),
+            highest=jnp.full((), -jnp.inf, jnp.float32),
         )
 
     def ask(
@@ -110,7 +112,9 @@ class CrossEntropy(Search[CrossEntropyState]):
         key = jax.random.fold_in(state.key, state.round)
         fitted = self._draw(key, state, cube, batch)
         row = jnp.arange(batch, dtype=jnp.uint32)
+        # Of points that are equally good, and do not fail, none says where to go.
         known = jnp.sum(jnp.isfinite(state.score)) >= 2
+        known &= (state.highest > state.score[0]) | (state.score[0] == 0)
         exploited = jnp.where(known, batch - int(np.ceil(self.exploration * batch)), 0)
         exploited = exploited.astype(jnp.uint32)
         # Numbered without gaps: every 16th point of the sequence would stay in one half of it.
@@ -132,6 +136,10 @@ class CrossEntropy(Search[CrossEntropyState]):
             elite=elite,
             score=jnp.where(again, jnp.inf, score),
             stale=jnp.where(again, 0, stale).astype(jnp.int32),
+            highest=jnp.maximum(
+                state.highest,
+                jnp.max(observations.rho, where=observations.usable, initial=-jnp.inf),
+            ),
         )
 
     def _draw(

@@ -34,7 +34,7 @@ from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.outcomes import OUTCOME
 from verifai_jax.search.base import Observations, Search, Wants
 from verifai_jax.search.behaviour import SeenBehaviour, is_known
-from verifai_jax.search.gradient import NOTHING
+from verifai_jax.search.clause_values import NOTHING
 from verifai_jax.search.wrapper import Learn, Wrapper
 
 AT_ONCE = 16

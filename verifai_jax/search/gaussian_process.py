@@ -12,6 +12,7 @@ covariance of independent noise and the target zero, which changes nothing.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -30,7 +31,7 @@ LENGTH = (-4.0, 8.0)
 few hundred points say nothing about what lies between them, to 3000 cubes, where a coordinate is of
 no influence."""
 
-NOISE = (-9.0, 0.0)
+NOISE = (-11.0, 0.0)
 """Range of the logarithm of the noise, which keeps 32-bit factors finite."""
 
 SMALLEST = 2.0**-24
@@ -168,10 +169,20 @@ class GaussianProcess:
         self, posterior: Posterior, x: Float[Array, "m d"]
     ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Return mean and standard deviation of the values at these points, without noise."""
-        cross = self.cross(posterior, x)
-        left = solve_triangular(posterior.factor, cross.T, lower=True)
-        variance = jnp.exp(posterior.hyper.variance) - jnp.sum(left**2, axis=0)
-        return cross @ posterior.weights, jnp.sqrt(jnp.maximum(variance, 1e-12))
+        return self.predictor(posterior)(x)
+
+    def predictor(self, posterior: Posterior) -> Callable[[Float[Array, "m d"]], tuple]:
+        """Return `predict` as a function of points, whose calls are products of matrices."""
+        identity = jnp.eye(len(posterior.residual), dtype=posterior.factor.dtype)
+        inverse = solve_triangular(posterior.factor, identity, lower=True)
+
+        def predict(x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+            cross = self.cross(posterior, x)
+            variance = jnp.exp(posterior.hyper.variance)
+            variance = variance - jnp.sum((cross @ inverse.T) ** 2, axis=1)
+            return cross @ posterior.weights, jnp.sqrt(jnp.maximum(variance, 1e-12))
+
+        return predict
 
     def paths(self, posterior: Posterior, key: Key[Array, ""], count: int, waves: int) -> Paths:
         """Draw `count` functions from the posterior; the prior's part has `waves` random waves."""

@@ -23,7 +23,6 @@ already, the first box is smaller still.
 """
 
 from dataclasses import dataclass
-from itertools import combinations
 from typing import ClassVar, NamedTuple
 
 import jax
@@ -32,7 +31,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction, check_positive
-from verifai_jax.core.clauses import ABSENT, CLAUSES
+from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import (
     Observations,
@@ -43,11 +42,9 @@ from verifai_jax.search.base import (
     draw_uniform,
     nearest_to_failing,
 )
+from verifai_jax.search.clause_values import NOTHING
 from verifai_jax.search.halton import halton_points
-
-NOTHING = ABSENT / 10
-"""Values of clauses below mean that a goal has no such clause. Above `ABSENT`, which is raised
-where what a search learns is changed, and below the value of any clause, which has no unit."""
+from verifai_jax.search.linear_steps import HALVINGS, flip_weakest, minimax_direction
 
 LITTLE = 0.9
 """Share of the robustness that is left after a step which is only a little better.
@@ -80,11 +77,6 @@ box is tried, and the next smaller one is not."""
 COOLING = 0.7
 """Factor on the temperature with each step, after the first descent. Chosen by hand;
 no comparison with other values is recorded."""
-
-
-HALVINGS = 24
-"""Halvings of the interval that holds the weight at which two clauses are equal: as many as a
-float32 has bits, so that more would change nothing."""
 
 
 class GradientState(NamedTuple):
@@ -253,7 +245,7 @@ class Gradient(Search[GradientState]):
         solve = jax.vmap(minimax_direction, in_axes=(0, 0, 0, 0, None, None))
         tried = solve(clauses, gradients, point, box, free, halvings)
         stays = jnp.max(jnp.abs(tried - point), axis=1, initial=0.0) < 1e-6
-        flip = jax.vmap(_flip, in_axes=(0, 0, 0, 0, None))
+        flip = jax.vmap(flip_weakest, in_axes=(0, 0, 0, 0, None))
         other = flip(clauses, gradients, point, state.flips[descent] + size, free)
         return jnp.where(stays[:, None], other, tried), stays
 
@@ -283,7 +275,10 @@ class Gradient(Search[GradientState]):
         gradients = jnp.where(usable[best][:, None, None], observations.clause_gradients[best], 0.0)
         finite = jnp.all(jnp.isfinite(gradients), axis=(1, 2))
         gradients = jnp.where(finite[:, None, None], gradients, 0.0)
-        informative = finite & jnp.any(gradients != 0, axis=(1, 2)) & jnp.isfinite(lowest)
+        # Where the greatest clause has no slope, a step lowers none that counts.
+        greatest = jnp.argmax(clauses[best], axis=1)[:, None, None]
+        slope = jnp.take_along_axis(gradients, greatest, axis=1)
+        informative = finite & jnp.any(slope != 0, axis=(1, 2)) & jnp.isfinite(lowest)
         visited = jnp.any(owner, axis=1)
         before = jnp.max(state.clauses, axis=1)
 
@@ -392,75 +387,3 @@ class Gradient(Search[GradientState]):
 
 def _rows(chosen: Bool[Array, " n"], new: Array, old: Array) -> Array:
     return jnp.where(chosen.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
-
-
-def minimax_direction(
-    clauses: Float[Array, " clauses"],
-    gradients: Float[Array, "clauses d"],
-    point: Float[Array, " d"],
-    radius: Float[Array, ""],
-    free: Bool[np.ndarray, " d"],
-    halvings: Int[Array, ""],
-) -> Float[Array, " d"]:
-    """Minimise the greatest of linear clauses over a box.
-
-    Exact for two clauses; for more the best of all points where one is least or two meet, or part
-    of the way there where they lie higher than the point itself.
-    """
-    low, high = jnp.maximum(point - radius, 0.0), jnp.minimum(point + radius, 1.0)
-
-    def corner(gradient: Float[Array, "*m d"]) -> Float[Array, "*m d"]:
-        target = jnp.where(gradient > 0, low, jnp.where(gradient < 0, high, point))
-        return jnp.where(free, target, point)
-
-    def linear(points: Float[Array, "*m d"]) -> Float[Array, "*m clauses"]:
-        return clauses + (points - point) @ gradients.T
-
-    pairs = np.array(list(combinations(range(CLAUSES), 2)))
-    one, two = gradients[pairs[:, 0]], gradients[pairs[:, 1]]
-
-    apart, turned = clauses[pairs[:, 0]] - clauses[pairs[:, 1]], one - two
-
-    def gap(points: Float[Array, "m d"]) -> Float[Array, " m"]:
-        return apart + jnp.sum((points - point) * turned, axis=1)
-
-    def halve(_: Int[Array, ""], weights: tuple[Array, Array]) -> tuple[Array, Array]:
-        # At the lower weight on the first clause it is the greater one, at the upper the second.
-        lower, upper = weights
-        middle = (lower + upper) / 2
-        above = gap(corner(middle[:, None] * one + (1 - middle)[:, None] * two)) > 0
-        return jnp.where(above, middle, lower), jnp.where(above, upper, middle)
-
-    zero = jnp.zeros(len(pairs), jnp.float32)
-    lower, upper = jax.lax.fori_loop(0, halvings, halve, (zero, zero + 1))
-    a, b = (corner(w[:, None] * one + (1 - w)[:, None] * two) for w in (lower, upper))
-    above, below = jnp.maximum(gap(a), 0.0), jnp.maximum(-gap(b), 0.0)
-    share = jnp.where(above + below > 0, below / (above + below), 0.5)[:, None]
-    candidates = jnp.concatenate([corner(gradients), share * a + (1 - share) * b])
-    greatest = jnp.max(linear(candidates), axis=1)
-    # Of clauses that do not exist, and of equally good points the first: a corner.
-    there = clauses > NOTHING
-    usable = jnp.concatenate([there, there[pairs[:, 0]] & there[pairs[:, 1]]])
-    greatest = jnp.where(usable, greatest, jnp.inf)
-    # Three clauses can be higher at all of these points; the greatest of them is convex.
-    parts = point + np.array([0.5, 0.25, 0.0])[:, None, None] * (candidates - point)
-    partly = jnp.where(usable, jnp.max(linear(parts), axis=2), jnp.inf).ravel()
-    whole = jnp.min(greatest) <= jnp.max(clauses)
-    nearer = parts.reshape(-1, len(point))[jnp.argmin(partly)]
-    return jnp.where(whole, candidates[jnp.argmin(greatest)], nearer)
-
-
-def _flip(
-    clauses: Float[Array, " clauses"],
-    gradients: Float[Array, "clauses d"],
-    point: Float[Array, " d"],
-    number: Int[Array, ""],
-    free: Bool[np.ndarray, " d"],
-) -> Float[Array, " d"]:
-    """Move the `number`-th weakest coordinate to the other end of its range."""
-    steep = jnp.abs(gradients[jnp.argmax(clauses)])
-    # Coordinates without a derivative come last: they seem to have no effect.
-    order = jnp.argsort(jnp.where((steep > 0) & free, steep, jnp.inf))
-    chosen = order[jnp.minimum(number, len(point) - 1)]
-    other = jnp.where(point[chosen] > 0.5, 0.0, 1.0)
-    return point.at[chosen].set(other)

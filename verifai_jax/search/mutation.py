@@ -72,6 +72,7 @@ class MutationState(NamedTuple):
     score: Float[Array, " k"]  # infinite where there is no point yet
     verdicts: Int[Array, ""]  # simulations with a verdict since the last beginning
     stale: Int[Array, ""]  # simulations without progress
+    highest: Float[Array, ""]  # robustness so far
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,7 @@ class Mutation(Search[MutationState]):
             score=jnp.full(self.kept, jnp.inf, jnp.float32),
             verdicts=jnp.int32(0),
             stale=jnp.int32(0),
+            highest=jnp.full((), -jnp.inf, jnp.float32),
         )
 
     def ask(
@@ -122,11 +124,13 @@ class Mutation(Search[MutationState]):
         key = jax.random.fold_in(state.key, state.round)
         coins, values, cuts, masks, noise = draw_columns(key, batch, 16, d, d, d, d)
         idle = jnp.minimum(state.stale / self.idle, 1.0)
-        fresh = _explore(cube, coins[:, 0], coins[:, 1], coins[:, 14], idle, values, cuts)
+        # Where all points are equally good there is nothing to start from, nor to lean to.
+        level = (state.highest <= state.score[0]) & (state.score[0] >= 0)
+        # Signals lean all the same: those that swing, or change seldom, are rare in the prior.
+        evenly = level & (state.verdicts >= self.first) & (not cube.signals)
+        even = jnp.where(evenly, 0.0, coins[:, 14])
+        fresh = _explore(cube, coins[:, 0], coins[:, 1], even, idle, values, cuts)
         changed = self._mutate(state, cube, coins[:, 2:], values, masks, standard_normal(noise))
-        # Where all points are equally good there is nothing to start from.
-        there = jnp.isfinite(state.score)
-        level = jnp.max(jnp.where(there, state.score, -jnp.inf)) <= jnp.min(state.score)
         # The longer without progress, the more it explores.
         share = self.exploration + (MAX_EXPLORATION - self.exploration) * idle
         explores = (state.verdicts < self.first) | level | (coins[:, 15] < share)
@@ -146,6 +150,7 @@ class Mutation(Search[MutationState]):
             score=jnp.where(again, jnp.inf, score),
             verdicts=jnp.where(again, 0, state.verdicts + usable),
             stale=jnp.where(again, 0, stale),
+            highest=jnp.maximum(state.highest, jnp.max(jnp.where(jnp.isinf(new), -jnp.inf, new))),
         )
 
     def _mutate(
@@ -192,13 +197,32 @@ class Mutation(Search[MutationState]):
         still = differs & (coins[:, 13] < 0.5)
         moved = jnp.where(still[:, None], base, base + step)
         if len(cube.discrete):
-            # A choice is another one at random, or that of a good point.
-            moves &= ~still[:, None]
-            chosen = jnp.where(moves, values, jnp.where(differs[:, None], one, parent))
+            source = jnp.where(differs[:, None], one, parent)
+            chosen = _other_cells(cube, source, step, values)
+            chosen = jnp.where(moves & ~still[:, None], chosen, source)
             moved = jnp.where(np.array(cube.levels) > 0, chosen, moved)
         # Half of the steps out of the cube end on its faces, half turn back at them.
         inside = 1 - jnp.abs(1 - jnp.abs(moved))
         return jnp.clip(jnp.where((coins[:, 11] < 0.5)[:, None], inside, moved), 0.0, 1.0)
+
+
+def _other_cells(
+    cube: Cube,
+    points: Float[Array, "n d"],
+    step: Float[Array, "n d"],
+    values: Float[Array, "n d"],
+) -> Float[Array, "n d"]:
+    """Move each discrete coordinate to another cell: by the step if it is ordered, or to any."""
+    levels = np.array(cube.levels)[cube.discrete]
+    ordered = np.array(cube.ordered)[cube.discrete]
+    cells, step = cube.cells(points), step[:, cube.discrete] * levels
+    near = jnp.where(step < 0, jnp.minimum(jnp.round(step), -1), jnp.maximum(jnp.round(step), 1))
+    near = near.astype(jnp.int32)
+    beyond = (cells + near < 0) | (cells + near >= levels)
+    along = jnp.clip(jnp.where(beyond, cells - near, cells + near), 0, levels - 1)
+    any_other = 1 + (values[:, cube.discrete] * (levels - 1)).astype(jnp.int32)
+    to = jnp.where(ordered, along, (cells + any_other) % levels)
+    return points.at[:, cube.discrete].set(cube.centres(to))
 
 
 def _explore(

@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Plan, Search, Wants, choose
+from verifai_jax.search.clause_values import without_clauses
 from verifai_jax.search.cross_entropy import CrossEntropy, CrossEntropyState
 from verifai_jax.search.descent import (
     InteriorState,
@@ -36,19 +37,23 @@ from verifai_jax.search.descent import (
     wait,
     waits,
 )
-from verifai_jax.search.gradient import NOTHING, Gradient, GradientState
+from verifai_jax.search.gradient import Gradient, GradientState
 from verifai_jax.search.mutation import FEW, Mutation, MutationState
 from verifai_jax.search.wrapper import Wrapper
 
 GRADIENT, MUTATION, CROSS_ENTROPY = range(3)
 """Numbers of the members."""
 
-PRIOR_GAINS = np.array([4.0, 2.0, 0.5])
-"""Gains of each member before there is evidence: as if descents had succeeded always, mutations
-every second time, and cross-entropy, which needs large batches, one time in eight. Chosen by hand;
-no comparison with other values is recorded."""
+PRIOR_GAINS = 4.0, 2.5
+"""Gains before there is evidence, of descents and of the other two together: as if descents had
+succeeded always. Chosen by hand; no comparison with other values is recorded."""
 
-PRIOR_COSTS = np.array([4.0, 4.0, 4.0])
+FILLED = 8
+"""Batch from which on cross-entropy has nine tenths of what it and mutations have; it has a fifth
+in rounds of one simulation, where it draws from the prior alone. With a fifth in batches of 16
+five problems of choices and numbers took up to 1.5 times as many simulations."""
+
+PRIOR_COSTS = 4.0
 """Cost of these gains, in simulations: few, so that evidence soon decides."""
 
 DISCOUNT = 0.98
@@ -63,6 +68,11 @@ OPENING = 6
 """Descents before the budget is shared by evidence. With two instead, SB3 to SB5 together took 0.99
 times as many simulations; with twelve, and one of four with the whole cube, the
 landscape of ripples cost half as much again (`benchmarks/RESULTS.md`)."""
+
+MOSTLY = 0.75
+"""Share of coordinates that descents can move from which on some descents go first. Where a fifth
+of the coordinates or fewer are choices three problems took 0.36, 0.41 and 0.88 times as many
+simulations with these descents as without, where more are two took 1.3 and 2.7 times as many."""
 
 MANY = 32
 """Simulations of a round beyond which descents wait until failures are rare: such rounds simulate
@@ -79,8 +89,7 @@ AMONG = 4
 """Number of best points among which a new one is a gain: those that mutations have as parents."""
 
 TAKEN = 32
-"""Points that are remembered as starts and ends of descents; as many as mutations keep to start
-from."""
+"""Points remembered as starts and ends of descents; as many as mutations keep to start from."""
 
 
 class PortfolioState(NamedTuple):
@@ -124,23 +133,37 @@ class Portfolio(Search[PortfolioState]):
     def _differentiates(self, cube: Cube) -> bool:
         return self.gradients and len(cube.continuous) > 0
 
+    def _gradient(self, cube: Cube) -> Gradient:
+        # Of choices none knows which are worth a descent: one at a time, from the best so far.
+        return Gradient() if self._descends_first(cube) else Gradient(descents=1)
+
+    def _descends_first(self, cube: Cube) -> bool:
+        return len(cube.continuous) >= MOSTLY * cube.dim
+
     def _cross_entropy(self, batch: int) -> CrossEntropy:
         # In small batches a round says little: patience counts simulations.
         return CrossEntropy(patience=max(6, 128 // batch))
 
+    def _prior_gains(self, cube: Cube, batch: int) -> Float[np.ndarray, " members"]:
+        descents, others = PRIOR_GAINS
+        # Descents move the continuous coordinates alone, and are in vain where a choice is wrong.
+        descents *= min(1.0, cube.dim / FEW) * (len(cube.continuous) / max(cube.dim, 1)) ** 2
+        fitted = np.clip(batch / FILLED, 0.2, 0.9)
+        return np.array([descents, (1 - fitted) * others, fitted * others], np.float32)
+
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> PortfolioState:
         keys = jax.random.split(key, 3)
-        gradient = Gradient().init(keys[0], cube, batch) if self._differentiates(cube) else None
-        share = 0.0 if gradient is None else min(1.0, cube.dim / FEW)
-        gains = np.where(np.arange(3) == GRADIENT, share, 1.0) * PRIOR_GAINS
+        gradient = None
+        if self._differentiates(cube):
+            gradient = self._gradient(cube).init(keys[0], cube, batch)
         return PortfolioState(
             key=key,
             gradient=gradient,
             mutation=Mutation().init(keys[1], cube, batch),
             cross_entropy=self._cross_entropy(batch).init(keys[2], cube, batch),
             credit=jnp.zeros(3, jnp.float32),
-            gains=jnp.asarray(gains, jnp.float32),
-            costs=jnp.asarray(PRIOR_COSTS, jnp.float32),
+            gains=jnp.asarray(self._prior_gains(cube, batch)),
+            costs=jnp.full(3, PRIOR_COSTS, jnp.float32),
             rows=jnp.zeros(3, jnp.int32),
             differentiates=jnp.array(False),
             opening=jnp.array(False),
@@ -171,19 +194,23 @@ class Portfolio(Search[PortfolioState]):
         mutated, mutation = Mutation().ask(state.mutation, cube, batch)
         drawn, cross_entropy = self._cross_entropy(batch).ask(state.cross_entropy, cube, batch)
         state = state._replace(mutation=mutation, cross_entropy=cross_entropy)
-        share = self._shares(state)
+        share = self._shares(state, self._prior_gains(cube, batch))
         credit = state.credit + share * batch
         differentiates, descents, points = jnp.array(False), jnp.int32(0), mutated
         opening = differentiates
         if state.gradient is not None:
-            points, gradient = Gradient().ask(state.gradient, cube, batch)
-            plan = Gradient().plan(gradient, cube, batch)
-            # Some descents go first, that from the middle of the cube before all.
-            opening = gradient.starts <= max(OPENING, len(gradient.fresh))
-            opening &= gradient.useless == 0
-            if cube.dim < FEW:
-                opening &= state.barren < FEW * cube.dim
-            turn = opening | (credit[GRADIENT] >= 1)
+            points, gradient = self._gradient(cube).ask(state.gradient, cube, batch)
+            plan = self._gradient(cube).plan(gradient, cube, batch)
+            if not self._descends_first(cube):
+                # They begin with the choices of good points.
+                turn = (credit[GRADIENT] >= 1) & jnp.isfinite(state.mutation.score[AMONG - 1])
+            else:
+                # That from the middle of the cube goes before all.
+                opening = gradient.starts <= max(OPENING, len(gradient.fresh))
+                opening &= gradient.useless == 0
+                if cube.dim < FEW:
+                    opening &= state.barren < FEW * cube.dim
+                turn = opening | (credit[GRADIENT] >= 1)
             differentiates = plan.differentiate & turn
             allowed = jnp.where(opening, batch, jnp.floor(credit[GRADIENT]).astype(jnp.int32))
             descents = jnp.where(turn, jnp.minimum(plan.rows, allowed), 0)
@@ -194,6 +221,8 @@ class Portfolio(Search[PortfolioState]):
         draws = jnp.maximum(draws, 0)
         rows = jnp.stack([descents, others - draws, draws]).astype(jnp.int32)
         member = self._members(rows, batch)[:, None]
+        # The last of a batch of cross-entropy explore, which mutations do already.
+        drawn = jnp.roll(drawn, batch - draws, axis=0)
         u = jnp.where(
             member == GRADIENT, points, jnp.where(member == CROSS_ENTROPY, drawn, mutated)
         )
@@ -232,7 +261,7 @@ class Portfolio(Search[PortfolioState]):
         state = state._replace(barren=barren)
         if state.interior is None:
             return self._learn(state, cube, observations)
-        score, turn = _common(observations).score, state.interior.turn
+        score, turn = without_clauses(observations).score, state.interior.turn
         costs = jnp.where(turn | state.differentiates, 2.0, 1.0)
         interior = learn(
             state.interior,
@@ -255,20 +284,27 @@ class Portfolio(Search[PortfolioState]):
     ) -> PortfolioState:
         """Tell the three members, and count what the one that proposed a point has gained."""
         batch = len(observations.rho)
-        common = _common(observations)
+        common = without_clauses(observations)
         member = self._members(state.rows, batch)
-        # A gain is a point among the best, once there are enough of them.
+        # A gain is a point among the best, once there are enough of them. A descent that began at
+        # one of these, as all do among many choices, has to be better than all.
         limit = state.mutation.score[AMONG - 1]
-        gained = jnp.isfinite(limit) & ((common.score < limit) | (common.score == 0))
-        gained &= common.usable
+        known = jnp.isfinite(limit)
+        if not self._descends_first(cube):
+            limit = jnp.where(member == GRADIENT, state.mutation.score[0], limit)
+        gained = known & ((common.score < limit) | (common.score == 0)) & common.usable
         proposed = jnp.arange(batch) < jnp.sum(state.rows)
         is_member = (member[None] == jnp.arange(3)[:, None]) & proposed[None]
         spent = jnp.sum(is_member, axis=1) * jnp.where(state.differentiates, 2.0, 1.0)
         total = jnp.sum(spent)
         kept = DISCOUNT**total
-        credit = state.credit + self._shares(state) * total - spent
+        share = self._shares(state, self._prior_gains(cube, batch))
+        credit = state.credit + share * total - spent
         credit = jnp.where(state.opening, state.credit, credit)
         mutation = Mutation().tell(state.mutation, cube, common)
+        # Boxes of several sizes around a point are one gain.
+        descents = batch if state.gradient is None else len(state.gradient.fresh)
+        limits = np.array([descents, batch, batch])
         # Mutations begin when enough is explored, whatever descents have seen.
         descended = jnp.sum(common.usable & is_member[GRADIENT]).astype(jnp.int32)
         state = state._replace(
@@ -278,7 +314,7 @@ class Portfolio(Search[PortfolioState]):
             gains=jnp.where(
                 state.opening,
                 state.gains,
-                kept * state.gains + jnp.sum(is_member & gained[None], axis=1),
+                kept * state.gains + jnp.minimum(jnp.sum(is_member & gained[None], axis=1), limits),
             ),
             costs=jnp.where(state.opening, state.costs, kept * state.costs + spent),
             # Nobody saves, or owes, more than a few rounds.
@@ -287,12 +323,12 @@ class Portfolio(Search[PortfolioState]):
         if state.gradient is None:
             return state
         own = observations._replace(valid=observations.valid & (member == GRADIENT))
-        updated = Gradient().tell(state.gradient, cube, own)
+        updated = self._gradient(cube).tell(state.gradient, cube, own)
         turn = state.rows[GRADIENT] > 0
-        return self._offer(state, choose(turn, updated, state.gradient), turn)
+        return self._offer(state, cube, choose(turn, updated, state.gradient), turn)
 
     def _offer(
-        self, state: PortfolioState, updated: GradientState, turn: Bool[Array, ""]
+        self, state: PortfolioState, cube: Cube, updated: GradientState, turn: Bool[Array, ""]
     ) -> PortfolioState:
         """Offer the best points where no descent began or ended as every second start."""
         before, n = state.gradient, len(updated.fresh)
@@ -309,7 +345,8 @@ class Portfolio(Search[PortfolioState]):
         free = not_taken(points, score, taken)
         best = jnp.argsort(~free, stable=True)[:n]
         later = updated.starts + jnp.arange(n)
-        offers = updated.fresh & free[best] & (later > OPENING) & (later % 2 == 1)
+        turns = (later > OPENING) & (later % 2 == 1) | (not self._descends_first(cube))
+        offers = updated.fresh & free[best] & turns
         near = jnp.where(offers, score[best], jnp.inf)
         gradient = updated._replace(offered=points[best], near=near)
         return state._replace(gradient=gradient, taken=taken)
@@ -321,7 +358,7 @@ class Portfolio(Search[PortfolioState]):
         batch = len(observations.rho)
         gradient = state.gradient
         if gradient is not None:
-            gradient = Gradient().warm_start(gradient, cube, common)
+            gradient = self._gradient(cube).warm_start(gradient, cube, common)
         return state._replace(
             gradient=gradient,
             mutation=Mutation().tell(state.mutation, cube, common),
@@ -337,7 +374,7 @@ class Portfolio(Search[PortfolioState]):
         if state.gradient is None:
             return state
         common = observations._replace(gradient=None, clauses=None, clause_gradients=None)
-        gradient = Gradient().start_from(state.gradient, cube, common)
+        gradient = self._gradient(cube).start_from(state.gradient, cube, common)
         # Whoever suggests a start wants a descent from it.
         state = state._replace(barren=jnp.int32(NEVER))
         # The descents from there have their turn at once, whatever the shares are.
@@ -345,8 +382,10 @@ class Portfolio(Search[PortfolioState]):
         credit = state.credit.at[GRADIENT].max(min_share.astype(jnp.float32))
         return state._replace(gradient=gradient, credit=credit)
 
-    def _shares(self, state: PortfolioState) -> Float[Array, " members"]:
-        rate = (state.gains + 0.1 * PRIOR_GAINS) / (state.costs + 0.1 * PRIOR_COSTS)
+    def _shares(
+        self, state: PortfolioState, prior: Float[np.ndarray, " members"]
+    ) -> Float[Array, " members"]:
+        rate = (state.gains + 0.1 * prior) / (state.costs + 0.1 * PRIOR_COSTS)
         rate = rate.astype(jnp.float32)
         if state.gradient is None:
             rate = rate.at[GRADIENT].set(0.0)
@@ -390,7 +429,7 @@ class PortfolioStage(Wrapper[PortfolioState]):
             return learned
         rows = jnp.sum(state.rows)
         simulated = jnp.arange(len(observations.rho)) < rows
-        score = _common(observations).score
+        score = without_clauses(observations).score
         spent = rows * jnp.where(state.differentiates, 2.0, 1.0)
         waiting = wait(state.interior, jnp.where(simulated, score, jnp.inf), spent)
         return learned._replace(interior=waiting)
@@ -409,14 +448,3 @@ class PortfolioStage(Wrapper[PortfolioState]):
         """Return the state after a round, with the other members as they were before."""
         gradient = inner.gradient if self.descends else state.gradient
         return inner._replace(interior=state.interior, gradient=gradient)
-
-
-def _common(observations: Observations) -> Observations:
-    """Return the observations for members that use no clauses."""
-    rho = observations.rho
-    if observations.clauses is not None:
-        # Where clauses of different units have to be broken together, without unit.
-        several = observations.clauses[:, 1] > NOTHING
-        greatest = jnp.max(observations.clauses, axis=1)
-        rho = jnp.where(several & jnp.isfinite(greatest), greatest, rho)
-    return Observations(observations.u, rho, observations.valid)

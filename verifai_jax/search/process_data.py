@@ -11,11 +11,25 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from verifai_jax.core.cube import Cube
+from verifai_jax.search.base import Observations
 from verifai_jax.search.gaussian_process import GaussianProcess, TrainingData
 
 CAP = 30.0
 """Quartiles of the robustness above which all values are the same to the process, so that a few
 huge ones do not hide the rest. Chosen by hand; no comparison with other values is recorded."""
+
+LARGEST = 1e30
+"""Robustness above which nothing differs: sums of such stay finite in float32."""
+
+NO_VERDICT = 2e30
+"""Score of a simulation without a verdict."""
+
+
+def scores(observations: Observations) -> Float[Array, " n"]:
+    """Return the robustness, 0 for all failures, `NO_VERDICT` for NaN; infinite in other rows."""
+    rho = observations.rho
+    score = jnp.where(jnp.isnan(rho), NO_VERDICT, jnp.clip(rho, 0.0, LARGEST))
+    return jnp.where(observations.valid & ~(rho == jnp.inf), score, jnp.inf)
 
 
 def process_of(cube: Cube) -> GaussianProcess:
@@ -46,7 +60,7 @@ def encode(u: Float[Array, "n d"], cube: Cube) -> Float[Array, "n d"]:
 
 def training_data(u: Float[Array, "n d"], score: Float[Array, " n"], cube: Cube) -> TrainingData:
     """Return the process' data: a logarithm of the robustness, with mean 0 and deviation 1."""
-    mask = jnp.isfinite(score)
+    mask = score <= LARGEST
     score = jnp.where(mask, score, 0.0)
     positive = jnp.sort(jnp.where(score > 0, score, jnp.inf))
     quartile = positive[jnp.sum(score > 0) // 4]

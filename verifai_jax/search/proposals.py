@@ -12,10 +12,8 @@ row with the distribution it would have, given acceptance; rows that stay refuse
 valid in what it learns. A point that was simulated before is not simulated again (`repetition`).
 """
 
-import math
 from collections.abc import Callable, Mapping
-from functools import lru_cache
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
 import jax
 import jax.numpy as jnp
@@ -23,14 +21,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.clauses import ABSENT, CLAUSES
-from verifai_jax.core.compilation import Compilation, XlaOptimization, compile_soon, tracing
+from verifai_jax.core.compilation import Compilation
 from verifai_jax.core.cube import Cube
-from verifai_jax.core.fingerprint import identity
 from verifai_jax.core.outcomes import OUTCOME
-from verifai_jax.core.remembered import lower_or_recall, remembered_as
 from verifai_jax.search.base import Observations, Plan, Search
 from verifai_jax.search.contract import check_points, is_user_defined
 from verifai_jax.search.repetition import Repetition
+from verifai_jax.search.search_program import compiled_search
 
 TRIES = 32
 """Maximum number of asks in one round until every row of a search that learns is accepted. Where
@@ -87,7 +84,6 @@ class Proposals:
         self._rows = np.zeros(0, int)  # and which of them are simulated.
         self._plan: Plan | None = None
         self._barren = 0  # Rounds without any, so far.
-        self._greatest = -math.inf  # Robustness so far, for a search that avoids what has none.
         self._repetition = Repetition(cube, key) if search.learns and cube.dim else None
 
     @property
@@ -159,10 +155,8 @@ class Proposals:
         """
         if not self.search.learns:
             return
-        if self.search.wants.no_verdict_rows and valid.any():
-            self._greatest = float(np.max(rho[valid], initial=self._greatest))
-        if self.search.wants.no_verdict_rows and math.isfinite(self._greatest):
-            rho, valid = np.where(valid, rho, np.float32(self._greatest)), np.ones(len(rho), bool)
+        if self.search.wants.no_verdict_rows:
+            rho, valid = np.where(valid, rho, np.float32(np.nan)), np.ones(len(rho), bool)
         observations = Observations(
             u=self._points,
             rho=self._spread(rho, np.nan),
@@ -275,7 +269,6 @@ class Proposals:
             **{f"search.{i}": leaf for i, leaf in enumerate(leaves)},
             "queue": self._queue,
             "counts": np.array([self.proposed, self.accepted], np.int64),
-            **({"greatest": np.array(self._greatest)} if self.search.wants.no_verdict_rows else {}),
             **({} if self._repetition is None else {"simulated": self._repetition.codes}),
         }
 
@@ -299,7 +292,6 @@ class Proposals:
         self._state = jax.tree.unflatten(form, restored)
         self._queue = np.asarray(checkpoint["queue"])
         self.proposed, self.accepted = (int(count) for count in checkpoint["counts"])
-        self._greatest = float(checkpoint.get("greatest", -math.inf))
         if self._repetition is not None and "simulated" in checkpoint:
             self._repetition.restore(np.asarray(checkpoint["simulated"]))
 
@@ -409,67 +401,3 @@ class Proposals:
             f"rounds; it accepted {self.accepted} of {self.proposed} points in all. Make the space "
             "narrower, so that more of it is allowed, or use another search"
         )
-
-
-SMALL = 256
-"""Points of a round up to which a search that plans its rounds is compiled with the least effort:
-its programs are large, and then run nearly as fast."""
-
-
-def optimization_of(search: Search, batch: int) -> XlaOptimization:
-    """Return how much is done to make the programs of a search fast."""
-    return "least" if search.wants.clauses and batch <= SMALL else "little"
-
-
-class SearchProgram(NamedTuple):
-    """Compiled functions of a search; `init` is None if they begin with the state of another."""
-
-    init: Callable[..., PyTree] | None
-    ask: Callable[..., tuple[Array, PyTree]]
-    tell: Callable[..., PyTree]
-    temperature: Callable[..., Any]
-    plan: Callable[..., Plan]
-
-
-@lru_cache(maxsize=64)
-@tracing("the search")
-def compiled_search(
-    search: Search, cube: Cube, batch: int, coverage_ids: int, begins: bool = True
-) -> SearchProgram:
-    """Compile `init / ask / tell` of one search on one cube, in the background, side by side.
-
-    - `begins`: whether `init` is wanted.
-    """
-    key = jax.eval_shape(lambda: jax.random.key(0, impl="threefry2x32"))
-    begun = jax.jit(lambda key: search.init(key, cube, batch)).trace(key)
-    state: Any = begun.out_info
-    states = jax.tree.structure(state)
-    # What a search of this package does follows from its options; a user's may do anything.
-    kept = None if is_user_defined(search) else identity(search, cube, batch, coverage_ids)
-
-    def compiled(verb: str, function: Callable[..., Any], *arguments: PyTree, form: Any) -> Any:
-        name = remembered_as(f"search-{verb}", kept, verb)
-        lowered = lower_or_recall(name, function, arguments, form)
-        return compile_soon("the search", lowered, optimization_of(search, batch))
-
-    # What takes longest to compile begins first.
-    asked = jax.tree.structure((0, jax.tree.unflatten(states, [0] * states.num_leaves)))
-    ask = compiled("ask", lambda state: search.ask(state, cube, batch), state, form=asked)
-    init: Any = None
-    if begins:
-        init = compile_soon("the search", begun.lower(), optimization_of(search, batch))
-    plan: Any = None
-    if search.wants.clauses:
-        form = jax.tree.structure(Plan(0, 0, 0))  # pyright: ignore[reportArgumentType]
-        plan = compiled("plan", lambda state: search.plan(state, cube, batch), state, form=form)
-    tell: Any = None
-    if search.learns:
-        tell = compiled(
-            "tell", lambda state, rows: search.tell(state, cube, rows), state,
-            search.wants.form(cube, batch, coverage_ids), form=states,
-        )  # fmt: skip
-    temperature: Any = lambda state: 1.0  # noqa: E731
-    if search.wants.gradient:
-        form = jax.tree.structure(0)
-        temperature = compiled("temperature", search.temperature, state, form=form)
-    return SearchProgram(init, ask, tell, temperature, plan)

@@ -26,9 +26,12 @@ from verifai_jax.search.base import Observations, Search, Wants, draw_uniform
 from verifai_jax.search.gaussian_process import Hyper
 from verifai_jax.search.halton import halton_points
 from verifai_jax.search.process_data import (
+    LARGEST,
+    NO_VERDICT,
     encode,
     process_of,
     rows_to_keep,
+    scores,
     snap,
     training_data,
 )
@@ -49,8 +52,6 @@ PROGRESS = 1e-3
 authors' program."""
 KNOWN = 1 - 1e-5
 """Correlation with an observation, above which a point need not be simulated. As in `bayes`."""
-LARGEST = 1e30
-"""Robustness above which nothing differs: sums of such stay finite in float32."""
 
 
 class TuRBOState(NamedTuple):
@@ -172,8 +173,13 @@ class TuRBO(Search[TuRBOState]):
         return candidates[chosen]
 
     def tell(self, state: TuRBOState, cube: Cube, observations: Observations) -> TuRBOState:
-        usable = observations.valid & (observations.rho < jnp.inf)
-        score = jnp.where(usable, jnp.clip(observations.rho, 0.0, LARGEST), jnp.inf)
+        score = scores(observations)
+        # One without a verdict is taken for the worst, so that the region stays away from it.
+        seen = jnp.concatenate([score, state.score])
+        worst = jnp.max(seen, where=seen <= LARGEST, initial=-jnp.inf)
+        worst = jnp.where(worst >= 0, worst, jnp.inf)
+        score = jnp.where(score == NO_VERDICT, worst, score)
+        usable = jnp.isfinite(score)
         count = jnp.sum(usable, dtype=jnp.int32)
         number = state.results + jnp.arange(len(score), dtype=jnp.uint32)
         # A Weyl sequence (in steps of the golden ratio): as good as random for choosing.

@@ -115,7 +115,7 @@ def read_record(path: Path) -> dict[str, Any]:
 
 
 def plain(value: object) -> Any:
-    """Return data as JSON has it: arrays as lists, and a text of what it does not have."""
+    """Convert data to what JSON can hold: arrays to lists, and what JSON lacks to text."""
 
     def convert(each: Any) -> Any:
         return each.tolist() if hasattr(each, "tolist") else str(each)

@@ -133,7 +133,7 @@ class FeatureParameters:
         return self._values.simulations + (self._slopes.simulations if self._slopes else 0)
 
     def evaluate(self, thetas: Any, environments: Any, temperature: float | None = None) -> Pairs:
-        """Simulate every pair; with a `temperature` the smooth robustness is differentiated."""
+        """Simulate every pair; a `temperature` also asks for gradients of the smooth robustness."""
         k, n, d = len(thetas), len(environments), self.problem.space.dim
         rows = self._rows(thetas, environments)
         happens = accepted(self.problem.space, rows)

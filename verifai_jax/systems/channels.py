@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key, PyTree
+from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from verifai_jax.core.errors import unknown_name
 
@@ -30,17 +30,25 @@ class Instant(NamedTuple):
     - `time`: in seconds; `period`: between two of them.
     - `features`: the features of the simulation.
     - `xp`: `jax.numpy`, or `numpy` on the host.
+    - `ended`: whether the simulation has ended, so that nothing new is remembered.
     """
 
     time: Any
     period: float
     features: PyTree
     xp: Any = jnp
+    ended: Bool[Array, ""] | bool = False
 
     @property
     def step(self) -> Any:
         """The number of instants before this one."""
         return self.xp.round(self.xp.asarray(self.time) / self.period).astype(np.int32)
+
+    def kept(self, before: PyTree, after: PyTree) -> Any:
+        """Return what is remembered from here on: `after`, or `before` if it has ended."""
+        if self.ended is False:
+            return after
+        return jax.tree.map(lambda old, new: self.xp.where(self.ended, old, new), before, after)
 
 
 class Link:
@@ -68,7 +76,7 @@ class Link:
         return ()
 
     def through(self, state: PyTree, value: PyTree, now: Instant) -> tuple[PyTree, PyTree]:
-        """Return what comes out at this instant, and what it remembers then."""
+        """Return what comes out at this instant, and what it remembers then, as `now.kept`."""
         raise NotImplementedError
 
     def valid(self, features: PyTree) -> Any:
@@ -105,13 +113,20 @@ class Channels(NamedTuple):
         now = Instant(0.0, self.period, self.features, self.xp)
         return tuple(link.begin(first[link.side], now, key) for link in self.links)
 
-    def observation(self, states: States, value: PyTree, time: Any) -> tuple[Any, States]:
-        """Return what the policy sees at `time` seconds, and what the links remember then."""
-        return self._through("observation", states, value, time)
+    def observation(
+        self, states: States, value: PyTree, time: Any, ended: Bool[Array, ""] | bool = False
+    ) -> tuple[Any, States]:
+        """Return what the policy sees at `time` seconds, and what the links remember then.
 
-    def action(self, states: States, value: PyTree, time: Any) -> tuple[Any, States]:
+        Where the simulation has ended, they remember what they did before.
+        """
+        return self._through("observation", states, value, time, ended)
+
+    def action(
+        self, states: States, value: PyTree, time: Any, ended: Bool[Array, ""] | bool = False
+    ) -> tuple[Any, States]:
         """Return the action that takes effect at `time`, and what the links remember then."""
-        return self._through("action", states, value, time)
+        return self._through("action", states, value, time, ended)
 
     def valid(self) -> Any:
         """Return whether all numbers of the links are what they may be."""
@@ -120,8 +135,10 @@ class Channels(NamedTuple):
             valid = valid & link.valid(self.features)
         return valid
 
-    def _through(self, side: Side, states: States, value: PyTree, time: Any) -> tuple[Any, States]:
-        now, after = Instant(time, self.period, self.features, self.xp), list(states)
+    def _through(
+        self, side: Side, states: States, value: PyTree, time: Any, ended: Any
+    ) -> tuple[Any, States]:
+        now, after = Instant(time, self.period, self.features, self.xp, ended), list(states)
         for i, link in enumerate(self.links):
             if link.side == side:
                 value, after[i] = link.through(states[i], value, now)

@@ -65,7 +65,8 @@ class Delay(Link):
         if self.feature is not None:
             wanted = jnp.asarray(self.steps(now.features)).astype(jnp.int32)
             steps = jnp.clip(wanted, 0, self.max_steps)
-        return jax.tree.unflatten(form, [entry(line, steps) for line in lines]), lines
+        late = jax.tree.unflatten(form, [entry(line, steps) for line in lines])
+        return late, now.kept(state, lines)
 
     def refusal(self, features: Features, owner: str) -> str | None:
         """Return what is wrong with the feature's value; None for a delay that `owner` can have."""

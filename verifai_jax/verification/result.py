@@ -171,7 +171,7 @@ class Verification(Drawn, InNotebook):
                 f"fails, at {sure} by {count}",
             ),
             f"  failing      {format_percent(low)} of the prior at least, "
-            f"{format_percent(high)} at most{f' at {sure}' * (undecided.mass > 0)}",
+            f"{format_percent(high)} at most{f' at {sure}' if undecided.mass > 0 else ''}",
             f"  boxes        {len(self.boxes):,} of {self.looked_at:,} that were looked at, "
             f"{self.simulations:,} simulations in {self.seconds:z.1f} s, stopped: {self.stopped}",
             "  verified     the system in discrete time as it is simulated, in real arithmetic and "

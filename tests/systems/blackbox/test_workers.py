@@ -44,7 +44,7 @@ def outcomes(system, features, seeds=None):
     return [outcome for _, outcome in sorted(found, key=lambda pair: pair[0])]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_each_trouble_is_a_row_and_stops_no_other():
     with pool_of_two(timeout=3.0) as troublesome:
         found = outcomes(troublesome, [{"a": a} for a in (0, 1, 3, 4, 5, 6, 7, 8, 9.5)])

@@ -112,9 +112,11 @@ class TestDescription:
             vj.fmu(made(utf16.encode("utf-16")), **TIMES)
         with pytest.raises(ValueError, match=r"no binary for this machine .*; it has win64"):
             vj.fmu(made(description(2), "binaries/win64/spring.dll"), **TIMES)
-        exchange = description(2).replace("CoSimulation", "ModelExchange")
-        with pytest.raises(ValueError, match="export it again for co-simulation"):
-            vj.fmu(made(exchange), **TIMES)
+        other = description(2).replace("CoSimulation", "ScheduledExecution")
+        with pytest.raises(ValueError, match="not offer co-simulation or model exchange; it has n"):
+            vj.fmu(made(other), **TIMES)
+        with pytest.raises(ValueError, match="not offer ModelExchange; it has CoSimulation"):
+            vj.fmu(made(description(2)), **TIMES, exchange=True)
         (tmp_path / "text.fmu").write_text("x")
         with pytest.raises(ValueError, match="no FMU: an archive"):
             vj.fmu(tmp_path / "text.fmu", **TIMES)

@@ -427,7 +427,7 @@ def test_a_row_in_which_mujoco_raises_is_an_error_and_the_others_go_on(monkeypat
     np.testing.assert_array_equal(trace.signals["x"][[0, 2, 3]], alone.signals["x"][[0, 2, 3]])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_one_system_in_both_precisions():
     system = loop(backend="native", terminate=None, duration=0.2)
     single = system.simulate_batch(rows(), KEYS).signals["x"]

@@ -596,7 +596,7 @@ def test_a_simulation_that_takes_too_long():
         assert stuck.refusal() == f"point {first}, {second} took longer than 1.5 s"
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_time_is_counted_from_when_a_client_can_begin():
     with remote(timeout=2.0) as system:
         peer = Peer(system.address, capacity=8)

@@ -106,7 +106,7 @@ class Clusters(Drawn, InNotebook):
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """A row for each cluster, the largest first, noise (-1) last.
+        """One row per cluster, the largest first, noise (-1) last.
 
         Its centre in the features; `size` and `share` of the rows; `representative`: the row
         nearest to the centre; `worst`: the row of least robustness, and `worst_rho`. A name that a

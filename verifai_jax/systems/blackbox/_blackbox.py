@@ -91,7 +91,7 @@ class _RowByRow(System):
 
     @property
     def exact_step(self) -> bool:
-        """True for a simulator that says that its step is part of the system."""
+        """True if the simulator declares its step a part of the system."""
         return as_system(self.simulation.function).exact_step
 
     def passing(self, features: Features) -> Passing:
@@ -148,6 +148,11 @@ class PooledBlackBox(_RowByRow):
     """A system on the host, in processes of its own; made by `blackbox(..., workers=n)`."""
 
     pool: Pool
+
+    @property
+    def workers(self) -> int:
+        """Simulations that run side by side."""
+        return self.pool.workers
 
     def __call__(self, features: Features, key: Seed = None) -> Trace:
         """Simulate once, in a worker.

@@ -135,16 +135,17 @@ def _run(
         # Time, and with it randomness, stops with the state: the samples after the end repeat.
         time = age.astype(float) * episode.dt
         decide_key, step_key = (jax.random.fold_in(k, age) for k in (keys.decide, keys.step))
-        observed, states = channels.observation(states, moment.observation, time)
+        observed, states = channels.observation(states, moment.observation, time, frozen)
         action, after = episode.decide(time, observed, memory, decide_key)
         after = as_precise_as(after, memory)
-        action, states = channels.action(states, action, time)
+        action, states = channels.action(states, action, time, frozen)
         collected, output = collect(collected, episode.signals(time, moment, action))
         # A state in which an episode has ended may have no finite derivative.
         state = _where(frozen, first.state, moment.state)
         following = _cast(episode.next_moment(time, state, action, step_key), moment)
-        onwards = (following, after, states, age + 1)
-        return (_where(frozen, carry[0], onwards), collected), output
+        unchanged, onwards = (moment, memory, age), (following, after, age + 1)
+        moment, memory, age = _where(frozen, unchanged, onwards)
+        return ((moment, memory, states, age), collected), output
 
     # One iteration more than there are steps samples the end and moves nothing.
     ((last, _, _, age), collected), outputs = checkpointed_scan(

@@ -1,4 +1,4 @@
-"""Functional Mock-up Units (FMI 2 and 3, co-simulation) as systems."""
+"""Functional Mock-up Units (FMI 2 and 3) as systems."""
 
 from verifai_jax.systems.fmu._fmu import fmu as fmu
 from verifai_jax.systems.fmu._fmu import fmu_ranges as fmu_ranges

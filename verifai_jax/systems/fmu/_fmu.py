@@ -26,6 +26,7 @@ from verifai_jax.core.waveform import is_waveform
 from verifai_jax.systems.base import Features, System
 from verifai_jax.systems.blackbox._blackbox import blackbox
 from verifai_jax.systems.fmu.description import Description, read_description
+from verifai_jax.systems.fmu.exchange import ExchangeInstance
 from verifai_jax.systems.fmu.library import Instance
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 Controller: TypeAlias = Callable[[float, dict[str, float], Features], Mapping[str, float]]
 """From time, outputs by name and features to inputs by name."""
 
-_instances: dict[Path, Instance] = {}
+_instances: dict[tuple[Path, bool, str], Instance] = {}
 """Instances of this process, which the next simulation resets and uses again."""
 
 
@@ -96,10 +97,10 @@ class FMUSimulation:
             return self._simulated(instance, constant, moving, features)
         except BaseException:
             # An instance that failed is in no state to be used again.
-            _instances.pop(self.file, None)
+            _instances.pop(self._key, None)
             raise
         finally:
-            if not self.reuse and _instances.pop(self.file, None):
+            if not self.reuse and _instances.pop(self._key, None):
                 instance.free()
 
     def _simulated(
@@ -116,7 +117,7 @@ class FMUSimulation:
         def at(time: float) -> dict[str, float]:
             return {name: float(course(time)) for name, course in moving.items()}
 
-        instance.begin({**constant, **at(0.0)}, self.duration)
+        instance.begin({**constant, **at(0.0)}, steps * self.dt)
         rows[0], valid = instance.get(names), 1
         for step in range(steps):
             time = step * self.dt
@@ -144,9 +145,15 @@ class FMUSimulation:
         return name
 
     def _instance(self) -> Instance:
-        if self.file not in _instances:
-            _instances[self.file] = Instance(self.description, _unpacked(self.file))
-        return _instances[self.file]
+        if self._key not in _instances:
+            kind = ExchangeInstance if self.description.exchange else Instance
+            _instances[self._key] = kind(self.description, _unpacked(self.file))
+        return _instances[self._key]
+
+    @property
+    def _key(self) -> tuple[Path, bool, str]:
+        # The token is another one for a model that was exported again under the same name.
+        return self.file, self.description.exchange, self.description.token
 
 
 def _unpacked(file: Path) -> Path:
@@ -170,8 +177,9 @@ def fmu(
     workers: int | None = 1,
     timeout: float | None = None,
     reuse: bool = True,
+    exchange: bool | None = None,
 ) -> System:
-    """Make a system of a Functional Mock-up Unit: FMI 2 or 3, co-simulation.
+    """Make a system of a Functional Mock-up Unit: FMI 2 or 3, co-simulation or model exchange.
 
     A feature sets the variable of its name before each simulation: a parameter, a start value, or
     an input; a `Signal` is an input over time. An FMU is a program: simulate only those that you
@@ -191,6 +199,8 @@ def fmu(
     - `timeout`: seconds after which a simulation is ended.
     - `reuse`: whether a process resets its instance for the next simulation, which saves its
       loading; False for an FMU whose reset forgets to reset something.
+    - `exchange`: whether its equations are integrated here, by model exchange; when left out only
+      those of an FMU without a solver of its own.
 
     **Returns:** the system.
 
@@ -200,11 +210,11 @@ def fmu(
     duration, dt = check_positive("duration", duration), check_positive("dt", dt)
     if dt > duration:
         raise ValueError(f"dt must be at most the duration of {duration:zg} s; got {dt}")
-    description = read_description(file)
+    description = read_description(file, exchange)
     _ = description.binary
     if outputs is None:
-        there = [v.name for v in description.variables.values() if v.causality == "output"]
-        named = {_identifier(name): name for name in there if description.variables[name].scalar}
+        there = [v for v in description.variables.values() if v.causality == "output"]
+        named = {_identifier(v.name): v.name for v in there if v.scalar and v.type != "String"}
     else:
         named = (
             dict(outputs) if isinstance(outputs, Mapping) else {_identifier(n): n for n in outputs}

@@ -74,9 +74,11 @@ class Description:
     - `file`: the FMU.
     - `version`: the version of FMI, 2 or 3.
     - `name`: the name of the model.
-    - `identifier`: the identifier of the binary for co-simulation.
+    - `identifier`: the identifier of the binary.
     - `token`: by which the binary knows its description.
     - `variables`: by name.
+    - `exchange`: whether it is to be simulated by model exchange, and not by co-simulation.
+    - `sizes`: numbers of continuous states and event indicators, as FMI 2 declares them.
     """
 
     file: Path
@@ -85,6 +87,8 @@ class Description:
     identifier: str
     token: str
     variables: dict[str, Variable] = field(repr=False)
+    exchange: bool = False
+    sizes: tuple[int, int] = (0, 0)
 
     def variable(self, name: str) -> Variable:
         """Return a scalar variable.
@@ -126,11 +130,16 @@ class Description:
         return wanted
 
 
-def read_description(file: str | Path) -> Description:
+def read_description(file: str | Path, exchange: bool | None = None) -> Description:
     """Read the description of an FMU.
 
-    **Raises:** `FileNotFoundError`; `ValueError` for a file that is no FMU of FMI 2 or 3, has no
-    co-simulation, or declares a document type.
+    **Arguments:**
+
+    - `exchange`: whether its model exchange is meant; its co-simulation, if it has one, when left
+      out.
+
+    **Raises:** `FileNotFoundError`; `ValueError` for a file that is no FMU of FMI 2 or 3, lacks
+    what is meant, or declares a document type.
     """
     path = Path(file).absolute()
     if not path.exists():
@@ -154,16 +163,21 @@ def read_description(file: str | Path) -> Description:
             f"{path.name} is of FMI {root.get('fmiVersion', 'without a version')}; 2 and 3 can be "
             "simulated"
         )
-    simulation = root.find("CoSimulation")
-    if simulation is None:
+    kinds = {False: "CoSimulation", True: "ModelExchange"}
+    there = {k: found for k, tag in kinds.items() if (found := root.find(tag)) is not None}
+    exchange = next(iter(there), None) if exchange is None else exchange
+    if exchange not in there:
+        wanted = "co-simulation or model exchange" if exchange is None else kinds[exchange]
         raise ValueError(
-            f"the FMU {path.name} has no co-simulation, so that it lacks a solver of its own; "
-            "export it again for co-simulation"
+            f"the FMU {path.name} does not offer {wanted}; it has "
+            f"{' and '.join(kinds[k] for k in there) or 'neither'}. Export it again with that"
         )
     token = root.get("guid") if version == "2" else root.get("instantiationToken")
+    states = len(root.findall("ModelStructure/Derivatives/Unknown"))
     return Description(
         path, int(version), root.get("modelName", path.stem),
-        simulation.get("modelIdentifier", ""), token or "", _variables(root, int(version)),
+        there[exchange].get("modelIdentifier", ""), token or "", _variables(root, int(version)),
+        exchange, (states, int(root.get("numberOfEventIndicators", "0"))),
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""The binary of an FMU, called through ctypes: instances of FMI 2 and 3 for co-simulation.
+"""The binary of an FMU, called through ctypes: instances of FMI 2 and 3, here for co-simulation.
 
 instance = Instance(description, folder)            # folder: where the FMU is unpacked
 instance.begin({"m": 2.0}, duration=4.0)
@@ -61,7 +61,8 @@ class Instance:
     def __init__(self, description: Description, folder: Path) -> None:
         self.description, self.messages = description, []
         self._groups: dict[tuple[str, ...], list[tuple[str, list[int], Any, Any]]] = {}
-        three = description.version == 3
+        self._functions: dict[str, Any] = {}
+        self._two, three = description.version == 2, description.version == 3
         self._prefix = f"fmi{description.version}"
         try:
             self._library = ctypes.CDLL(str(folder / description.binary))
@@ -72,21 +73,22 @@ class Instance:
         resources = folder / "resources"
         token, name = description.token.encode(), description.name.encode()
         if three:
-            make = self._function("InstantiateCoSimulation", c_void_p)
+            kind = "ModelExchange" if description.exchange else "CoSimulation"
             path = f"{resources}/".encode()
-            self._component = make(
+            # Co-simulation without event mode, early returns, and news from within a step.
+            none = (c_bool(), c_bool(), c_void_p(), c_size_t(0)), (c_void_p(),)
+            before, after = ((), ()) if description.exchange else none
+            self._component = self._function(f"Instantiate{kind}", c_void_p)(
                 c_char_p(name), c_char_p(token), c_char_p(path), c_bool(False), c_bool(False),
-                c_bool(False), c_bool(False), c_void_p(), c_size_t(0), c_void_p(), self._logger,
-                c_void_p(),
+                *before, c_void_p(), self._logger, *after,
             )  # fmt: skip
         else:
             own = ctypes.CDLL(None)
             pointers = (ctypes.cast(f, c_void_p) for f in (own.calloc, own.free))
             self._callbacks = _Callbacks(self._logger, *pointers, None, None)
-            make = self._function("Instantiate", c_void_p)
-            self._component = make(
-                c_char_p(name), c_int(1), c_char_p(token), c_char_p(resources.as_uri().encode()),
-                byref(self._callbacks), c_int(0), c_int(0),
+            self._component = self._function("Instantiate", c_void_p)(
+                c_char_p(name), c_int(not description.exchange), c_char_p(token),
+                c_char_p(resources.as_uri().encode()), byref(self._callbacks), c_int(0), c_int(0),
             )  # fmt: skip
         if not self._component:
             raise FMUError(f"{description.file.name} made no instance{self._said()}")
@@ -99,7 +101,7 @@ class Instance:
             self._call("Reset")
         self._begun = True
         end = (c_bool(True), c_double(duration))
-        if self.description.version == 2:
+        if self._two:
             rest = (c_int(0), c_double(0.0), c_double(0.0), c_int(1), c_double(duration))
             self._call("SetupExperiment", *rest)
             self.set(values)
@@ -112,7 +114,7 @@ class Instance:
 
     def step(self, time: float, size: float) -> bool:
         """Simulate one step; False if the FMU ended its simulation."""
-        if self.description.version == 2:
+        if self._two:
             status = self._call("DoStep", c_double(time), c_double(size), c_int(1))
             return status != DISCARD
         flags = [c_bool(False) for _ in range(3)]
@@ -165,11 +167,11 @@ class Instance:
         return self._groups[names]
 
     def _c_type(self, kind: str) -> Any:
-        return c_bool if kind == "Boolean" and self.description.version == 3 else C_TYPES[kind]
+        return c_bool if kind == "Boolean" and not self._two else C_TYPES[kind]
 
     def _exchange(self, verb: str, kind: str, references: Any, buffer: Any) -> None:
         count = c_size_t(len(references))
-        counts = (count,) if self.description.version == 3 else ()
+        counts = () if self._two else (count,)
         self._call(f"{verb}{kind}", references, count, buffer, *counts)
 
     def _call(self, name: str, *arguments: Any) -> int:
@@ -186,14 +188,15 @@ class Instance:
         return status
 
     def _function(self, name: str, returns: Any) -> Any:
-        try:
-            function = getattr(self._library, f"{self._prefix}{name}")
-        except AttributeError:
-            raise FMUError(
-                f"the binary of {self.description.file.name} has no {self._prefix}{name}"
-            ) from None
-        function.restype = returns
-        return function
+        if name not in self._functions:
+            try:
+                self._functions[name] = getattr(self._library, f"{self._prefix}{name}")
+            except AttributeError:
+                raise FMUError(
+                    f"the binary of {self.description.file.name} has no {self._prefix}{name}"
+                ) from None
+            self._functions[name].restype = returns
+        return self._functions[name]
 
     def _said(self) -> str:
         return f": {'; '.join(self.messages[-MESSAGES:])}" if self.messages else ""

@@ -226,22 +226,23 @@ class Loop:
         """
         time = progress.age.astype(jnp.result_type(float)) * self.control_period
         state, sensors = self.state(time, arrays)
-        channels = self.channels(features)
-        seen, states = channels.observation(progress.states, state, time)
-        ctrl, memory = self.control(seen, progress.memory, features)
-        ctrl, states = channels.action(states, ctrl, time)
-        inputs = {"ctrl": ctrl, **self.bindings.applied_at(features, time)}
         frozen = k >= self.periods
         if self.terminate is not None:
             frozen |= self.terminate(state, features)
+        channels = self.channels(features)
+        seen, states = channels.observation(progress.states, state, time, frozen)
+        ctrl, memory = self.control(seen, progress.memory, features)
+        ctrl, states = channels.action(states, ctrl, time, frozen)
+        inputs = {"ctrl": ctrl, **self.bindings.applied_at(features, time)}
         signals = self.signal_values(state, sensors, inputs["ctrl"], features)
         finite = progress.finite
         for value in (*inputs.values(), *(arrays[name] for name in ("qpos", "qvel", "act"))):
             finite &= jnp.all(jnp.abs(value) <= HUGE)
-        after = Progress(memory, progress.age + 1, finite, states)
-        unchanged = progress._replace(finite=finite)
+        # The links know of the end themselves: a long line of past values is not copied for it.
+        after = Progress(memory, progress.age + 1, finite, ())
+        unchanged = progress._replace(finite=finite, states=())
         after = jax.tree.map(lambda new, old: jnp.where(frozen, old, new), after, unchanged)
-        return Sample(inputs, signals, frozen), after
+        return Sample(inputs, signals, frozen), after._replace(states=states)
 
     def state(self, time: Array, arrays: Mapping[str, Array]) -> tuple[State, Array]:
         """Return the state as users see it, and all sensors; an array that is not given is zero."""

@@ -204,22 +204,23 @@ class _Rollout:
         def sample(carry: PyTree, k: Int[Array, ""]) -> Any:
             (state, memory, held, age), collected = carry
             time, frozen = self.clock(k, age, state)
-            control, next_memory = self.decide(k, age, time, state, memory, held)
+            control, (own, states) = self.decide(k, age, time, frozen, state, memory, held)
             signals = self.signals(time, state, control)
             next_state = self.step(time, self.safe_state(frozen, state, start), control)
             next_state = updated(loop, time + loop.dt, next_state, self.features)
             applied = None if held is None else control
-            following = (next_state, next_memory, applied, age + 1)
-            after = _where(frozen, (state, memory, applied, age), following)
+            following = (next_state, own, applied, age + 1)
+            # The links know of the end themselves: a long line of past values is not copied for it.
+            state, own, applied, age = _where(frozen, (state, memory[0], applied, age), following)
             collected, output = collect(collected, signals)
-            return (after, collected), output
+            return ((state, (own, states), applied, age), collected), output
 
         # A controller that runs at every sample holds nothing between samples.
         held = None
         memory = (memory, self.states(state, memory))
         if loop.steps_per_control > 1:
             time = jnp.zeros((), _dtype(state))
-            form = jax.eval_shape(self.control, time, state, memory)[0]
+            form = jax.eval_shape(self.control, time, jnp.array(False), state, memory)[0]
             held = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form)
         # One iteration more than there are steps: it samples the final state and moves nothing,
         # which is cheaper than copying all samples to append one.
@@ -236,23 +237,26 @@ class _Rollout:
         k: Int[Array, ""],
         age: Int[Array, ""],
         time: Time,
+        frozen: Bool[Array, ""],
         state: PyTree,
         memory: PyTree,
         held: PyTree,
     ) -> Any:
         """Return the control from sample `k` on, and the controller's memory then."""
         if held is None:
-            return self.control(time, state, memory)
+            return self.control(time, frozen, state, memory)
         # The counter is common to all lanes of a batch, so this stays a branch under `vmap`.
         control, next_memory = jax.lax.cond(
             k % self.loop.steps_per_control == 0,
-            lambda: self.control(time, state, memory),
+            lambda: self.control(time, frozen, state, memory),
             lambda: (held, memory),
         )
         if self.loop.terminate is None:
             return control, next_memory
         # What has ended earlier keeps the control that it ended with.
-        return _where(age < k, (held, memory), (control, next_memory))
+        own, states = next_memory
+        control, own = _where(age < k, (held, memory[0]), (control, own))
+        return control, (own, states)
 
     def clock(
         self, k: Int[Array, ""], age: Int[Array, ""], state: PyTree
@@ -274,18 +278,20 @@ class _Rollout:
         """
         return state if self.loop.terminate is None else _where(frozen, start, state)
 
-    def control(self, time: Time, state: PyTree, memory: PyTree) -> tuple[Any, Any]:
+    def control(
+        self, time: Time, frozen: Bool[Array, ""], state: PyTree, memory: PyTree
+    ) -> tuple[Any, Any]:
         loop = self.loop
         own, states = memory
         if loop.controller is None:
             return None, memory
-        seen, states = self.channels.observation(states, state, time)
+        seen, states = self.channels.observation(states, state, time, frozen)
         if loop.controller_memory is None:
             control = loop.controller(time, seen, self.features)
         else:
             control, after = loop.controller(time, seen, own, self.features)
             own = as_precise_as(after, own)
-        control, states = self.channels.action(states, control, time)
+        control, states = self.channels.action(states, control, time, frozen)
         return control, (own, states)
 
     def signals(self, time: Time, state: PyTree, control: PyTree) -> Any:

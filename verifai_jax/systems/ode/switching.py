@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from verifai_jax.core.checks import is_number
 from verifai_jax.core.user_errors import check_called_with
+from verifai_jax.systems.any_lane import in_any_lane
 from verifai_jax.systems.ode.integrators import Derivative, Integrator, Step, Time, looped_rk4, rk4
 
 Inputs: TypeAlias = tuple[PyTree, PyTree]
@@ -119,7 +120,7 @@ def switched_step(
     happens = (guards(time, state) > 0) & (guards(time + dt, end) <= 0) & _finite(end)
     # Under `vmap` this stays a branch, since the condition is common to all lanes.
     return jax.lax.cond(
-        _in_any_lane(jnp.any(happens)), step.with_events, lambda end, _: end, end, happens
+        in_any_lane(jnp.any(happens)), step.with_events, lambda end, _: end, end, happens
     )
 
 
@@ -240,18 +241,6 @@ def _cubic(
         return jax.tree.map(leaf, *parts)
 
     return course
-
-
-@jax.custom_batching.custom_vmap
-def _in_any_lane(condition: Any) -> Any:
-    """Return the condition, and in a batch whether it holds in any lane."""
-    return condition
-
-
-@_in_any_lane.def_vmap
-def _in_any_lane_of_batch(_: int, batched: Any, conditions: Any) -> tuple[Any, bool]:
-    whole = jnp.any(conditions, axis=0) if batched[0] else conditions
-    return _in_any_lane(whole), False
 
 
 def _length(
