@@ -22,7 +22,7 @@ from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.kept_work import present
-from verifai_jax.evaluation.unfinished import Part
+from verifai_jax.evaluation.unfinished import Part, Unfinished
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
@@ -262,7 +262,7 @@ class HeldKeys:
 
     def _block(self, points: Any, numbers: Any, temperature: float = 1.0) -> Verdicts:
         simulate = partial(self._simulated, points, numbers, temperature)
-        work = present()
+        work: Unfinished | None = present()
         if work is None:
             return simulate()
         if self._kept is None or self._kept.of is not work:

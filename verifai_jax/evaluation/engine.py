@@ -167,7 +167,7 @@ class Engine:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was decided, once compiled, that a user may not expect."""
+        """Decisions, known once it is compiled, that a user may not expect."""
         return self.program.notes
 
     @property

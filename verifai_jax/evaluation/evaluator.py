@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from verifai_jax.evaluation.host_engine import HostEngine
     from verifai_jax.evaluation.journal import Journal
     from verifai_jax.evaluation.native_engine import NativeEngine
-    from verifai_jax.evaluation.unfinished import Part
+    from verifai_jax.evaluation.unfinished import Part, Unfinished
 
 
 NOT_NATIVE = (
@@ -229,7 +229,7 @@ class Evaluator:
         simulate: Callable[[], Verdicts],
     ) -> Verdicts:
         """Return the verdicts of work that goes on where an earlier process was killed."""
-        work = None if self._keeps_traces else present()
+        work: Unfinished | None = None if self._keeps_traces else present()
         if work is None:
             return simulate()  # Traces are not stored.
         if self._kept is None or self._kept.of is not work:

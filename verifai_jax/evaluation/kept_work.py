@@ -4,15 +4,12 @@ work = present()                                    # an `Unfinished`; None if n
 """
 
 from contextvars import ContextVar
-from typing import TYPE_CHECKING
+from typing import Any
 
-if TYPE_CHECKING:
-    from verifai_jax.evaluation.unfinished import Unfinished
-
-PRESENT: "ContextVar[Unfinished | None]" = ContextVar("unfinished", default=None)
-"""The work; set by `evaluation.unfinished.keeping`."""
+PRESENT: ContextVar[Any] = ContextVar("unfinished", default=None)
+"""The work; set by `evaluation.unfinished.keeping`, which a run imports only where it is used."""
 
 
-def present() -> "Unfinished | None":
-    """Return the work whose simulations are kept now, or None if there is none."""
+def present() -> Any:
+    """Return the `Unfinished` work whose simulations are kept now, or None if there is none."""
     return PRESENT.get()
