@@ -20,7 +20,7 @@ from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import Engine
-from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.evaluation.evaluator import Evaluator, Sent
 from verifai_jax.evaluation.kept_work import present
 from verifai_jax.evaluation.unfinished import Part, Unfinished
 from verifai_jax.evaluation.verdicts import Verdicts
@@ -112,6 +112,7 @@ class DoublePrecisionEvaluator:
         self._evaluator = Evaluator(
             problem, batch, precision=precision, seed=seed, executor=executor, ends_raising=True
         )
+        self._sends = executor is not None
         self._differentiated: Evaluator | None = None
         self._problem, self._precision, self._seed = problem, precision, seed
         self._numbers = jax.jit(jax.vmap(lambda u: _flat(space.unflatten(u))))
@@ -125,6 +126,10 @@ class DoublePrecisionEvaluator:
     ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
         verdicts = self._evaluator(self._plain(u))
         return verdicts.lowest, verdicts.violated, verdicts.proper
+
+    def begin(self, u: Float[np.ndarray, "n d"]) -> Sent | None:
+        """Send points to the workers of the executor, if there is one, to be waited for later."""
+        return self._evaluator.begin(self._plain(u)) if self._sends else None
 
     def gradient(
         self, u: Float[np.ndarray, "n d"]

@@ -136,21 +136,35 @@ class Part:
 
         - `numbers`: the numbers of the simulations, which their random keys come from.
         """
-        asked = {
-            "points": np.asarray(points),
-            "numbers": np.asarray(numbers, np.int64),
-            "temperature": np.broadcast_to(np.asarray(temperature, np.float32), len(points)),
-        }
-        if self._known:
-            found = [self._known.get(key) for key in _keys(asked)]
-            if all(found):
-                return Verdicts.concatenate(
-                    [_verdict(*one, self._form) for one in found if one is not None]
-                )
+        known = self.recall(points, numbers, temperature)
+        if known is not None:
+            return known
         verdicts = simulate()
-        self.of.put(self.number, {f"{self.number}/{numbers[0]}": {**asked, **_arrays(verdicts)}})
+        self.of.put(
+            self.number,
+            {
+                f"{self.number}/{numbers[0]}": {
+                    **_asked(points, numbers, temperature),
+                    **_arrays(verdicts),
+                }
+            },
+        )
         self.settle()
         return verdicts
+
+    def recall(
+        self,
+        points: Float[np.ndarray, "n d"],
+        numbers: Int[np.ndarray, " n"],
+        temperature: Float[np.ndarray, " n"] | float,
+    ) -> Verdicts | None:
+        """Return verdicts of these points; None if not all of them are kept."""
+        if not self._known:
+            return None
+        found = [self._known.get(k) for k in _keys(_asked(points, numbers, temperature))]
+        if not all(found):
+            return None
+        return Verdicts.concatenate([_verdict(*one, self._form) for one in found if one])
 
     def settle(self) -> None:
         """Note what the first simulations have read."""
@@ -196,6 +210,18 @@ def keeping(folder: Path, work: Mapping[str, Any]) -> Iterator[Unfinished]:
         finally:
             if kept.done or kept.empty:
                 shutil.rmtree(folder, ignore_errors=True)
+
+
+def _asked(
+    points: Float[np.ndarray, "n d"],
+    numbers: Int[np.ndarray, " n"],
+    temperature: Float[np.ndarray, " n"] | float,
+) -> dict[str, np.ndarray]:
+    return {
+        "points": np.asarray(points),
+        "numbers": np.asarray(numbers, np.int64),
+        "temperature": np.broadcast_to(np.asarray(temperature, np.float32), len(points)),
+    }
 
 
 def _keys(asked: Arrays) -> Iterator[bytes]:
