@@ -10,7 +10,7 @@ from verifai_jax.problem.problem import Problem
 
 
 class KeptWork(Protocol):
-    """The part of an `evaluation.unfinished.Unfinished` that evaluators need; few processes import it."""
+    """The part of an `evaluation.unfinished.Unfinished` that evaluators need."""
 
     def part(self, problem: Problem, *mode: object) -> Any:
         """Return the `Part` of the next evaluator."""
