@@ -1,5 +1,8 @@
 """The failure table against closed forms: redundant sensors, a voter, a single channel."""
 
+import json
+import math
+
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
@@ -7,6 +10,7 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax import faults
+from verifai_jax.failure_table import Effect, FailureTable
 
 END = 1.0
 """Seconds of a simulation: ten samples, so that a duration counts in tenths."""
@@ -150,3 +154,30 @@ def test_faults_that_cannot_be_off_are_refused():
         vj.fmea(one.with_faults(faults.AtMost(1, dropouts("a", "b"))))
     with pytest.raises(ValueError, match="problem 'redundant' has no faults that vary"):
         vj.fmea(one)
+
+
+@pytest.mark.slow
+def test_the_report_names_each_row_with_its_command(table, tmp_path):
+    page = table.report(tmp_path / "table.html").read_text()
+    claims = json.loads((tmp_path / "table.claims.json").read_text())["claims"]
+    for effect, claim in zip(table, claims, strict=True):
+        assert effect.name in page
+        assert effect.name in claim["claim"]
+    assert (
+        table["single_bias"].command
+        in claims[[e.name for e in table].index("single_bias")]["evidence"]
+    )
+    assert "2 of 3 faults and pairs break the property; 2 of these are confirmed." in page
+
+
+@pytest.mark.thorough
+def test_the_report_on_a_table_without_a_failure(tmp_path):
+    effect = Effect(
+        ("gyro_dropout",), False, {}, None, "", "", math.nan, "", math.nan, 1.0, 0.0, 0.0, 0.006,
+        0, 512, "",
+    )  # fmt: skip
+    empty = FailureTable("balance", (effect,), None, None, None, 0.95, True, 1.0)
+    page = empty.report(tmp_path / "empty.html").read_text()
+    assert "No failure by gyro_dropout was found" in page
+    assert "given that it happens" in page
+    assert "0 of 1 faults and pairs break the property" in page

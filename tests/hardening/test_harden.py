@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+from function_training import by_starts
 
 import verifai_jax as vj
 from verifai_jax.hardening import HardeningError, _harden, harden
@@ -189,6 +190,23 @@ def test_it_is_shown_and_saved(whole, tmp_path):
 
 
 @pytest.mark.thorough
+def test_a_function_that_trains_gets_where_its_episodes_begin(tmp_path):
+    trainer = Trainer(
+        by_starts, example=lambda observation: jnp.zeros(1), observation=np.zeros(1), workers=1
+    )
+    options = {**SMALL, "algorithm": None, "rounds": 1, "folder": tmp_path}
+    result = harden(trainer, staying_below(1.5), **options)
+    own = result.table.set_index("round")
+    # As many of its episodes begin near failures as the shares say, and it learns of them.
+    assert list(own["return"]) == [0.0, pytest.approx(0.75, abs=0.05)]
+    assert own["failures"][0] > 0 == own["failures"][1]
+    assert result.chosen == {"hardened": 1}
+    assert "return 0;" not in str(result)
+    again = harden(trainer, staying_below(1.5), **options)
+    assert str(again.table.drop(columns="seconds")) == str(result.table.drop(columns="seconds"))
+
+
+@pytest.mark.thorough
 def test_where_nothing_fails_it_is_certified_at_once():
     result = harden(TASK, staying_below(100.0), p=0.1, **SMALL)
     assert (result.stopped, result.safe) == ("certified", True)
@@ -214,10 +232,10 @@ def test_what_cannot_be_hardened_is_refused_before_anything_trains():
     def train(key, hyperparameters, steps):
         return lambda observation: jnp.zeros(1)
 
-    message = "cannot for the function train: give a task and one of the algorithms"
-    for trainer in (train, Trainer(train, example=lambda observation: jnp.zeros(1))):
-        with pytest.raises(HardeningError, match=message):
-            harden(trainer, staying_below(1.5))
+    with pytest.raises(ValueError, match="give example="):
+        harden(train, staying_below(1.5))
+    with pytest.raises(HardeningError, match="give train an argument starts, a list of features"):
+        harden(Trainer(train, example=lambda observation: jnp.zeros(1)), staying_below(1.5))
     with pytest.raises(ValueError, match="shares of all episodes"):
         harden(TASK, staying_below(1.5), own=0.6, failing=0.6, algorithm=PPO_SMALL)
     with pytest.raises(ValueError, match="rounds"):

@@ -21,7 +21,7 @@ from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator, Sent
-from verifai_jax.evaluation.unfinished import Part, present
+from verifai_jax.evaluation.kept_work import present
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
@@ -29,6 +29,7 @@ from verifai_jax.problem.problem import Problem
 if TYPE_CHECKING:
     from verifai_jax.core.executors import Executor
     from verifai_jax.evaluation.host_engine import HostEngine
+    from verifai_jax.evaluation.unfinished import Part
 
 EXACT = 2**24
 """Greatest integer up to which all integers are float32 numbers."""

@@ -20,8 +20,8 @@ from verifai_jax.core.programs import power_of_two
 from verifai_jax.core.progress import count_done
 from verifai_jax.evaluation.engine import Engine, Wanted, engine_for
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
+from verifai_jax.evaluation.kept_work import present
 from verifai_jax.evaluation.raising import ALIKE, Raising
-from verifai_jax.evaluation.unfinished import Part, present
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from verifai_jax.evaluation.host_engine import HostEngine
     from verifai_jax.evaluation.journal import Journal
     from verifai_jax.evaluation.native_engine import NativeEngine
+    from verifai_jax.evaluation.unfinished import Part
 
 
 NOT_NATIVE = (
@@ -232,7 +233,7 @@ class Evaluator:
             np.asarray(points), np.arange(first, first + len(points)), temperature, simulate
         )
 
-    def part(self) -> Part | None:
+    def part(self) -> "Part | None":
         """Return what is kept of work that goes on where an earlier process was killed, if any."""
         work = None if self._keeps_traces else present()
         if work is not None and (self._kept is None or self._kept.of is not work):

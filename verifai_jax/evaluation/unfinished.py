@@ -14,7 +14,6 @@ import contextlib
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -25,6 +24,7 @@ from jaxtyping import Float, Int
 from verifai_jax.core.progress import write_line
 from verifai_jax.core.sources import Sources, list_changes
 from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.kept_work import PRESENT
 from verifai_jax.evaluation.verdicts import RowVerdict, Verdicts
 from verifai_jax.problem.problem import Problem
 from verifai_jax.store.cache import Cache, CacheError, locked_cache
@@ -33,8 +33,6 @@ from verifai_jax.store.log import Arrays
 Form: TypeAlias = jax.tree_util.PyTreeDef  # pyright: ignore[reportInvalidTypeForm]
 KIND = "unfinished"
 """Kind of the cache."""
-_PRESENT: ContextVar["Unfinished | None"] = ContextVar("unfinished", default=None)
-"""The work that evaluators of this process are part of."""
 
 
 class Unfinished:
@@ -188,11 +186,6 @@ class _Rows(Journal):
             super().add(row, point, verdict)
 
 
-def present() -> Unfinished | None:
-    """Return the work whose simulations are kept now, or None if there is none."""
-    return _PRESENT.get()
-
-
 @contextlib.contextmanager
 def keeping(folder: Path, work: Mapping[str, Any]) -> Iterator[Unfinished]:
     """Keep the simulations of all evaluators that are used within, until the work is done.
@@ -209,11 +202,11 @@ def keeping(folder: Path, work: Mapping[str, Any]) -> Iterator[Unfinished]:
         kept = Unfinished(cache, folder)
         try:
             cache.claim(work)
-            token = _PRESENT.set(kept)
+            token = PRESENT.set(kept)
             try:
                 yield kept
             finally:
-                _PRESENT.reset(token)
+                PRESENT.reset(token)
         finally:
             if kept.done or kept.empty:
                 shutil.rmtree(folder, ignore_errors=True)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.figure import Drawn
+from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook, frame_html
 from verifai_jax.core.text import format_percent, format_seconds
 from verifai_jax.falsification.run import Run
@@ -114,7 +115,7 @@ class FailureTable(Drawn, InNotebook):
         rows = [
             {
                 "fails": each.fails,
-                "severity": _severity(each),
+                "severity": severity_text(each),
                 "property": each.broken,
                 "onset_to_violation": each.delay,
                 "shown_by": each.shown_by,
@@ -153,6 +154,18 @@ class FailureTable(Drawn, InNotebook):
             raise ValueError(f"{name} has no counterexample: nothing failed with it")
         return self.run.replay(effect.row)
 
+    def report(self, path: str | Path, **options: Any) -> Path:
+        """Write the evidence report on the table as HTML, and its claims as JSON.
+
+        **Arguments:**
+
+        - `path`: the path of the HTML file.
+        - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`.
+
+        **Returns:** the path.
+        """
+        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
+
     def __str__(self) -> str:
         failing = [each for each in self.effects if each.fails]
         what = "in a mission" if self.rate is not None else "given that it happens"
@@ -170,7 +183,7 @@ class FailureTable(Drawn, InNotebook):
             elif each.row is None:
                 line += ", fails under few random keys"
             else:
-                line += f", {each.verdict}\n    from {_severity(each)}; breaks {each.broken} "
+                line += f", {each.verdict}\n    from {severity_text(each)}; breaks {each.broken} "
                 line += f"{format_seconds(each.delay, 3)} after the onset"
                 if each.shown_by:
                     shown = format_seconds(each.shown_after, 3)
@@ -186,5 +199,6 @@ class FailureTable(Drawn, InNotebook):
         yield frame_html(self.table)
 
 
-def _severity(effect: Effect) -> str:
+def severity_text(effect: Effect) -> str:
+    """Write the least severities at which a row fails."""
     return ", ".join(f"{name} {value:z.4g}" for name, value in effect.severity.items())

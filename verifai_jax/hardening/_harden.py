@@ -9,6 +9,7 @@ Sources: Pinto, Davidson, Sukthankar and Gupta, Robust adversarial reinforcement
 randomization for transferring deep neural networks, IROS 2017 (the baseline).
 """
 
+import inspect
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -29,12 +30,12 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import reproducible_settings
 from verifai_jax.core.progress import say_done, shows_progress
 from verifai_jax.features import Categorical
-from verifai_jax.hardening.arms import Arms, Mix
+from verifai_jax.hardening.arms import Arms, FunctionArms, TaskArms
 from verifai_jax.hardening.collecting import Collected, collect, end_if_interrupted
-from verifai_jax.hardening.mixture import HardeningError, Start, mixture_of
+from verifai_jax.hardening.mixture import HardeningError, Mixture, Start, mixture_of
 from verifai_jax.hardening.result import BASELINE, HARDENED, Hardening
 from verifai_jax.problem.problem import Problem
-from verifai_jax.rl import Algorithm, Task, evaluate
+from verifai_jax.rl import Algorithm, evaluate
 from verifai_jax.search import Search
 from verifai_jax.statistics.confidence_sequences import safe_at
 from verifai_jax.store.cache import Cache, locked_cache
@@ -135,7 +136,9 @@ def harden(
     **Arguments:**
 
     - `study`: a `Study`, a `Trainer`, or a task. A task says by `start(key, features) -> state` how
-      an episode with the features of the problem starts, as tasks of `ode_task` do.
+      an episode with the features of the problem starts, as tasks of `ode_task` do. A function that
+      trains gets the argument `starts`: a list of features, of which each of its episodes takes one
+      at random, and `None` for those of its own; in the first training all are.
     - `problem`: from a policy to the problem of its closed loop; that of the study when left out.
     - `algorithm`: the algorithm of a task; `PPO()` when left out.
     - `start(key, features) -> state`: where the task has no such method.
@@ -203,12 +206,16 @@ class Work:
         self.study, self.plan, self.cache, self.untrained = study, plan, cache, untrained
         self.arms_named = (HARDENED, BASELINE) if plan.baseline else (HARDENED,)
         stages = [plan.steps + stage * plan.further_steps for stage in range(plan.rounds + 1)]
-        trainer, space = study.trainer, untrained.space
-        configured = trainer.configuration(values, plan.seed).task
-        self.task = configured if trainer.nominal is None else trainer.nominal
-        mixture = mixture_of(configured, untrained, start)
-        self.arms = Arms(trainer, values, stages, plan.seed, cache, mixture, self.arms_named)
-        self.stages = stages
+        trainer, space, named = study.trainer, untrained.space, self.arms_named
+        self.task, self.stages = trainer.nominal, stages
+        self.arms: Arms
+        if isinstance(trainer, FunctionTrainer):
+            self.arms = FunctionArms(study, values, stages, plan.seed, cache, named)
+        else:
+            configured = trainer.configuration(values, plan.seed).task
+            self.task = configured if trainer.nominal is None else trainer.nominal
+            mixture = mixture_of(configured, untrained, start)
+            self.arms = TaskArms(trainer, values, stages, plan.seed, cache, mixture, named)
         self.points = np.zeros((0, space.dim), np.float32)
         self.rows: list[dict[str, Any]] = []
         self.added: list[pd.DataFrame] = []
@@ -246,7 +253,7 @@ class Work:
         end_if_interrupted(certificates)
         for number, (arm, policy) in enumerate(zip(self.arms_named, policies, strict=True)):
             self.policies[arm, stage] = policy
-            self.returns[arm, stage] = self._returns(policy)
+            self.returns[arm, stage] = self._returns(number, stage, policy)
             one = certificates[number]
             self.rows.append(
                 {
@@ -282,14 +289,14 @@ class Work:
         if len(found.points):
             columns = space.rows(space.features_at(found.points))
             self.added.append(pd.DataFrame(columns).assign(round=stage, source=found.sources))
-        rest = 1 - plan.own
-        mixes: dict[str, Mix] = {
-            HARDENED: ((plan.own, rest - plan.failing, plan.failing), self.points),
-            BASELINE: ((plan.own, rest, 0.0), self.points[:0]),
-        }
-        self.arms.mix(stage + 1, mixes)
+        shares = (plan.own, 1 - plan.own - plan.failing, plan.failing)
+        mixtures = [Mixture.of(space, shares, p) for p in (self.points, self.points[:0])]
+        self.arms.mix(stage + 1, mixtures[: len(self.arms_named)])
 
-    def _returns(self, policy: Any) -> np.ndarray:
+    def _returns(self, number: int, stage: int, policy: Any) -> np.ndarray:
+        if self.task is None:
+            assert isinstance(self.arms, FunctionArms)
+            return np.array([self.arms.checkpoint(number, stage).training_return])
         seed, episodes = self.plan.seed_for(RETURNS), self.plan.episodes
         return np.asarray(evaluate(self.task, policy, seed=seed, episodes=episodes), np.float64)
 
@@ -357,28 +364,30 @@ def _as_study(
     algorithm: Algorithm | None,
     p: float | None,
 ) -> Study:
-    trainer = given.trainer if isinstance(given, Study) else given
-    is_function = callable(trainer) and not isinstance(trainer, Task | type)
-    if is_function or isinstance(trainer, FunctionTrainer):
-        name = getattr(trainer, "name", getattr(trainer, "__name__", "it"))
-        raise HardeningError(
-            f"harden says where the episodes of a training begin, which it cannot for the function "
-            f"{name}: give a task and one of the algorithms of verifai_jax.rl"
-        )
     if isinstance(given, Study):
         if problem is not None or algorithm is not None:
             raise ValueError("a Study has a problem and algorithms; give no others")
-        return given
-    if problem is None:
+        study = given
+    elif problem is None:
         raise HardeningError(
             "harden needs problem=, a function from a policy to the Problem of its closed loop"
         )
-    if not isinstance(trainer, Trainer):
-        trainer = Trainer(given) if algorithm is None else Trainer(given, algorithm)
-    elif algorithm is not None:
-        raise ValueError("a Trainer has algorithms; give no other")
-    space = {"steps": Categorical(trainer.steps)}
-    return Study(trainer.name, space, trainer, problem, p=0.01 if p is None else p)
+    else:
+        if isinstance(given, Trainer) and algorithm is not None:
+            raise ValueError("a Trainer has algorithms; give no other")
+        trainer = given if isinstance(given, Trainer) else Trainer(given)
+        trainer = trainer if algorithm is None else Trainer(given, algorithm)
+        space = {"steps": Categorical(trainer.steps)}
+        study = Study(trainer.name, space, trainer, problem, p=0.01 if p is None else p)
+    trainer = study.trainer
+    if isinstance(trainer, FunctionTrainer):
+        if "starts" not in inspect.signature(trainer.train).parameters:
+            raise HardeningError(
+                f"harden says where the episodes of a training begin: give {trainer.name} an "
+                "argument starts, a list of features, with None for an episode of its own"
+            )
+        trainer.check(study.space)
+    return study
 
 
 def _fingerprint(

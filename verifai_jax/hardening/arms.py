@@ -1,7 +1,7 @@
 """The policies of hardening, stage by stage: one arm with counterexamples, one with the prior.
 
-arms = Arms(trainer, values, stages, seed, cache, mixture, ("hardened", "randomised"))
-arms.mix(1, {"hardened": (shares, centres), "randomised": (shares, none)})
+arms = TaskArms(trainer, values, stages, seed, cache, mixture, ("hardened", "randomised"))
+arms.mix(1, [mixture, prior])
 arms.policies(1)                                    # trained up to the second stage, or cached
 
 Arms share the training seed, so that up to the first stage they are one training, and afterwards
@@ -9,24 +9,39 @@ take the same number of environment steps, wherever an episode begins.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from dataclasses import replace
+from typing import Any, Protocol, cast
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
-from verifai_jax.hardening.mixture import MixtureTask
+from verifai_jax.hardening.mixture import HardeningError, Mixture, MixtureTask
 from verifai_jax.rl.batched_training import BatchedTraining, Configuration
-from verifai_jax.rl.policy import Policy
 from verifai_jax.store.cache import Cache
+from verifai_jax.sweeps.clock import Clock
+from verifai_jax.sweeps.function_runs import FunctionRuns
+from verifai_jax.sweeps.study import Study
 from verifai_jax.sweeps.trainer import Trainer
+from verifai_jax.sweeps.training_runs import RunCheckpoint
 
-Mix = tuple[tuple[float, float, float], Float[np.ndarray, "n d"]]
-"""Shares of episodes, as `MixtureTask` has them, and the centres of neighbourhoods."""
+STARTS = 4096
+"""Episodes that a function gets to train on: enough that each of 256 neighbourhoods has some."""
 
 
-class Arms:
-    """The arms of a hardening, trained by one compiled program."""
+class Arms(Protocol):
+    """Trainings that differ in where their episodes begin."""
+
+    def mix(self, stage: int, mixtures: Sequence[Mixture]) -> None:
+        """Say, for each arm, what the episodes are drawn from on the way to a stage."""
+        ...
+
+    def policies(self, stage: int) -> list[Any]:
+        """Return the policy of each arm at a stage, trained if it is not cached."""
+        ...
+
+
+class TaskArms:
+    """Trainings of a task, by one compiled program."""
 
     def __init__(
         self,
@@ -44,15 +59,13 @@ class Arms:
         self._form = jax.tree.structure(trainer.untrained_policy(trainer.algorithm_name(values)))
         one = Configuration(mixture, configuration.algorithm, stages[-1], seed)
         self._batch = BatchedTraining([one] * len(self.names))
-        self._mixes: dict[int, Mapping[str, Mix]] = {}
+        self._mixes: dict[int, Sequence[Mixture]] = {}
         self._reached = -1
 
-    def mix(self, stage: int, mixes: Mapping[str, Mix]) -> None:
-        """Say what the episodes are drawn from on the way to a stage."""
-        self._mixes[stage] = mixes
+    def mix(self, stage: int, mixtures: Sequence[Mixture]) -> None:
+        self._mixes[stage] = mixtures
 
     def policies(self, stage: int) -> list[Any]:
-        """Return the policy of each arm at a stage, trained if it is not cached."""
         names = [f"training/{stage}/{arm}" for arm in self.names]
         stored = [self._cache.get(name) for name in names]
         if any(arrays is None for arrays in stored):
@@ -68,16 +81,54 @@ class Arms:
                 }
             )
             stored = [self._cache.get(name) for name in names]
-        return [self._policy(cast("dict[str, np.ndarray]", arrays)) for arrays in stored]
+        known = cast("list[dict[str, np.ndarray]]", stored)
+        return [jax.tree.unflatten(self._form, [a[n] for n in sorted(a)]) for a in known]
 
     def _train(self, stage: int) -> None:
-        for number, arm in enumerate(self.names):
-            if stage in self._mixes:
-                shares, centres = self._mixes[stage][arm]
-                self._batch.change_task(number, self._mixture.mixed(shares, centres))
+        for number, mixture in enumerate(self._mixes.get(stage, ())):
+            self._batch.change_task(number, replace(self._mixture, mixture=mixture))
         for _ in self._batch.advance(dict.fromkeys(range(len(self.names)), self.stages[stage])):
             pass
         self._reached = stage
 
-    def _policy(self, arrays: Mapping[str, np.ndarray]) -> Policy:
-        return jax.tree.unflatten(self._form, [arrays[name] for name in sorted(arrays)])
+
+class FunctionArms:
+    """Trainings by a function, which gets the features that its episodes begin with."""
+
+    def __init__(
+        self,
+        study: Study,
+        values: Mapping[str, object],
+        stages: Sequence[int],
+        seed: int,
+        cache: Cache,
+        arms: Sequence[str],
+    ) -> None:
+        trainer = replace(study.trainer, steps=stages[-1])
+        staged = Study(study.name, study.space, trainer, study.problem, stages[:-1])
+        self._runs, self._seed = FunctionRuns(staged, cache, Clock(study.name, None, False)), seed
+        for number, arm in enumerate(arms):
+            self._runs.add(values, seed)
+            run = self._runs.runs[number]
+            self._runs.runs[number] = replace(run, key=f"{run.key}-{arm}")
+
+    def mix(self, stage: int, mixtures: Sequence[Mixture]) -> None:
+        for number, mixture in enumerate(mixtures):
+            key = jax.random.fold_in(jax.random.key(self._seed), stage)
+            own, points = jax.vmap(mixture.episode)(*jax.random.split(key, (2, STARTS)))
+            features = jax.tree.map(np.asarray, mixture.space.features_at(np.asarray(points)))
+            self._runs.starts[number] = [
+                None if is_own else jax.tree.map(lambda leaf, i=i: leaf[i], features)
+                for i, is_own in enumerate(np.asarray(own))
+            ]
+
+    def policies(self, stage: int) -> list[Any]:
+        numbers = range(len(self._runs.runs))
+        self._runs.train(numbers, stage, further=True)
+        for error in self._runs.errors.values():
+            raise HardeningError(f"{self._runs.study.trainer.name} does not train: {error}")
+        return [self.checkpoint(number, stage).policy for number in numbers]
+
+    def checkpoint(self, number: int, stage: int) -> RunCheckpoint:
+        """Return an arm at a stage that it has reached."""
+        return cast(RunCheckpoint, self._runs.checkpoint(number, stage))

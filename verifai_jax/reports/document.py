@@ -17,6 +17,7 @@ from verifai_jax.core.errors import check_names
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.error_budgets.result import ErrorBudget
 from verifai_jax.estimation.result import Estimate
+from verifai_jax.failure_table.result import FailureTable
 from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import Judgement
@@ -25,6 +26,7 @@ from verifai_jax.reports.assessment import with_assessment
 from verifai_jax.reports.comparison_report import comparison_page
 from verifai_jax.reports.errors_section import with_errors
 from verifai_jax.reports.estimate_report import estimate_page
+from verifai_jax.reports.failure_table_report import failure_table_page
 from verifai_jax.reports.judgement_report import judgement_page
 from verifai_jax.reports.odd_section import with_odd
 from verifai_jax.reports.page import write_page
@@ -57,8 +59,8 @@ def write_report(
 
     **Arguments:**
 
-    - `result`: a run, a sweep, an estimate, a verification, a comparison, a transfer or a
-      judgement. The failures of a run that has its problem are simulated again.
+    - `result`: a run, a sweep, an estimate, a verification, a comparison, a transfer, a failure
+      table or a judgement. The failures of a run that has its problem are simulated again.
     - `path`: the path of the HTML file; the claims go to the same name with the ending
       `.claims.json`.
     - `units`: the units of features, by name.
@@ -69,8 +71,8 @@ def write_report(
       system is a black box that takes long.
     - `modes`: simulations spent on all ways of failing of a run and their probabilities, as
       `vj.modes` finds them; none when left out.
-    - `problem`: the problem of an estimate or a verification, or the baseline of a comparison, for
-      its property and prior.
+    - `problem`: the problem of an estimate, a verification or a failure table without a failure, or
+      the baseline of a comparison, for its property and prior.
     - `errors`: how wrong the number can be, as `vj.error_budget` says: a section and a claim.
     - `odd`: the operational design domain, of `vj.read_odd`: a section on what a run covers of it;
       its units, and its reasons with their sources, are those of features without others.
@@ -119,6 +121,10 @@ def write_report(
         case Transfer():
             _check(about, result.space, ())
             page = transfer_page(result, about)
+        case FailureTable():
+            problem = problem if result.run is None else result.run.problem
+            _check(about, None if problem is None else problem.space, ())
+            page = failure_table_page(result, about, problem)
         case Judgement():
             _check(about, None, ())
             page = judgement_page(result)
@@ -126,7 +132,7 @@ def write_report(
             kind = type(result).__name__
             raise TypeError(
                 "a report is on a run, a sweep, an estimate, a verification, a comparison, a "
-                f"transfer or a judgement; got {kind}"
+                f"transfer, a failure table or a judgement; got {kind}"
             )
     if errors is not None:
         page = with_errors(page, errors)

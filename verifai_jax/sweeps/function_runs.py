@@ -55,6 +55,8 @@ class FunctionRuns(TrainingRuns):
             check_executor(executor)
         self._trainer = cast(FunctionTrainer, study.trainer)
         self._workers = executor
+        self.starts: dict[int, Any] = {}
+        """For a function with an argument `starts`, what it gets of a training, by its number."""
         if cache.path is None:
             self._folder = Path(tempfile.mkdtemp(prefix="verifai_jax_trainings_"))
             weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
@@ -106,6 +108,8 @@ class FunctionRuns(TrainingRuns):
             run = self.runs[number]
             steps, folder = run.checkpoints[at], str(self._begin(number, at))
             calls.append({"values": dict(run.values), "steps": steps, "folder": folder})
+            if number in self.starts:
+                calls[-1]["starts"] = self.starts[number]
         seeds = [self.runs[number].seed for number in numbers]
         train = partial(train_once, self._trainer.train, self._trainer.observation)
 
@@ -182,7 +186,8 @@ def train_once(
 
     - `train`: see `Trainer`.
     - `observation`: an example for policies that do not say what they observe, or None.
-    - `call`: the hyper-parameters `values`, the `steps` in all, and the `folder` to resume from.
+    - `call`: the hyper-parameters `values`, the `steps` in all, the `folder` to resume from, and
+      `starts` if it gets them.
     - `seed`: training seed.
 
     **Returns:** the arrays, which the pool hands on as they are.
@@ -191,7 +196,9 @@ def train_once(
     np.random.seed(seed)  # noqa: NPY002 - what other frameworks draw from.
     if (torch := sys.modules.get("torch")) is not None:
         torch.manual_seed(seed)
-    options = {"resume": Path(call["folder"])} if resumes(train) else {}
+    options: dict[str, Any] = {"resume": Path(call["folder"])} if resumes(train) else {}
+    if "starts" in call:
+        options["starts"] = call["starts"]
     began = time.perf_counter()
     made = train(jax.random.key(seed), dict(call["values"]), steps=call["steps"], **options)
     seconds = time.perf_counter() - began

@@ -1,0 +1,88 @@
+"""Hardening against plain domain randomisation at equal environment steps; see RESULTS.md.
+
+    python benchmarks/hardening.py cartpole [--seeds 5] [--folder hardenings]
+
+Of each seed both arms are one training up to the first round, and take the same steps afterwards.
+Failure probabilities are those of the last certificate, from samples that decided nothing. What is
+compared is the logarithm of the failure probability, with half a failure added to each count.
+Interrupted, it goes on where it was.
+"""
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+import verifai_jax as vj
+from envs.cartpole import CartPoleTask
+from envs.mountain_car import MountainCarTask
+from envs.train_cartpole import HYPER_PARAMETERS
+from specs.cartpole import balance_with
+from specs.mountain_car import climb_with, safe_training
+from verifai_jax.statistics.paired import paired_difference
+
+WIDE = {
+    "x0": vj.Box(-1.5, 1.5),
+    "theta0": vj.Box(-0.12, 0.12),
+    "masspole": vj.Box(0.05, 1.0),
+    "length": vj.Box(0.2, 2.0),
+}
+"""Starts and poles of which a policy that was trained on CartPole-v1 keeps not all."""
+
+
+def wide_with(policy):
+    """Return `balance` under a policy, with these starts and poles."""
+    return dataclasses.replace(balance_with(policy), space=vj.FeatureSpace(WIDE))
+
+
+CASES = {
+    "cartpole": (
+        CartPoleTask(masspole_range=0.0, length_range=0.0), wide_with, HYPER_PARAMETERS,
+        {"steps": 300_000, "p": 0.001},
+    ),
+    "mountain_car": (
+        vj.Trainer(MountainCarTask(potential=10.0), safe_training.trainer.by_name["ppo"],
+                   steps=500_000, nominal=MountainCarTask()),
+        climb_with, None, {"p": 0.001},
+    ),
+}  # fmt: skip
+
+
+def odds(certificate):
+    """Return the failure probability of a certificate, never 0."""
+    return (certificate.failures + certificate.not_finite + 0.5) / (certificate.simulations + 1)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("case", choices=CASES)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--folder", type=Path)
+    args = parser.parse_args()
+    task, problem, algorithm, options = CASES[args.case]
+    logs, seconds = [], 0.0
+    for seed in range(args.seeds):
+        folder = None if args.folder is None else args.folder / args.case / str(seed)
+        result = vj.harden(
+            task, problem, algorithm=algorithm, seed=seed, baseline=True, folder=folder,
+            progress=False, **options,
+        )  # fmt: skip
+        print(result, flush=True)
+        logs.append([np.log(odds(each)) for each in result.certificates])
+        seconds += result.seconds
+    before, hardened, randomised = np.array(logs).T
+    print(f"\n{args.case}: {args.seeds} seeds, {seconds / args.seeds:.0f} s each")
+    named = (("hardened", before, hardened), ("randomised", before, randomised),
+             ("hardened, not randomised", randomised, hardened))  # fmt: skip
+    for name, one, other in named:
+        gained = paired_difference(one, other, 0.95)
+        ends = [np.exp(each) for each in (gained.low, gained.mean, gained.high)]
+        print(
+            f"  {name}: fails {ends[1]:.3g} times less (95 % t interval {ends[0]:.3g} to "
+            f"{ends[2]:.3g}), less in {(other < one).sum()} of {args.seeds} seeds"
+        )
+
+
+if __name__ == "__main__":
+    main()

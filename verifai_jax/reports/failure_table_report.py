@@ -1,0 +1,119 @@
+"""The report on a failure table: what each fault does, how probable that is, and its replay."""
+
+from verifai_jax.core.text import format_percent, format_seconds
+from verifai_jax.failure_table.result import Effect, FailureTable, severity_text
+from verifai_jax.problem.problem import Problem
+from verifai_jax.reports.claims import Claim, claims_json
+from verifai_jax.reports.markup import bullets, paragraph, picture, preformatted, table
+from verifai_jax.reports.page import Page, Section
+from verifai_jax.reports.provenance import Model, chained
+from verifai_jax.reports.run_question import About
+from verifai_jax.reports.sections import (
+    MODEL,
+    answers_section,
+    claims_section,
+    model_answer,
+    model_warnings,
+    problem_content,
+    provenance_content,
+)
+from verifai_jax.reports.studies import png
+
+NOMINAL = "All features that are not of the faults of a row are nominal."
+INDEPENDENT = "A fault happens at its rate, in a mission once at most, and independently of others."
+SAMPLED = "The numbers of a fault are independent samples of its prior, given that it happens."
+
+
+def failure_table_page(found: FailureTable, about: About, problem: Problem | None) -> Page:
+    """Make the report on a failure table.
+
+    **Arguments:**
+
+    - `found`: the failure table.
+    - `about`: units and reasons of the features.
+    - `problem`: the problem with its faults; None if it is not at hand.
+    """
+    run, sure = found.run, format_percent(found.confidence)
+    model = Model.of(() if run is None else run.sources, problem and problem.sources())
+    links = tuple(chained(model.inputs))
+    failing = [each for each in found if each.fails]
+    assumed = (MODEL, NOMINAL, SAMPLED, *([] if found.rate is None else [INDEPENDENT]))
+    when = "in a mission" if found.rate is not None else "given that it happens"
+    headline = (
+        f"{len(failing):,} of {len(found):,} faults and pairs break the property; "
+        f"{sum(each.confirmed for each in failing):,} of these are confirmed."
+    )
+    claims = [
+        Claim(f"C{i + 1}", _sentence(each, when, sure), (_samples(each), each.command), assumed)
+        for i, each in enumerate(found)
+    ]
+    heads = ["fault", "fails from", "breaks", "after the onset", "shown by", "probability", "low",
+             "high", "verdict"]  # fmt: skip
+    rows = [
+        (
+            each.name, severity_text(each), each.broken,
+            format_seconds(each.delay, 3) if each.broken else "", each.shown_by,
+            f"{each.probability:z.2g}", f"{each.low:z.2g}", f"{each.high:z.2g}",
+            each.verdict or "no failure found",
+        )
+        for each in found
+    ]  # fmt: skip
+    commands = [f"{each.name}: {each.command}" for each in failing if each.command]
+    limits = ["A fault without a failure may fail in ways that no sample and no search met."]
+    if not found.healthy:
+        limits.append("The nominal features break the property without any fault.")
+    sections = (
+        answers_section(
+            [
+                ("What was claimed?", headline, "claims"),
+                ("How probable is it?", f"see the table: {when}, {sure} intervals", "found"),
+                ("What does it rest on?", SAMPLED, "limits"),
+                model_answer(model),
+            ]
+        ),
+        Section(
+            "asked",
+            "What was asked",
+            (
+                paragraph(
+                    f"What each fault of {found.name} does, and each pair of those that do "
+                    "not fail alone."
+                ),
+                *([] if problem is None else problem_content(problem, about)),
+            ),
+        ),
+        Section(
+            "found",
+            "What was found",
+            (
+                table(heads, rows, f"Probabilities {when}, with {sure} intervals"),
+                picture(png(found.plot()), "The probability of each row with its interval"),
+            ),
+        ),
+        Section("limits", "What was not shown", (bullets([*limits, *assumed]),)),
+        claims_section(claims),
+        Section(
+            "reproduce",
+            "How to reproduce it",
+            (preformatted("\n".join(commands)), *provenance_content(links, model)),
+        ),
+    )
+    return Page(
+        title=f"{found.name}: failure modes and effects of faults",
+        headline=headline,
+        tone="fails" if failing else "open",
+        sections=sections,
+        claims=claims_json(found.name, claims, links[-1].chain if links else ""),
+        warnings=model_warnings(model),
+    )
+
+
+def _sentence(effect: Effect, when: str, sure: str) -> str:
+    chance = f"{effect.probability:z.2g} ({sure} interval {effect.low:z.2g} to {effect.high:z.2g})"
+    if not effect.fails:
+        return f"No failure by {effect.name} was found; its probability {when} is {chance}."
+    return f"{effect.name} breaks the property with probability {chance} {when}."
+
+
+def _samples(effect: Effect) -> str:
+    return f"{effect.failures:,} failures in {effect.simulations:,} samples of the prior"
