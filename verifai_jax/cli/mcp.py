@@ -212,9 +212,8 @@ class Server:
                 env={**os.environ, "MPLBACKEND": "agg"},
             )  # fmt: skip
         except subprocess.TimeoutExpired:
-            raise Refused(
-                f"it was ended after {self.seconds:zg} s; take a smaller budget"
-            ) from None
+            text = f"it was ended after {self.seconds:zg} s; take a smaller budget"
+            raise Refused(text) from None
 
     def _fence(self, key: str, value: str) -> None:
         """Refuse a path outside of the folder, and a problem that is no file in it."""
