@@ -214,7 +214,7 @@ def gradients():
         engines = {}
         for mode in ("forward", "reverse"):
             engine = engines[mode] = Engine(problem, 256, gradient=True)
-            engine._derivative = Derivative(d).by(mode)
+            engine.program.derivative = Derivative(d).by(mode)
             engine.compile()
         chosen = "reverse" if Derivative(d).reverse else "forward"
         ratios = {

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 from scipy.stats import chi2, norm
 
-from verifai_jax.estimation import surrogate
+from verifai_jax.estimation import gaussian_surrogate, surrogate
 from verifai_jax.estimation.answers import (
     Plan,
     chains_for,
@@ -227,7 +227,7 @@ def main():
             wave = np.sin(z @ np.random.default_rng(z.shape[1]).standard_normal((z.shape[1], 5)))
             return wave.sum(axis=1) + 1.5, np.full(len(z), 0.3)
 
-        surrogate.Surrogate.predict = wrong
+        gaussian_surrogate.Surrogate.predict = wrong
     for method in options.methods:
         table(method, options.problems, options.seeds, options.budget)
 

@@ -16,7 +16,8 @@ from click.testing import CliRunner
 
 import verifai_jax as vj
 from verifai_jax.cli.main import main
-from verifai_jax.evaluation.unfinished import keeping, present
+from verifai_jax.evaluation.kept_work import present
+from verifai_jax.evaluation.unfinished import keeping
 
 MODEL = """
 import os

@@ -95,6 +95,9 @@ def test_less_effort_gives_the_same_numbers_and_unknown_options_are_left_out(mon
     monkeypatch.setattr(jax.config, "read", lambda name: False)
     monkeypatch.setitem(compilation._OPTIONS, "little", {"no_such_option": True})
     assert compilation.options_of.__wrapped__("little") is None
+    plain = jax.jit(lambda x: x * 3).lower(x)
+    program = compile_soon("one", plain, "little", splits=False, wide=True)
+    np.testing.assert_array_equal(program(x), 3 * x)
 
 
 def test_what_the_compiler_raises_is_raised_where_the_program_is_called():

@@ -199,6 +199,22 @@ def test_few_slow_simulations_are_lost_when_somebody_interrupts(monkeypatch):
     assert answer.prior.simulations == sum(calls[:-1]) > 30
 
 
+def test_each_of_several_workers_has_something_to_simulate(monkeypatch):
+    from verifai_jax.estimation import normal_space
+
+    calls, clock = [], [0.0]
+    monkeypatch.setattr(normal_space.time, "perf_counter", lambda: clock[0])
+
+    def evaluate(u):
+        calls.append(len(u))
+        clock[0] += 60.0
+        return np.ones(len(u)), np.zeros(len(u), bool), np.ones(len(u), bool)
+
+    limit_state = normal_space.LimitState(evaluate, 1, 200, batch=64, one_by_one=True, workers=3)
+    limit_state(np.zeros((100, 1)))
+    assert calls[:3] == [16, 12, 12]
+
+
 @pytest.mark.parametrize(
     ("splitting", "reached", "tail", "widened"),
     [

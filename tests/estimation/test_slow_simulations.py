@@ -1,6 +1,7 @@
 """Few simulations: a surrogate, or a cheap model, proposes; fresh simulations are the estimate."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,13 @@ from scipy.special import ndtri
 import verifai_jax as vj
 from tests.estimation.closed_forms import closed_form, normal
 from verifai_jax.estimation.answers import Plan
-from verifai_jax.estimation.surrogate import Surrogate, estimate_by_surrogate
+from verifai_jax.estimation.components import Gaussian, Prior
+from verifai_jax.estimation.control_variate import Control
+from verifai_jax.estimation.gaussian_surrogate import Surrogate
+from verifai_jax.estimation.importance import sample_proposal
+from verifai_jax.estimation.mixture import Mixture
+from verifai_jax.estimation.normal_space import LimitState
+from verifai_jax.estimation.surrogate import estimate_by_surrogate
 
 PLAN = Plan(0.95, 32, np.zeros(2, bool))
 
@@ -31,6 +38,10 @@ def series(z):
 CASES = {"trap": (trap, 3.209e-5), "series": (series, 2.224e-3)}
 
 
+SIDES = [Gaussian(np.array([side, 0.0]), np.eye(2), np.array([0.5, 1.0])) for side in (-2.3, 2.3)]
+WIDE = Mixture((Prior(2), *SIDES), np.array([0.1, 0.45, 0.45]))
+
+
 def answer_of(robustness, seed, plan=PLAN, budget=500):
     limit_state = closed_form(lambda u: robustness(normal(u)), 2, budget)
     return limit_state, estimate_by_surrogate(limit_state, np.random.default_rng(seed), plan)
@@ -43,8 +54,82 @@ def test_five_hundred_simulations(name):
     limit_state, answer = answer_of(robustness, 1)
     assert limit_state.simulations == 500
     assert answer.low < truth < answer.high < 1.6 * answer.low
-    assert answer.diagnostics["agreement"] > 0.9
+    assert answer.diagnostics["agreement"] > 0.85
     assert answer.prior.simulations < 60
+
+
+class Workers:
+    """A limit state whose simulations are begun and waited for; notes what happens when."""
+
+    def __init__(self, robustness):
+        self.robustness, self.log = robustness, []
+
+    def __call__(self, u):
+        rho = self.robustness(normal(u))
+        return rho, rho < 0, np.ones(len(u), bool)
+
+    def begin(self, u):
+        rho, violated, proper = self(u)
+        name = len(self.log)
+        self.log.append(f"begin {name}")
+
+        def result():
+            self.log.append(f"result {name}")
+            return SimpleNamespace(lowest=rho, violated=violated, proper=proper)
+
+        return SimpleNamespace(result=result, cancel=lambda: self.log.append("cancel"))
+
+
+def test_simulations_that_are_begun_count_once_they_are_waited_for():
+    workers = Workers(lambda z: 1 - z[:, 0])
+    limit_state = LimitState(workers, 2, 100, batch=50)
+    begun = limit_state.begin(np.array([[0.0, 0.0], [2.0, 0.0]]))
+    assert (limit_state.simulations, workers.log) == (0, ["begin 0"])
+    assert begun.result().failing.tolist() == [False, True]
+    assert (limit_state.simulations, limit_state.failures) == (2, 1)
+    # More than are simulated together are simulated when they are waited for.
+    assert limit_state.begin(np.zeros((60, 2))).result().failing.sum() == 0
+    assert workers.log == ["begin 0", "result 0"]
+
+
+class Known(Surrogate):
+    """One that says that everything beyond its border fails."""
+
+    def predict(self, z):
+        return self.border - np.abs(z[:, 0]), np.ones(len(z))
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.1, 3.0])
+def test_a_control_variate_is_right_whatever_the_surrogate_is_worth(shift):
+    rng, covered = np.random.default_rng(0), []
+    surrogate = Known(2)
+    surrogate.posterior, surrogate.border = True, 2.0 - shift
+    for _ in range(20):
+        # Half of the prior is refused; of the rest 0.0455 fails, more than two deviations away.
+        limit_state = LimitState(
+            lambda u: (lambda rho: (rho, rho < 0, rho < 9))(2.0 - np.abs(normal(u)[:, 0])),
+            2, 400, batch=400, constraint=lambda u: u[:, 1] > 0.5,
+        )  # fmt: skip
+        control = Control(limit_state, rng, surrogate, WIDE)
+        mean = control.estimate(sample_proposal(limit_state, rng, WIDE, 100), 0.95)
+        covered.append(mean.low < 0.0455003 < mean.high)
+        # Samples alone have a relative error of a fifth.
+        assert mean.cv < 0.12 or shift
+    assert np.mean(covered) > 0.9
+
+
+@pytest.mark.slow
+def test_workers_have_the_next_round_while_one_is_simulated():
+    def half_space(z):
+        return 2.5 - z[:, 0]
+
+    workers = Workers(half_space)
+    limit_state = LimitState(workers, 2, 120, batch=120)
+    answer = estimate_by_surrogate(limit_state, np.random.default_rng(0), PLAN)
+    assert workers.log[:3] == ["begin 0", "begin 1", "result 0"]
+    # Whether there are workers decides about nothing else.
+    _, same = answer_of(half_space, 0, budget=120)
+    assert (answer.probability, answer.low) == (same.probability, same.low)
 
 
 @pytest.mark.thorough
@@ -73,7 +158,7 @@ def test_a_cheap_model_saves_simulations():
 
     helped, answer = answer_of(series, 2, Plan(*[0.95, 32, PLAN.clamped, 1.5], cheap=cheap))
     assert answer.low < 2.224e-3 < answer.high <= 1.5**2 * answer.low
-    assert helped.simulations < 160
+    assert helped.simulations < 110
     # Another one that is wrong everywhere is found out.
     _, misled = answer_of(series, 2, Plan(*[0.95, 32, PLAN.clamped, 1.5], cheap=lambda u: u[:, 0]))
     assert misled.low < 2.224e-3 < misled.high

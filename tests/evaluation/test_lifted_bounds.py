@@ -29,7 +29,7 @@ def problem(high=2.0, swing=0.6):
 
 def text(engine):
     with jax.enable_x64(engine.precision == "float64"):
-        return engine._trace("evaluate").lower().as_text()
+        return engine.program.trace("evaluate").lower().as_text()
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])

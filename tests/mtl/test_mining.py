@@ -176,3 +176,12 @@ def test_a_front_is_drawn(tmp_path):
     assert (tmp_path / "front.png").stat().st_size > 1000
     with pytest.raises(ValueError, match="no front to draw"):
         mtl.mine("always x > ?d", trace(x=[5.5, 6.1])).plot()
+
+
+@given(formulas(counted=True), recordings(), st.sampled_from(["hold", "truncate"]), st.booleans())
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+def test_the_first_sample_alone_has_the_same_value(formula, recording, end, boolean):
+    signals = {name: np.asarray(v, float) for name, v in recording.items()}
+    alone, every = (HostValues.of(Trace(signals, dt=DT), end) for _ in range(2))
+    expected = (every.truth if boolean else every)(formula)[0]
+    np.testing.assert_array_equal(alone.first(formula, boolean), expected)

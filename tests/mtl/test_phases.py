@@ -7,6 +7,7 @@ import pytest
 
 from verifai_jax import mtl
 from verifai_jax.core.trace import Trace
+from verifai_jax.mtl.english import formula_words
 from verifai_jax.mtl.host_values import HostValues
 
 RANDOM = np.random.default_rng(5)
@@ -120,6 +121,10 @@ def test_the_text_of_what_is_counted_reads_back(text):
     built = mtl.always(mtl.duration(mtl.signal("speed") > 30, 60) <= 3)
     assert str(built) == "always (duration(speed > 30, 60) <= 3)"
     assert built.signals() == ("speed",)
+    assert formula_words(built) == (
+        "at all times, the number of seconds of the last 60 s in which speed is above 30 "
+        "is at most 3"
+    )
     assert mtl.latex(built) == (
         r"\Box \left(\mathrm{duration}_{60}\left(\mathit{speed} > 30\right) \leq 3\right)"
     )

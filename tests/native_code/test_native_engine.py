@@ -153,7 +153,7 @@ def test_the_record_says_which_engine(ending, tmp_path):
 
 def test_auto_is_native_where_the_budget_is_worth_it(ending):
     engine = engine_for(ending, BATCH)
-    enough = int(native_engine.WORTH / engine.work) + 1
+    enough = int(native_engine.WORTH / engine.program.work) + 1
     assert NativeEngine(engine, "auto", enough)._is_worth
     assert not NativeEngine(engine, "auto", enough - 2)._is_worth
 

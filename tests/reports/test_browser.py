@@ -1,5 +1,6 @@
 """The report in a real browser: nothing is fetched, nothing fails, rows answer."""
 
+import base64
 import json
 
 import jax.numpy as jnp
@@ -13,6 +14,8 @@ from verifai_jax.reports.view import trace_data, view_data
 
 chromium = pytest.importorskip("chromium")
 HOSTILE = "<script>alert(1)</script>"
+PAPER = 700
+"""Pixels between the margins of a page of A4."""
 BOX = """(() => {
   const box = document.querySelector(".vj-scatter").getBoundingClientRect();
   return [box.left, box.top, box.width, box.height];
@@ -36,7 +39,8 @@ def test_the_page_answers_in_a_browser(tmp_path):
         description=f"{HOSTILE} </script>",
     )
     run = vj.falsify(problem, "uniform", 64, batch=64, progress=False)
-    path = write_report(run, tmp_path / "report.html", traces=6, studies=False)
+    path = write_report(run, tmp_path / "report.html", traces=6, studies=False, assessment=True,
+                        odd=vj.odd_of(problem.space))  # fmt: skip
     with chromium.Browser(tmp_path / "profile") as browser:
         for width in (1280, 400):
             browser.open(path.as_uri(), width, 900)
@@ -48,6 +52,14 @@ def test_the_page_answers_in_a_browser(tmp_path):
             assert browser.value(broken) == 0
             assert HOSTILE in str(browser.value("document.body.innerText"))
         _rows_answer(browser, run)
+        # On paper nothing scrolls, so that nothing may be wider than the page.
+        browser.call("Emulation.setEmulatedMedia", media="print")
+        browser.open(path.as_uri(), PAPER, 990)
+        assert browser.value("document.documentElement.scrollWidth") <= PAPER
+        assert browser.value("document.getElementById('explore').offsetHeight") == 0
+        assert browser.value("document.getElementById('still').offsetHeight") > 100
+        printed = base64.b64decode(browser.call("Page.printToPDF")["data"])
+        assert printed.startswith(b"%PDF-")
         assert browser.errors == []
         assert browser.requests == []
 

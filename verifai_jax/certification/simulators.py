@@ -21,7 +21,6 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.certification.policy_groups import PolicyGroup
-from verifai_jax.core.compilation import options_of
 from verifai_jax.core.devices import Device, enable_compile_cache, spread_over_devices
 from verifai_jax.core.keys import IMPLEMENTATION, simulation_key
 from verifai_jax.evaluation.engine import Engine, Mode
@@ -212,8 +211,7 @@ class _Program:
                 jax.ShapeDtypeStruct((len(self.devices),), jnp.int32),
                 jax.eval_shape(lambda: jax.random.key(0, impl=IMPLEMENTATION)),
             )
-            program = jax.jit(self._traced(mode)).lower(*arguments)
-            self._executables[mode] = program.compile(options_of("most"))
+            self._executables[mode] = jax.jit(self._traced(mode)).lower(*arguments).compile()
         return self._executables[mode]
 
     def _traced(self, mode: Mode) -> Callable[..., PyTree]:
@@ -224,8 +222,10 @@ class _Program:
                 keys = jax.vmap(partial(simulation_key, key))(numbers)
                 engine = Engine(problem_with(self.problem_of, policy), self.lanes)
                 if mode == "holds":
-                    return (jax.vmap(engine.row_holds)(u[i], keys),)
-                rows = jax.vmap(engine.row, in_axes=(0, 0, None))(u[i], keys, jnp.float32(1.0))
+                    return (jax.vmap(engine.program.row_holds)(u[i], keys),)
+                rows = jax.vmap(engine.program.row, in_axes=(0, 0, None))(
+                    u[i], keys, jnp.float32(1.0)
+                )
                 return rows.rho, rows.status
 
             if not _one_by_one(self.devices):

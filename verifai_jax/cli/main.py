@@ -39,6 +39,7 @@ from verifai_jax.cli.fuzz import fuzz
 from verifai_jax.cli.going_on import WORDS
 from verifai_jax.cli.harden import harden
 from verifai_jax.cli.list import list_targets
+from verifai_jax.cli.mcp import mcp
 from verifai_jax.cli.merge import merge
 from verifai_jax.cli.modes import modes
 from verifai_jax.cli.monitor import monitor
@@ -83,6 +84,7 @@ COMMANDS = (
     trace,
     qualify,
     trials,
+    mcp,
     new,
 )
 """The sub-commands. Their files import nothing heavy until a command runs."""

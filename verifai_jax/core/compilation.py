@@ -32,9 +32,7 @@ some processors to the last bit, in programs without long chains of products and
 rounds each product."""
 
 _OPTIONS: dict[XlaOptimization, dict[str, Any]] = {
-    # Of the processor's widest vectors, where XLA takes half of them by itself: simulations ran up
-    # to 1.25 times as fast. Sums of many numbers are rounded otherwise.
-    "most": {"xla_cpu_prefer_vector_width": 512},
+    "most": {},
     "little": {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1},
     "least": {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0},
 }
@@ -42,6 +40,9 @@ _OPTIONS: dict[XlaOptimization, dict[str, Any]] = {
 _WHOLE_LOOPS = {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
 """Without the pass that splits a loop over cores: each time it is waited for takes longer than a
 step of a simulation."""
+_WIDE = {"xla_cpu_prefer_vector_width": 512}
+"""The widest vectors of any processor, of which XLA takes half by itself: with them simulations ran
+up to 1.25 times as fast."""
 
 _running: dict[int, tuple[str, float]] = {}
 """What is being compiled: a name for people, and when it began."""
@@ -70,12 +71,13 @@ class Compilation:
         lowered: jax.stages.Lowered,
         effort: XlaOptimization = "most",
         splits: bool = True,
+        wide: bool = False,
     ) -> None:
         self.name = name
-        self._how: tuple[XlaOptimization, bool] = effort, splits
+        self._how: tuple[XlaOptimization, bool, bool] = effort, splits, wide
         self._lowered: jax.stages.Lowered | None = lowered
         self._future: Future[jax.stages.Compiled] = _pool().submit(
-            _compiled, name, lowered, effort, splits
+            _compiled, name, lowered, effort, splits, wide
         )
         self._program: jax.stages.Compiled | None = None
 
@@ -127,6 +129,7 @@ def compile_soon(
     lowered: jax.stages.Lowered,
     effort: XlaOptimization = "most",
     splits: bool = True,
+    wide: bool = False,
 ) -> Compilation:
     """Compile a program in the background.
 
@@ -137,9 +140,11 @@ def compile_soon(
     - `effort`: how much XLA does to make it fast; accelerators always do the most.
     - `splits`: whether its loops may be split over cores; not of a program that runs on all of
       them.
+    - `wide`: whether it may have the widest vectors of the processor; only a program without
+      functions of XLA's own, of which one is wrong with these.
     """
     enable_compile_cache()
-    return Compilation(name, lowered, effort, splits)
+    return Compilation(name, lowered, effort, splits, wide)
 
 
 def while_compiling(work: Callable[[], object], after: float = LONG) -> None:
@@ -216,35 +221,35 @@ def _cancel_waiting() -> None:
 
 
 def _compiled(
-    name: str, lowered: jax.stages.Lowered, effort: XlaOptimization, splits: bool
+    name: str, lowered: jax.stages.Lowered, effort: XlaOptimization, splits: bool, wide: bool
 ) -> jax.stages.Compiled:
     with _said(name):
-        options = _wanted_options(effort, splits)
+        options = _wanted_options(effort, splits, wide)
+        if not options:
+            return lowered.compile()
         try:
             return lowered.compile(options)
         except jax.errors.JaxRuntimeError:
-            known = options_of(effort, splits)
+            # An XLA that does not know one of the options; asking before takes longer.
+            known = known_options(options)
             if known == options:
                 raise
             return lowered.compile(known)
 
 
-def _wanted_options(effort: XlaOptimization, splits: bool) -> dict[str, Any] | None:
+def _wanted_options(
+    effort: XlaOptimization, splits: bool = True, wide: bool = False
+) -> dict[str, Any]:
     # The user of this switch wants the least of all programs.
     if jax.default_backend() != "cpu" or jax.config.read("jax_disable_most_optimizations"):
-        return None
-    return _OPTIONS[effort] | ({} if splits else _WHOLE_LOOPS)
+        return {}
+    return _OPTIONS[effort] | ({} if splits else _WHOLE_LOOPS) | (_WIDE if wide else {})
 
 
 @cache
-def options_of(effort: XlaOptimization, splits: bool = True) -> dict[str, Any] | None:
-    """Return XLA's options for this effort, as far as XLA knows them; None if there are none.
-
-    **Arguments:**
-
-    - `splits`: whether loops may be split over cores.
-    """
-    return known_options(_wanted_options(effort, splits) or {}) or None
+def options_of(effort: XlaOptimization) -> dict[str, Any] | None:
+    """Return XLA's options for this effort, as far as XLA knows them; None if there are none."""
+    return known_options(_wanted_options(effort)) or None
 
 
 def known_options(options: Mapping[str, Any]) -> dict[str, Any]:

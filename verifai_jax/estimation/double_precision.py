@@ -20,8 +20,8 @@ from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import Engine
-from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.evaluation.unfinished import Part, present
+from verifai_jax.evaluation.evaluator import Evaluator, Sent
+from verifai_jax.evaluation.kept_work import present
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
@@ -29,6 +29,7 @@ from verifai_jax.problem.problem import Problem
 if TYPE_CHECKING:
     from verifai_jax.core.executors import Executor
     from verifai_jax.evaluation.host_engine import HostEngine
+    from verifai_jax.evaluation.unfinished import Part
 
 EXACT = 2**24
 """Greatest integer up to which all integers are float32 numbers."""
@@ -111,6 +112,7 @@ class DoublePrecisionEvaluator:
         self._evaluator = Evaluator(
             problem, batch, precision=precision, seed=seed, executor=executor, ends_raising=True
         )
+        self._sends = executor is not None
         self._differentiated: Evaluator | None = None
         self._problem, self._precision, self._seed = problem, precision, seed
         self._numbers = jax.jit(jax.vmap(lambda u: _flat(space.unflatten(u))))
@@ -124,6 +126,10 @@ class DoublePrecisionEvaluator:
     ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
         verdicts = self._evaluator(self._plain(u))
         return verdicts.lowest, verdicts.violated, verdicts.proper
+
+    def begin(self, u: Float[np.ndarray, "n d"]) -> Sent | None:
+        """Send points to the workers of the executor, if there is one, to be waited for later."""
+        return self._evaluator.begin(self._plain(u)) if self._sends else None
 
     def gradient(
         self, u: Float[np.ndarray, "n d"]

@@ -11,7 +11,7 @@ they are tested on closed forms without a simulation.
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -72,6 +72,9 @@ FIRST = 16
 """Simulations that are asked for at first, where they take their time one after another."""
 SECONDS = 1.0
 """Seconds after which fewer of these are asked for at a time."""
+BUSY = 4
+"""Simulations for each of several workers that are asked for at a time, at least: most of them are
+busy until the last one ends."""
 
 
 class Ended(Exception):
@@ -97,6 +100,7 @@ class LimitState:
     - `together`: batches that are simulated at a time, where there are several workers.
     - `one_by_one`: whether simulations take their time one after another, so that fewer are asked
       for at a time where they take long: whoever interrupts loses no more than these.
+    - `workers`: of these simulations, how many run side by side.
     - `gradient`: as `evaluate`, with the gradient by the coordinates of the cube; none when left
       out. A simulation with its gradient counts 2.
     - `uniform`: True at coordinates `[dim]` of uniform features; none of them when left out.
@@ -122,12 +126,15 @@ class LimitState:
         uniform: Bool[np.ndarray, " dim"] | None = None,
         draws: bool = False,
         one_by_one: bool = False,
+        workers: int = 1,
         rest: "Rest | None" = None,
     ) -> None:
         self.max_step = self.step = batch * together
         self.one_by_one = one_by_one
         if one_by_one:
             self.step = min(FIRST, self.max_step)
+        self.min_step = 1 if workers == 1 else min(BUSY * workers, self.max_step)
+        self.step = max(self.step, self.min_step)
         self.evaluate, self.dim, self.budget, self.batch = evaluate, dim, budget, batch
         self.constraint, self.deadline, self.report = constraint, deadline, report
         self.gradient, self.draws, self.rest = gradient, draws, rest
@@ -206,6 +213,13 @@ class LimitState:
             return Scores(np.zeros(0), np.zeros(0, bool), np.zeros(0, bool))
         return Scores(*self._in_batches(self._score, z))
 
+    def begin(self, z: Float[np.ndarray, "n d"]) -> "Begun":
+        """Begin to simulate points, and return what waits for their scores.
+
+        Workers of an executor begin at once; without them all waits for whoever waits for it.
+        """
+        return Begun(self, z)
+
     def linearize(self, z: Float[np.ndarray, "n d"]) -> Linearized:
         """Simulate points of normal space, and differentiate their robustness.
 
@@ -239,7 +253,11 @@ class LimitState:
             start = stop
             if self.one_by_one:
                 quick = took < SECONDS
-                self.step = min(2 * self.step, self.max_step) if quick else max(1, self.step // 2)
+                self.step = (
+                    min(2 * self.step, self.max_step)
+                    if quick
+                    else max(self.min_step, self.step // 2)
+                )
         return [np.concatenate(column) for column in zip(*parts, strict=True)]
 
     def _linearize(self, z: Float[np.ndarray, "n d"]) -> Linearized:
@@ -280,6 +298,40 @@ class LimitState:
         if self.report is not None:
             self.report(self.simulations, self.failures, self.lowest)
         return Scores(score, failing, proper)
+
+
+class Begun:
+    """Simulations on their way; `result` waits for them, once, in the order in which they began.
+
+    **Arguments:**
+
+    - `limit_state`: which counts them when they are waited for.
+    - `z`: their points.
+    """
+
+    def __init__(self, limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> None:
+        self.z, self._limit_state = z, limit_state
+        begin = getattr(limit_state.evaluate, "begin", None)
+        together = begin is not None and 0 < len(z) <= limit_state.step
+        self._waits: Any = begin(to_unit_cube(z)) if together and begin is not None else None
+
+    def result(self) -> Scores:
+        """Return the scores.
+
+        **Raises:** as a call of the limit state.
+        """
+        if self._waits is None:
+            return self._limit_state(self.z)
+        return Scores(*self._limit_state._in_batches(self._score, self.z))
+
+    def _score(self, z: Float[np.ndarray, "n d"]) -> Scores:
+        verdicts = self._waits.result()
+        return self._limit_state._counted(z, verdicts.lowest, verdicts.violated, verdicts.proper)
+
+    def cancel(self) -> None:
+        """Take what has not begun out of the queue of the workers."""
+        if self._waits is not None:
+            self._waits.cancel()
 
 
 def to_unit_cube(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:

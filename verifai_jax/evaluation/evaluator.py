@@ -20,8 +20,8 @@ from verifai_jax.core.programs import power_of_two
 from verifai_jax.core.progress import count_done
 from verifai_jax.evaluation.engine import Engine, Wanted, engine_for
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
+from verifai_jax.evaluation.kept_work import present
 from verifai_jax.evaluation.raising import ALIKE, Raising
-from verifai_jax.evaluation.unfinished import Part, present
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from verifai_jax.evaluation.host_engine import HostEngine
     from verifai_jax.evaluation.journal import Journal
     from verifai_jax.evaluation.native_engine import NativeEngine
+    from verifai_jax.evaluation.unfinished import Part, Unfinished
 
 
 NOT_NATIVE = (
@@ -184,16 +185,7 @@ class Evaluator:
         u = self.rows_of(u)
         count, parts = len(u), []
         if self._sender is not None and count:
-            self.simulations = start + count
-            verdicts = self._recall_or(
-                u,
-                start,
-                temperature,
-                partial(self._sender.evaluate, u, self.key, start, temperature),
-            )
-            count_done(count)
-            self._check_raising(verdicts)
-            return verdicts
+            return self.begin(u, temperature, start).result()
         begin = 0
         while begin < count:
             size = min(self.batch, count - begin)
@@ -228,29 +220,53 @@ class Evaluator:
         simulate: Callable[[], Verdicts],
     ) -> Verdicts:
         """Return the verdicts of work that goes on where an earlier process was killed."""
-        work = None if self._keeps_traces else present()
-        if work is None:
+        kept = self.part()
+        if kept is None:
             return simulate()  # Traces are not stored.
-        if self._kept is None or self._kept.of is not work:
-            self._kept = work.part(self.problem, *self._mode)
         if self._host is not None and not self._host.system.can_simulate_batch:
             # One by one, which is worth more the longer a simulation takes.
-            self._host.journal = self._kept.journal
+            self._host.journal = kept.journal
             verdicts = simulate()
-            self._kept.settle()
+            kept.settle()
             return verdicts
-        return self._kept.recall_or(
+        return kept.recall_or(
             np.asarray(points), np.arange(first, first + len(points)), temperature, simulate
         )
+
+    def part(self) -> "Part | None":
+        """Return what is kept of work that goes on where an earlier process was killed, if any."""
+        work: Unfinished | None = None if self._keeps_traces else present()
+        if work is not None and (self._kept is None or self._kept.of is not work):
+            self._kept = work.part(self.problem, *self._mode)
+        return None if work is None else self._kept
+
+    def begin(
+        self,
+        u: Float[Any, "n d"],
+        temperature: Float[np.ndarray, " n"] | float = 1.0,
+        first: int | None = None,
+    ) -> "Sent":
+        """Send points to the workers; `result` of what it returns is what a call returns.
+
+        **Raises:** `TypeError` for an evaluator without an executor.
+        """
+        start, u = self.simulations if first is None else first, self.rows_of(u)
+        self.simulations = start + len(u)
+        return Sent(self, u, temperature, start)
 
     def submit(self, u: Float[Any, "n d"], first: int) -> "Pending":
         """Send points to the workers of the executor; `result` of what it returns waits for them.
 
         **Raises:** `TypeError` for an evaluator without an executor.
         """
+        return self._send(self.rows_of(u), first, 1.0)
+
+    def _send(
+        self, u: Float[Any, "n row"], first: int, temperature: Float[np.ndarray, " n"] | float
+    ) -> "Pending":
         if self._sender is None:
             raise TypeError("points are sent to workers only by an evaluator with an executor")
-        return self._sender.submit(self.rows_of(u), self.key, first)
+        return self._sender.submit(u, self.key, first, temperature)
 
     def rows_of(self, u: Float[Any, "n d"]) -> Float[Any, "n row"]:
         """Return points as rows of the engine, which takes others where features may be given."""
@@ -269,3 +285,37 @@ class Evaluator:
         if self._raising is not None:
             self._raising.add(verdicts.status, verdicts.messages)
             self._raising.check(self.problem.name)
+
+
+class Sent:
+    """Points on their way to workers, unless their verdicts are kept; see `Evaluator.begin`."""
+
+    def __init__(
+        self,
+        evaluator: Evaluator,
+        u: Float[Any, "n row"],
+        temperature: Float[np.ndarray, " n"] | float,
+        first: int,
+    ) -> None:
+        self._evaluator, self._asked = evaluator, (u, first, temperature)
+        kept, numbers = evaluator.part(), np.arange(first, first + len(u))
+        self._known = None if kept is None else kept.recall(np.asarray(u), numbers, temperature)
+        self._pending: Pending | None = None
+        if self._known is None:
+            self._pending = evaluator._send(u, first, temperature)
+
+    def result(self) -> Verdicts:
+        """Wait for the verdicts, and count them; once."""
+        if self._pending is None:
+            assert self._known is not None
+            verdicts = self._known
+        else:
+            verdicts = self._evaluator._recall_or(*self._asked, self._pending.result)
+        count_done(len(self._asked[0]))
+        self._evaluator._check_raising(verdicts)
+        return verdicts
+
+    def cancel(self) -> None:
+        """Take what has not begun out of the queue of the workers."""
+        if self._pending is not None:
+            self._pending.cancel()

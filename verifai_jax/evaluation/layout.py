@@ -5,7 +5,7 @@ layout.padded                                       # rows of its program, at le
 layout.spread(one_row, own_keys=False)              # a program (rows, number, ...) of a batch
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -21,8 +21,20 @@ from verifai_jax.problem.problem import Problem
 ACCELERATOR_FACTOR = 128
 """How many times as many rows a chunk has on an accelerator as on a core, whose cache traces fit.
 On an H200 chunks of 65,536 rows were 9 to 91 times as fast as those of 512 (RESULTS.md)."""
-TOGETHER = ("reduce", "arg", "cum", "dot", "conv", "sort", "gather", "scatter")
+TOGETHER = ("reduce_", "arg", "cum", "dot_", "conv_", "sort", "gather", "scatter")
 """Beginnings of the names of operations that bring several numbers of a row together."""
+PLAIN = frozenset((
+    "abs", "add", "add_any", "and", "bitcast_convert_type", "broadcast_in_dim", "ceil", "clamp",
+    "concatenate", "convert_element_type", "copy", "copy_p", "div", "dot_general", "dynamic_slice",
+    "dynamic_update_slice", "eq", "expand_dims", "floor", "gather", "ge", "gt", "integer_pow",
+    "iota", "is_finite", "le", "lt", "max", "min", "mul", "ne", "neg", "not",
+    "optimization_barrier", "or", "pad", "reduce_and", "reduce_max", "reduce_min", "reduce_or",
+    "reduce_sum", "rem", "reshape", "rev", "round", "scatter", "select_n", "shift_left",
+    "shift_right_arithmetic", "shift_right_logical", "sign", "slice", "split", "sqrt", "square",
+    "squeeze", "stack", "stop_gradient", "sub", "transpose", "xor",
+))  # fmt: skip
+"""Operations that processors have, and those that only move numbers. XLA's own functions are not
+among them: with vectors of 512 bits its arctangent is wrong (0.10.2)."""
 
 
 class Layout(NamedTuple):
@@ -31,11 +43,13 @@ class Layout(NamedTuple):
     - `devices`: JAX devices, of which each has an equal share.
     - `chunks`: parts of a share, worked through one after the other.
     - `lanes`: rows of a chunk, worked on together.
+    - `wide`: whether XLA may take the widest vectors that the processor has.
     """
 
     devices: Sequence[Device]
     chunks: int
     lanes: int
+    wide: bool = False
 
     @classmethod
     def of(
@@ -62,16 +76,23 @@ class Layout(NamedTuple):
         return 1 < len(self.devices) == len(jax.local_devices())
 
     def for_program(self, program: Any) -> "Layout":
-        """Return the layout of a `Jaxpr` of one row: longer chunks where that is quicker.
+        """Return the layout that suits a `Jaxpr` of one row, of as many rows.
 
         Where each operation is of single numbers, what a chunk has in memory at a time is small,
-        and to start an operation on it takes a fifth of the time. Others lose by longer chunks: XLA
-        then writes the operands of products and sums to memory.
+        and to start an operation on it takes a fifth of the time: chunks are twice as long. Others
+        lose by that, since XLA then writes the operands of products and sums to memory.
         """
-        elementary = jax.default_backend() == "cpu" and _is_elementary(program)
-        if self.chunks % 2 or not elementary:
+        if jax.default_backend() != "cpu":
             return self
-        return self._replace(chunks=self.chunks // 2, lanes=2 * self.lanes)
+        steps = list(_steps(program))
+        layout = self._replace(wide=all(step.primitive.name in PLAIN for step in steps))
+        together = any(
+            step.primitive.name.startswith(TOGETHER) and any(v.aval.size > 1 for v in step.invars)
+            for step in steps
+        )
+        if together or self.chunks % 2:
+            return layout
+        return layout._replace(chunks=self.chunks // 2, lanes=2 * self.lanes)
 
     def spread(self, one_row: Callable[..., Any], own_keys: bool) -> Callable[..., Any]:
         """Spread a function of one row over chunks of lanes and over the devices.
@@ -131,9 +152,11 @@ def chunks_and_lanes(problem: Problem, batch: int, devices: int) -> tuple[int, i
     return chunks, -(-per_device // chunks)
 
 
-def _is_elementary(program: Any) -> bool:
-    """Return whether no step of a `Jaxpr` brings several numbers of a row together."""
-    return not any(
-        step.primitive.name.startswith(TOGETHER) or not all(map(_is_elementary, programs_in(step)))
-        for step in program.eqns
-    )
+def _steps(program: Any) -> Iterator[Any]:
+    """Yield the steps of a `Jaxpr`, in place of loops and calls those within them."""
+    for step in program.eqns:
+        inside = programs_in(step)
+        for each in inside:
+            yield from _steps(each)
+        if not inside:
+            yield step

@@ -89,7 +89,7 @@ class NativeEngine:
     @property
     def padded(self) -> int:
         """Rows of the program of XLA."""
-        return self._begun.layout.padded
+        return self._begun.padded
 
     @property
     def compile_seconds(self) -> float:
@@ -147,7 +147,7 @@ class NativeEngine:
             return False
         if self._wanted == "native":
             return True
-        return self._budget * self.engine.work >= WORTH
+        return self._budget * self.engine.program.work >= WORTH
 
     @cached_property
     def _xla(self) -> Engine:
@@ -251,13 +251,13 @@ class _Program:
     @cached_property
     def draws(self) -> bool:
         """True where the system uses its random key, or may do so."""
-        return self.engine.gradient or self.engine.draws()
+        return self.engine.gradient or self.engine.program.draws()
 
     @cached_property
     def traced(self) -> tuple[Any, str | None]:
         """The program of a row, its random key by its number; and its identity."""
-        function = self.engine.traced_row()
-        *_, numbers = self.engine._arguments
+        function = self.engine.program.traced_row()
+        *_, numbers = self.engine.program.forms
 
         def of_row(
             row: Array, words: Array, number: Array, temperature: Array, numbers: Array
@@ -276,8 +276,8 @@ class _Program:
                 jax.ShapeDtypeStruct((), jnp.float32),
                 numbers,
             )
-            program = self.engine.differentiable(lambda: jax.make_jaxpr(of_row)(*forms))
-            return program, self.engine.row_identity
+            program = self.engine.program.differentiable(lambda: jax.make_jaxpr(of_row)(*forms))
+            return program, self.engine.program.identity
 
     def begin(self) -> None:
         """Begin to compile, where that has not begun."""
@@ -317,8 +317,8 @@ class _Program:
         temperatures = np.broadcast_to(np.asarray(temperature, np.float32), (len(rows),))
         words = np.asarray(jax.random.key_data(key))
         threads = len(self.engine.layout.devices)
-        packed = library(rows, words, first, temperatures, self.engine.numbers, threads)
-        unpacked: Any = self.engine.unpack({"uint32": packed}, len(rows))
+        packed = library(rows, words, first, temperatures, self.engine.program.numbers(), threads)
+        unpacked: Any = self.engine.program.unpack("evaluate", {"uint32": packed}, len(rows))
         rho, status, features, more = unpacked
         # What is exactly zero is decided by XLA.
         broken = violations(rho, status, lambda: np.ones(rho.shape, bool))

@@ -96,13 +96,13 @@ class Replays:
         # Forms alone are traced: no value has to be made up that a user's domain would accept.
         self._form = problem.space.feature_form_in(precision)
         try:
-            self.draws = self._engine(1, 1).draws()
+            self.draws = self._engine(1, 1).program.draws()
         except Exception:
             if not self.refiner.traced:
                 raise
             # It takes integers only, whatever it says of itself.
             self.refiner.traced = False
-            self.draws = self._engine(1, 1).draws()
+            self.draws = self._engine(1, 1).program.draws()
 
     def __call__(
         self, factor: int, each: Sequence[PyTree], numbers: Int[np.ndarray, " n"]

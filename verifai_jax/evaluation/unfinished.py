@@ -14,7 +14,6 @@ import contextlib
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -25,6 +24,7 @@ from jaxtyping import Float, Int
 from verifai_jax.core.progress import write_line
 from verifai_jax.core.sources import Sources, list_changes
 from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.kept_work import PRESENT
 from verifai_jax.evaluation.verdicts import RowVerdict, Verdicts
 from verifai_jax.problem.problem import Problem
 from verifai_jax.store.cache import Cache, CacheError, locked_cache
@@ -33,8 +33,6 @@ from verifai_jax.store.log import Arrays
 Form: TypeAlias = jax.tree_util.PyTreeDef  # pyright: ignore[reportInvalidTypeForm]
 KIND = "unfinished"
 """Kind of the cache."""
-_PRESENT: ContextVar["Unfinished | None"] = ContextVar("unfinished", default=None)
-"""The work that evaluators of this process are part of."""
 
 
 class Unfinished:
@@ -138,21 +136,35 @@ class Part:
 
         - `numbers`: the numbers of the simulations, which their random keys come from.
         """
-        asked = {
-            "points": np.asarray(points),
-            "numbers": np.asarray(numbers, np.int64),
-            "temperature": np.broadcast_to(np.asarray(temperature, np.float32), len(points)),
-        }
-        if self._known:
-            found = [self._known.get(key) for key in _keys(asked)]
-            if all(found):
-                return Verdicts.concatenate(
-                    [_verdict(*one, self._form) for one in found if one is not None]
-                )
+        known = self.recall(points, numbers, temperature)
+        if known is not None:
+            return known
         verdicts = simulate()
-        self.of.put(self.number, {f"{self.number}/{numbers[0]}": {**asked, **_arrays(verdicts)}})
+        self.of.put(
+            self.number,
+            {
+                f"{self.number}/{numbers[0]}": {
+                    **_asked(points, numbers, temperature),
+                    **_arrays(verdicts),
+                }
+            },
+        )
         self.settle()
         return verdicts
+
+    def recall(
+        self,
+        points: Float[np.ndarray, "n d"],
+        numbers: Int[np.ndarray, " n"],
+        temperature: Float[np.ndarray, " n"] | float,
+    ) -> Verdicts | None:
+        """Return verdicts of these points; None if not all of them are kept."""
+        if not self._known:
+            return None
+        found = [self._known.get(k) for k in _keys(_asked(points, numbers, temperature))]
+        if not all(found):
+            return None
+        return Verdicts.concatenate([_verdict(*one, self._form) for one in found if one])
 
     def settle(self) -> None:
         """Note what the first simulations have read."""
@@ -174,11 +186,6 @@ class _Rows(Journal):
             super().add(row, point, verdict)
 
 
-def present() -> Unfinished | None:
-    """Return the work whose simulations are kept now, or None if there is none."""
-    return _PRESENT.get()
-
-
 @contextlib.contextmanager
 def keeping(folder: Path, work: Mapping[str, Any]) -> Iterator[Unfinished]:
     """Keep the simulations of all evaluators that are used within, until the work is done.
@@ -195,14 +202,26 @@ def keeping(folder: Path, work: Mapping[str, Any]) -> Iterator[Unfinished]:
         kept = Unfinished(cache, folder)
         try:
             cache.claim(work)
-            token = _PRESENT.set(kept)
+            token = PRESENT.set(kept)
             try:
                 yield kept
             finally:
-                _PRESENT.reset(token)
+                PRESENT.reset(token)
         finally:
             if kept.done or kept.empty:
                 shutil.rmtree(folder, ignore_errors=True)
+
+
+def _asked(
+    points: Float[np.ndarray, "n d"],
+    numbers: Int[np.ndarray, " n"],
+    temperature: Float[np.ndarray, " n"] | float,
+) -> dict[str, np.ndarray]:
+    return {
+        "points": np.asarray(points),
+        "numbers": np.asarray(numbers, np.int64),
+        "temperature": np.broadcast_to(np.asarray(temperature, np.float32), len(points)),
+    }
 
 
 def _keys(asked: Arrays) -> Iterator[bytes]:

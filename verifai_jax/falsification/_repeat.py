@@ -20,7 +20,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.checks import check_options
-from verifai_jax.core.compilation import options_of
 from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.keys import run_keys, simulation_key
@@ -342,10 +341,10 @@ class _WholeRounds:
         if len(keys) not in self._programs:
             enable_compile_cache()
             program = spread_over_devices(self._on_device, (True, True, False))
-            traced = self.engine.differentiable(
+            traced = self.engine.program.differentiable(
                 lambda: jax.jit(partial(program)).lower(state, keys, first)
             )
-            self._programs[len(keys)] = traced.compile(options_of("most"))
+            self._programs[len(keys)] = traced.compile()
         return self._programs[len(keys)](state, keys, first)
 
     def _on_device(self, state: PyTree, keys: Array, first: Array) -> PyTree:
@@ -363,7 +362,7 @@ class _WholeRounds:
             rows = first + i * batch + jnp.arange(batch, dtype=jnp.int32)
             keys = jax.vmap(partial(simulation_key, key))(rows)
             temperature = search.temperature(state) if search.wants.gradient else 1.0
-            simulate = jax.vmap(self.engine.row, in_axes=(0, 0, None))
+            simulate = jax.vmap(self.engine.program.row, in_axes=(0, 0, None))
             row = simulate(u, keys, jnp.float32(temperature))
             lowest = jnp.min(row.rho, axis=-1)
             gradient = row.derivatives.get("gradient")

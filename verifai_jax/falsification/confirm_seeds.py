@@ -121,7 +121,7 @@ class SeedConfirmer:
     def _draws(self) -> bool:
         def trace() -> bool:
             engine = Engine(self.problem, 1, precision=self.precision, own_keys=True, alone=True)
-            return engine.draws()
+            return engine.program.draws()
 
         return self.problem.programs.get(DRAWS, self.precision, trace)
 

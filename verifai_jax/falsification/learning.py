@@ -18,7 +18,6 @@ from jaxtyping import Array, Float, Int, Key
 
 from verifai_jax.evaluation.guidance import Guidance
 from verifai_jax.evaluation.verdicts import Verdicts
-from verifai_jax.falsification.likelihood import Likelihood
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Objective
 from verifai_jax.search import Search
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from verifai_jax.falsification.coverage_counts import CoverageCounts
+    from verifai_jax.falsification.likelihood import Likelihood
     from verifai_jax.falsification.surrogates import Surrogate
 
 MAX_WARM = 2048
@@ -81,9 +81,12 @@ class Learning:
 
             self.coverage_ids = coverage_counts.CoverageCounts(problem)
         self.surrogate: Surrogate | None = None
-        self._objective: Objective | Likelihood | None = None
+        self._objective: Objective | None = None
+        self._likelihood: Likelihood | None = None
         if search.wants.likelihood:
-            self._objective = Likelihood(problem.space)
+            from verifai_jax.falsification import likelihood
+
+            self._likelihood = likelihood.Likelihood(problem.space)
         elif problem.rulebook is not None:
             self._objective = Objective(problem.rulebook)
         self.proposals: Any = None
@@ -130,7 +133,7 @@ class Learning:
 
     def objective(self, verdicts: Verdicts) -> Float[np.ndarray, " n"]:
         """Return what the search minimises; with a priority it depends on the rows before."""
-        if self._objective is None or isinstance(self._objective, Likelihood):
+        if self._objective is None:
             return verdicts.lowest
         return self._objective(verdicts.rho, verdicts.rho < 0)
 
@@ -156,9 +159,9 @@ class Learning:
                 objective = self._with_guide(objective, verdicts.guidance[:, 0])
             if self.guidance.outcome:
                 outcomes = verdicts.guidance[:, int(self.guidance.guide) :]
-        if isinstance(self._objective, Likelihood):
+        if self._likelihood is not None:
             points = np.asarray(batch.points)
-            objective, verdicts = self._objective.learned(points, objective, verdicts)
+            objective, verdicts = self._likelihood.learned(points, objective, verdicts)
         if batch.given:
             self._learn_given(batch, objective, verdicts, outcomes)
         else:
@@ -226,8 +229,8 @@ class Learning:
         rho = proper["rho"].to_numpy(np.float32)
         names = [f"rho.{name}" for name in self.problem.formulas]
         points = self.problem.space.points(proper)
-        if isinstance(self._objective, Likelihood):
-            rho = self._objective(points, rho, proper["rho"].to_numpy() < 0).astype(np.float32)
+        if self._likelihood is not None:
+            rho = self._likelihood(points, rho, proper["rho"].to_numpy() < 0).astype(np.float32)
         elif self._objective is not None and all(name in proper for name in names):
             each = proper[names].to_numpy(np.float64)
             rho = self._objective(each, each < 0).astype(np.float32)
@@ -237,7 +240,8 @@ class Learning:
 
     def checkpoint(self) -> dict[str, Any]:
         """Return what it knows as entries of a checkpoint, but for the state of the search."""
-        state = {} if self._objective is None else self._objective.state
+        weighed = self._likelihood or self._objective
+        state = {} if weighed is None else weighed.state
         entries: dict[str, Any] = {f"objective.{name}": value for name, value in state.items()}
         for part in (self.surrogate, self.coverage_ids):
             entries |= {} if part is None else part.checkpoint()
@@ -249,9 +253,9 @@ class Learning:
         **Raises:** `ValueError` for a checkpoint of another search, space or batch size.
         """
         self.proposals.restore(checkpoint)
-        if self._objective is not None:
-            names = self._objective.state
-            self._objective.state = {name: checkpoint[f"objective.{name}"] for name in names}
+        weighed = self._likelihood or self._objective
+        if weighed is not None:
+            weighed.state = {name: checkpoint[f"objective.{name}"] for name in weighed.state}
         for part in (self.surrogate, self.coverage_ids):
             if part is not None:
                 part.restore(checkpoint)

@@ -120,7 +120,7 @@ def lockstep(
             for first in range(0, len(seed), engine.batch):
                 block = slice(first, first + engine.batch)
                 # Always as many, so that one program makes the keys.
-                index = np.minimum(np.arange(first, first + engine.layout.padded), len(seed) - 1)
+                index = np.minimum(np.arange(first, first + engine.padded), len(seed) - 1)
                 own = number_keys(run_key[seed[index]], numbers[index].astype(np.int32))
                 some = seed[block], row[block]
                 parts.append(engine.evaluate(u[some], own, temperature=temperature[some]))

@@ -16,7 +16,6 @@ from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.run_folder import RECORD
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.features.given import Rows, check_columns, given_features, given_rows
-from verifai_jax.features.improbability import Improbability
 from verifai_jax.problem.dependence import has_gradient, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
@@ -194,6 +193,8 @@ def check_objective(problem: Problem, search: Search) -> None:
             f"problem {problem.name!r} has {other}, which says which simulations are better, and "
             "so does objective='likelihood'; leave out one of them"
         )
+    from verifai_jax.features.improbability import Improbability
+
     Improbability(problem.space)
 
 

@@ -10,8 +10,8 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
-from verifai_jax.mtl.c_margins import MarginCode, margin_code
 from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.margins import Margins, Step, margins
 from verifai_jax.mtl.semantics import Semantics, hard
 from verifai_jax.mtl.streams import Count, Op, Plan, streams
 from verifai_jax.mtl.tree import missing_case
@@ -247,7 +247,7 @@ def export_c(
             f"the name of a monitor in C is a letter, then letters, digits and _; got {name!r}"
         )
     plan = streams(formulas, dt, semantics, every)
-    front = margin_code(plan, sizes or {})
+    front = margins(plan, sizes or {})
     columns = [
         f"x[{k}] {n}{'' if i is None else f'[{i}]'}" for k, (n, i) in enumerate(front.columns)
     ]
@@ -261,7 +261,7 @@ def export_c(
     return f"/*{comment}\n */\n#ifndef {guard}\n#define {guard}\n\n{HEAD}{HELPERS}{body}\n#endif\n"
 
 
-def monitor_code(plan: Plan, front: MarginCode, name: str) -> str:
+def monitor_code(plan: Plan, front: Margins, name: str) -> str:
     """Return the type of a monitor and its functions, without what they need."""
     code = _Code(plan.top)
     inner, counts = [], []
@@ -278,16 +278,54 @@ def monitor_code(plan: Plan, front: MarginCode, name: str) -> str:
         for k, o in enumerate(plan.outputs)
     ]
     waits = [output.wait for output in plan.outputs]
-    given = [f"m->leaf[{k}] = {text};" for k, text in enumerate(front.leaves)]
+    lines, texts = _margin_lines(front)
+    given = [f"m->leaf[{k}] = {texts[i]};" for k, i in enumerate(front.leaves)]
     parts = {
         "outputs": len(outputs), "leaves": max(1, len(front.leaves)),
         "columns": max(1, len(front.columns)), "fields": _lines(code.fields),
         "starts": _lines(code.starts), "ops": _lines([*ops, *outputs]),
-        "margins": _lines([*counts, *front.lines, *given] or ["(void)x;"]), "longest": max(waits),
+        "margins": _lines([*counts, *lines, *given] or ["(void)x;"]), "longest": max(waits),
         "waits": ", ".join(map(str, waits)), "lowest": _number(-plan.top), "top": _number(plan.top),
     }  # fmt: skip
     text = re.sub(r"@(name)", name, MONITOR)
     return "".join([*inner, re.sub(r"@(\w+)", lambda found: str(parts[found[1]]), text)])
+
+
+def _margin_lines(front: Margins) -> tuple[list[str], list[str]]:
+    """Return a line for each operation, and the text by which its result is read."""
+    lines: list[str] = []
+    texts: list[str] = []
+    for step in front.steps:
+        match step.kind:
+            case "column" | "count":
+                text = ("x[{}]" if step.kind == "column" else "n{}").format(int(step.number))
+            case "number":
+                text = f"({step.number!r})"
+            case _:
+                text = f"a{len(lines)}"
+                of = _operation(step, [texts[i] for i in step.inputs])
+                lines.append(f"const double {text} = {of};")
+        texts.append(text)
+    return lines, texts
+
+
+def _operation(step: Step, v: Sequence[str]) -> str:
+    match step.kind:
+        case "+" | "-" | "*" | "/":
+            return f"{v[0]} {step.kind} {v[1]}"
+        case "neg":
+            return f"-{v[0]}"
+        case "min" | "max":
+            sign = 1 if step.kind == "max" else -1
+            return functools.reduce(lambda a, b: f"vj_best({sign}, {a}, {b})", v)
+        case "norm":
+            return f"sqrt({' + '.join(f'({a} * {a})' for a in v)})"
+        case "power":
+            return f"vj_power({v[0]}, {int(step.number)})"
+        case "truth":
+            return f"vj_truth({v[0]}, {str(bool(step.number)).lower()})"
+    function = {"abs": "fabs", "**": "pow"}.get(step.kind, step.kind)
+    return f"{function}({', '.join(v)})"
 
 
 def _lines(lines: Sequence[str]) -> str:

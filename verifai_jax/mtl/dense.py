@@ -19,7 +19,7 @@ from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, 
 from verifai_jax.mtl.formula import Formula, Term
 from verifai_jax.mtl.host_values import FUNCTIONS, numbers
 from verifai_jax.mtl.parametric import read_parametric
-from verifai_jax.mtl.piecewise import SNAP, Piecewise, aligned, joined, since, until, window
+from verifai_jax.mtl.piecewise import SNAP, Piecewise, aligned, joined, window, witnessed
 from verifai_jax.mtl.resampling import Method
 from verifai_jax.mtl.setting import check_trace
 from verifai_jax.mtl.tree import missing_case, postorder
@@ -134,7 +134,7 @@ class _Dense:
     def witness(self, f: ast.Witness, left: Piecewise, right: Piecewise) -> Piecewise:
         # p U[a,b] q = p throughout [0,a), and at a (F[0,b-a] q & p U q); since is its mirror image.
         ahead, i = f.side == "ahead", f.interval
-        value = (until if ahead else since)(left, right)
+        value = witnessed(left, right, ahead)
         width = i.end - i.start
         if math.isfinite(width):
             near = window(right, 0.0 if ahead else -width, width if ahead else 0.0, 1)

@@ -9,7 +9,8 @@ import math
 
 from verifai_jax.core.text import format_seconds
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl.formula import Formula, Interval, surface
+from verifai_jax.mtl.expression import Duration
+from verifai_jax.mtl.formula import Formula, Interval, Term, surface
 from verifai_jax.mtl.words import COMPARISONS, OPERATORS
 
 
@@ -23,7 +24,7 @@ def _words(formula: Formula, inner: bool) -> str:
         case ast.Constant(value):
             return "anything is allowed" if value else "nothing is allowed"
         case ast.Predicate(comparison, left, right):
-            return f"{left} {COMPARISONS[comparison].english} {right}"
+            return f"{_term(left)} {COMPARISONS[comparison].english} {_term(right)}"
         case ast.Atom(expression):
             return f"{expression} is positive"
     word, operands, interval = surface(formula)
@@ -36,6 +37,13 @@ def _words(formula: Formula, inner: bool) -> str:
 
     text = functools.reduce(joined, others, first) if others else joined(first)
     return f"({text})" if inner else text
+
+
+def _term(e: Term) -> str:
+    if not isinstance(e, Duration):
+        return str(e)
+    counted = _words(e.operand, inner=True)
+    return f"the number of seconds of the last {format_seconds(e.window)} in which {counted}"
 
 
 def _when(interval: Interval, side: str) -> str:

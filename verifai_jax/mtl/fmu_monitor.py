@@ -11,9 +11,9 @@ from xml.etree import ElementTree
 from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.machine_code import Unavailable, library_file
 from verifai_jax.core.text import counted
-from verifai_jax.mtl.c_margins import margin_code
 from verifai_jax.mtl.c_monitor import export_c
 from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.margins import margins
 from verifai_jax.mtl.semantics import Semantics, hard
 from verifai_jax.mtl.streams import streams
 from verifai_jax.mtl.watching import FLAGS
@@ -180,7 +180,7 @@ def export_fmu(
     if path.suffix != ".fmu":
         raise ValueError(f"the name of an FMU ends in .fmu; got {path.name}")
     plan = streams(formulas, dt, semantics, every)
-    front = margin_code(plan.leaves, plan.top == 1, sizes or {})
+    front = margins(plan, sizes or {})
     inputs = [n if i is None else f"{n}[{i}]" for n, i in front.columns]
     outputs = [f"{key or 'robustness'}{kind}" for key in plan.formulas for kind in KINDS]
     twice = sorted({name for name in inputs + outputs if (inputs + outputs).count(name) > 1})

@@ -97,9 +97,35 @@ class HostValues:
         """Compute +1 where it holds, -1 where not; a comparison decides at robustness 0."""
         return self._everywhere(formula, True)
 
+    def first(self, formula: Formula, boolean: bool = False) -> Float[np.ndarray, "*lanes"]:
+        """Compute the robustness (or the truth) at the first sample alone, which takes less.
+
+        Nothing is said of signals that are missing.
+        """
+        with np.errstate(all="ignore"):
+            return self._first(formula, boolean, self._pad(formula))
+
+    def _first(self, f: Formula, boolean: bool, pad: int) -> Float[np.ndarray, "*lanes"]:
+        match f:
+            case ast.Not(part):
+                return -self._first(part, boolean, pad)
+            case ast.Join(parts):
+                if not self.blend:
+                    return _joined([self._first(part, boolean, pad) for part in parts], f.sign)
+            case ast.Window(part) if f.side == "ahead":
+                x = self._value(part, boolean, pad)
+                a, b = self._span(f.interval)
+                if self.end == "hold":
+                    a = min(a, len(x) - 1)
+                if a < len(x):
+                    seen = x[a : len(x) if math.isinf(b) else int(b) + 1]
+                    return seen.max(axis=0) if f.sign > 0 else seen.min(axis=0)
+        return self._value(f, boolean, pad)[0]
+
     def holds(self, formula: Formula) -> bool:
         """Return whether it holds at the first sample. **Raises:** `ValueError` for a NaN there."""
-        value = float(self.truth(formula)[0])
+        self._check_signals(formula)
+        value = float(self.first(formula, boolean=True))
         if math.isnan(value):
             raise ValueError(f"no verdict: a signal of {formula} is NaN where it matters")
         return value > 0
@@ -121,10 +147,13 @@ class HostValues:
 
         return Walk(values_of, self._span, self.length, self.end, self.stride)
 
-    def _everywhere(self, formula: Formula, boolean: bool) -> Values:
+    def _check_signals(self, formula: Formula) -> None:
         for name in formula.signals():
             if name not in self.signals:
                 raise missing_name("the trace", "signal", name, self.signals)
+
+    def _everywhere(self, formula: Formula, boolean: bool) -> Values:
+        self._check_signals(formula)
         with np.errstate(all="ignore"):
             return self._value(formula, boolean, self._pad(formula))[: self.length]
 
@@ -185,7 +214,8 @@ class HostValues:
 
     def _expression(self, e: Term, pad: int) -> Values:
         values: dict[int, Values] = {}
-        for part in postorder(e):
+        order = _in_order(e)
+        for part in order:
             match part:
                 case Number(value):
                     values[id(part)] = np.full((1,), value)
@@ -207,8 +237,9 @@ class HostValues:
                     values[id(part)] = FUNCTIONS[name](*(values[id(a)] for a in arguments))
                 case _:
                     raise missing_case("the value", part)
-        check_scalar(e, values[id(e)].shape, self.lanes)
-        return values[id(e)]
+        value = values[id(order[-1])]
+        check_scalar(e, value.shape, self.lanes)
+        return value
 
     def _signal(self, name: str, pad: int) -> Values:
         padded = self._padded.setdefault(pad, {})
@@ -223,10 +254,18 @@ class HostValues:
         return _held(seconds_held(truth, n, self.dt / self.stride, np), pad)
 
 
+@functools.lru_cache(1024)
 def _span(interval: Interval, dt: float, stride: int) -> tuple[int, float]:
     """Return the first and the last sample of an interval, relative to now."""
     first, last = (samples(t, dt, interval) * stride for t in (interval.start, interval.end))
     return int(first), last
+
+
+def _in_order(e: Term) -> tuple[Term, ...]:
+    """Return an expression and what is below it, children first; it remembers them."""
+    if "_order" not in e.__dict__:
+        object.__setattr__(e, "_order", tuple(postorder(e)))
+    return e.__dict__["_order"]
 
 
 @functools.lru_cache(1024)
@@ -287,7 +326,8 @@ def _window(
 def _witness(f: Values, g: Values, a: int, b: float, top: float, hold: bool, back: bool) -> Values:
     """Compute until over the samples `a` to `b` ahead, and since over those back."""
     f, g = np.broadcast_arrays(f, g)
-    found = _witness_anywhere(*((f[::-1], g[::-1]) if back else (f, g)))
+    # A witness beyond the interval does not count below, so none is sought farther away.
+    found = _witness_within(b - a + 1, *((f[::-1], g[::-1]) if back else (f, g)))
     terms = [_window(found[::-1] if back else found, a, a, 1, top, hold, back)]
     if math.isfinite(b):
         terms.append(_window(g, a, b, 1, top, hold, back))
@@ -296,11 +336,11 @@ def _witness(f: Values, g: Values, a: int, b: float, top: float, hold: bool, bac
     return _joined(terms, -1)
 
 
-def _witness_anywhere(f: Values, g: Values) -> Values:
-    """Compute `u[t] = max(g[t], min(f[t], u[t+1]))` by doubling."""
+def _witness_within(width: float, f: Values, g: Values) -> Values:
+    """Compute `u[t] = max(g[t], min(f[t], u[t+1]))` by doubling, over `width` samples or more."""
     g, f = g.copy(), f.copy()
     shift = 1
-    while shift < len(g):
+    while shift < min(len(g), width):
         np.maximum(g[:-shift], np.minimum(f[:-shift], g[shift:]), out=g[:-shift])
         np.minimum(f[:-shift], f[shift:], out=f[:-shift])
         shift *= 2

@@ -8,6 +8,7 @@ Nothing is compiled, as a fleet has recordings of many lengths: `HostValues` com
 on a recording with NumPy, what they share once.
 """
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -30,6 +31,10 @@ from verifai_jax.mtl.recording import read
 from verifai_jax.mtl.requirements import Requirement, Requirements, requirements_of
 from verifai_jax.mtl.resampling import Method, Missing, resample, without_gaps
 from verifai_jax.mtl.setting import check_horizon
+
+_signals = functools.lru_cache(1024)(Formula.signals)
+_text = functools.lru_cache(1024)(Formula.__str__)
+"""A fleet asks the same of a few formulas again and again."""
 
 
 class Reading(NamedTuple):
@@ -160,17 +165,17 @@ def _row(
 ) -> Row:
     """Judge one requirement on one recording."""
     formula = requirement.formalized
-    for signal in formula.signals():
+    for signal in _signals(formula):
         if signal not in trace.signals:
             raise missing_name("the recording", "signal", signal, trace.signals)
     if reading.end == "strict":
         check_horizon(formula, trace, values.dt)
-    robustness = float(values(formula)[0])
+    robustness = float(values.first(formula))
     if math.isnan(robustness):
         missing = f"no verdict: {first_nan(formula, trace)}"
         return Row(name, requirement.id, error=missing)
     # At a robustness of zero the comparison decides.
-    holds = robustness > 0 or (robustness == 0 and float(values.truth(formula)[0]) > 0)
+    holds = robustness > 0 or (robustness == 0 and float(values.first(formula, boolean=True)) > 0)
     instant, why = _decision(values, formula, clock) if reading.explain else (math.nan, "")
     return Row(name, requirement.id, "holds" if holds else "fails", robustness, instant, why)
 
@@ -187,4 +192,4 @@ def _decision(
     # Beyond the end a recording repeats its last sample, so that is where to look.
     instant = float(clock[min(sample, len(clock) - 1)])
     margin = walk.at(predicate, sample)
-    return instant, f"{predicate} has margin {margin:z.4g} at {format_time(instant)} s"
+    return instant, f"{_text(predicate)} has margin {margin:z.4g} at {format_time(instant)} s"

@@ -1,7 +1,7 @@
 """Functions of time that are linear between breakpoints, where they may jump.
 
     f = Piecewise(times, point, right, left)
-    joined(f, g, 1), window(f, 0.0, 2.0, 1), until(f, g)
+    joined(f, g, 1), window(f, 0.0, 2.0, 1), witnessed(f, g, ahead=True)
 
 Everything is exact up to rounding: new breakpoints are added where two functions cross.
 """
@@ -193,41 +193,27 @@ class _Highest:
         return out
 
 
-def until(f: Piecewise, g: Piecewise) -> Piecewise:
-    """Return `f` until `g`, over all that comes: `f` counts from now to before the witness."""
+def witnessed(f: Piecewise, g: Piecewise, ahead: bool) -> Piecewise:
+    """Return `f` until `g`, over all that comes (`ahead`), or `f` since `g`, over all that was.
+
+    `f` counts between now and the witness, at which it is not needed.
+    """
     f, g = aligned(f, g, crossings=True)
     n = len(f.times)
-    # The least of f from a time within a piece to its end, and the best that comes after it.
+    far_g, near_g, near_f = (g.left, g.right, f.right) if ahead else (g.right, g.left, f.left)
+    # The least of f between a time within a piece and its far end, and the best from there on.
     lowest = np.minimum(f.right, f.left)
-    coming, point = np.empty(n), np.empty(n)
-    after = -np.inf
-    for k in range(n - 1, -1, -1):
-        coming[k] = max(g.left[k], after)
-        within = max(min(g.right[k], f.right[k]), min(lowest[k], coming[k]))
-        after = point[k] = max(g.point[k], min(f.point[k], within))
-    rises = f.right < f.left
-    kept = Piecewise(f.times, point, lowest, np.where(rises, f.left, lowest), f.snap)
-    return _witnessed(kept, g, coming, point)
-
-
-def since(f: Piecewise, g: Piecewise) -> Piecewise:
-    """Return `f` since `g`, over all that was: `f` counts from after the witness to now."""
-    f, g = aligned(f, g, crossings=True)
-    n = len(f.times)
-    lowest = np.minimum(f.right, f.left)
-    past, point = np.empty(n), np.empty(n)
-    before = -np.inf
-    for k in range(n):
-        point[k] = max(g.point[k], min(f.point[k], before))
-        past[k] = max(g.right[k], point[k])
-        before = max(min(g.left[k], f.left[k]), min(lowest[k], past[k]))
-    falls = f.right > f.left
-    kept = Piecewise(f.times, point, np.where(falls, f.right, lowest), lowest, f.snap)
-    return _witnessed(kept, g, past, point)
-
-
-def _witnessed(kept: Piecewise, g: Piecewise, best: Values, point: Values) -> Piecewise:
-    """Return `max(g, min(kept, best))` between breakpoints, and `point` at them."""
+    best, point = np.empty(n), np.empty(n)
+    now = -np.inf
+    for k in range(n - 1, -1, -1) if ahead else range(n):
+        if not ahead:
+            now = point[k] = max(g.point[k], min(f.point[k], now))
+        best[k] = max(far_g[k], now)
+        now = max(min(near_g[k], near_f[k]), min(lowest[k], best[k]))
+        if ahead:
+            now = point[k] = max(g.point[k], min(f.point[k], now))
+    sides = (lowest, f.left) if ahead else (f.right, lowest)
+    kept = Piecewise(f.times, point, *sides, f.snap)
     far = joined([kept, Piecewise(g.times, best, best, best, g.snap)], -1)
     return _with_points(joined([g, far], 1), g.times, point)
 

@@ -1,6 +1,6 @@
 """The step of a monitor in Python, for machines without a compiler: some microseconds.
 
-    machine = PythonMachine(plan, margin_code(plan, {}))
+    machine = PythonMachine(plan, margins(plan, {}))
     machine.step([1.0, 0.0])                          # the numbers of one sample
     machine.out                                       # one number a formula
 
@@ -9,16 +9,14 @@ Each operation has a list of numbers as its memory, and does what its namesake i
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from verifai_jax.mtl.c_margins import MarginCode
-from verifai_jax.mtl.expression import CONSTANT, Arithmetic, Component, Number, Signal
-from verifai_jax.mtl.formula import Formula, Term
+from verifai_jax.mtl.expression import CONSTANT
 from verifai_jax.mtl.host_values import FUNCTIONS
+from verifai_jax.mtl.margins import Margins, Step
 from verifai_jax.mtl.streams import Count, Op, Plan
-from verifai_jax.mtl.tree import missing_case, postorder
 
 Memory = list[float]
 Join = Callable[[float, float], float]
@@ -30,17 +28,22 @@ class PythonMachine:
     - `out`: what the last step gave, one number a formula.
     """
 
-    def __init__(self, plan: Plan, front: MarginCode) -> None:
+    def __init__(self, plan: Plan, front: Margins) -> None:
         self.out = [math.nan] * len(plan.outputs)
         self._outputs = plan.outputs
-        # What is counted follows the columns of a sample.
-        columns = [*front.columns, *((each.duration.name, None) for each in plan.counts)]
-        numbered = {column: k for k, column in enumerate(columns)}
         self._counts = [
             _counted(count, PythonMachine(count.plan, own), own_columns)
             for count, (own, own_columns) in zip(plan.counts, front.counts, strict=True)
         ]
-        self._margins = [_margin(f, sign, plan.top == 1, numbered) for f, sign in plan.leaves]
+        # What is counted follows the columns of a sample.
+        first = {"column": 0, "count": len(front.columns)}
+        self._margins: list[tuple[Callable[..., float] | None, tuple[int, ...]]] = [
+            (None, (first[each.kind] + int(each.number),))
+            if each.kind in first
+            else (_operation(each), each.inputs)
+            for each in front.steps
+        ]
+        self._margin_of_leaf = front.leaves
         self._leaves = [math.nan] * len(plan.leaves)
         self._steps = [(_STEPS[op.kind], op, _first(op, plan.top)) for op in plan.ops]
         self._now = 0
@@ -49,7 +52,11 @@ class PythonMachine:
         """Take in one sample."""
         numbers = [float(value) for value in sample]
         numbers += [count(numbers) for count in self._counts]
-        self._leaves = [margin(numbers) for margin in self._margins]
+        v: list[float] = []
+        for function, inputs in self._margins:
+            of = numbers[inputs[0]] if function is None else function(*[v[i] for i in inputs])
+            v.append(of)
+        self._leaves = [v[i] for i in self._margin_of_leaf]
         self._follow()
 
     def steps(self, rows: np.ndarray) -> np.ndarray:
@@ -237,64 +244,20 @@ def _counted(
     return seconds
 
 
-def _margin(
-    f: Formula, sign: int, boolean: bool, columns: Mapping[tuple[str, int | None], int]
-) -> Callable[[Sequence[float]], float]:
-    left, comparison, right = f.compared or (*f.terms(), ">", Number(0.0))
-    if comparison in ("<", "<="):
-        left, right = right, left
-    one, other = _scalar(left, columns), _scalar(right, columns)
-    equality = {"==": -1.0, "!=": 1.0}.get(comparison, 0.0)
-    at_zero = comparison in (">=", "<=", "==")
-
-    def margin(x: Sequence[float]) -> float:
-        value = one(x) - other(x) if f.compared else one(x)
-        value = equality * abs(value) if equality else value
-        if boolean and value == value:
-            value = 1.0 if value > 0 or (at_zero and value == 0) else -1.0
-        return sign * value
-
-    return margin
-
-
-def _scalar(
-    e: Term, columns: Mapping[tuple[str, int | None], int]
-) -> Callable[[Sequence[float]], float]:
-    """Return an expression as a function of the numbers of a sample."""
-    steps: list[tuple[Callable[..., float] | None, tuple[int, ...]]] = []
-    slots: dict[int, int] = {}
-    for part in postorder(e):
-        inputs = tuple(slots.get(id(below), 0) for below in part.below())
-        match part:
-            case Number(value):
-                steps.append((lambda value=value: value, ()))
-            case Signal(name):
-                # Of a vector its component or norm is taken, and not the signal itself.
-                steps.append((None, (columns.get((name, None), 0),)))
-            case Component(Signal(name), index):
-                steps.append((None, (columns[name, index],)))
-            case Arithmetic("norm", (Signal(name),)):
-                own = tuple(k for (of, _), k in columns.items() if of == name)
-                first = len(steps)
-                steps += [(None, (k,)) for k in own]
-                steps.append((_norm, tuple(range(first, first + len(own)))))
-            case Arithmetic(name, _):
-                steps.append((_safe(name), inputs))
-            case _:
-                raise missing_case("the margin", part)
-        slots[id(part)] = len(steps) - 1
-
-    def compute(x: Sequence[float]) -> float:
-        v: list[float] = []
-        for function, inputs in steps:
-            v.append(x[inputs[0]] if function is None else function(*[v[i] for i in inputs]))
-        return v[-1]
-
-    (function, inputs) = steps[-1]
-    if len(steps) == 1:
-        number = None if function is None else function()
-        return lambda x: x[inputs[0]] if number is None else number
-    return compute
+def _operation(step: Step) -> Callable[..., float]:
+    """Return the function of an operation on margins."""
+    match step.kind:
+        case "number":
+            return lambda: step.number
+        case "power":
+            power = _safe("**")
+            return lambda x: power(x, step.number)
+        case "truth":
+            at_zero = bool(step.number)
+            return lambda x: x if x != x else 1.0 if x > 0 or (at_zero and x == 0) else -1.0
+        case "norm":
+            return _norm
+    return _safe(step.kind)
 
 
 def _norm(*vector: float) -> float:

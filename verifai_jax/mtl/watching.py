@@ -22,9 +22,9 @@ from jaxtyping import Float
 from verifai_jax.core.errors import missing_name
 from verifai_jax.core.gaps import with_gaps
 from verifai_jax.core.machine_code import Unavailable, compiler, library_file
-from verifai_jax.mtl.c_margins import MarginCode, margin_code
 from verifai_jax.mtl.c_monitor import HEAD, HELPERS, monitor_code
 from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.margins import Margins, margins
 from verifai_jax.mtl.python_machine import PythonMachine
 from verifai_jax.mtl.semantics import Semantics, hard
 from verifai_jax.mtl.streams import Plan, streams
@@ -62,7 +62,7 @@ class CompiledMachine:
     **Raises:** `Unavailable` where it cannot be compiled.
     """
 
-    def __init__(self, plan: Plan, front: MarginCode) -> None:
+    def __init__(self, plan: Plan, front: Margins) -> None:
         counts = {"@columns": max(1, len(front.columns)), "@outputs": len(plan.outputs)}
         library = LIBRARY
         for word, count in counts.items():
@@ -118,7 +118,7 @@ class Watch(Generic[R]):
     - `compiled`: whether the machine's compiler made the step.
     """
 
-    def __init__(self, plan: Plan, front: MarginCode, result: Callable[[Numbers], R]) -> None:
+    def __init__(self, plan: Plan, front: Margins, result: Callable[[Numbers], R]) -> None:
         self.delays = tuple(output.delay for output in plan.outputs)
         self._top = plan.top
         self._waits = [output.wait for output in plan.outputs]
@@ -267,7 +267,7 @@ def watch(
     norm without a size.
     """
     plan = streams(formulas, dt, semantics, every)
-    front = margin_code(plan, sizes or {})
+    front = margins(plan, sizes or {})
     if not isinstance(formulas, Mapping):
         return Watch(plan, front, lambda out: out[0])
     names = tuple(formulas)

@@ -10,6 +10,7 @@ import numpy as np
 from verifai_jax.sets import functions
 from verifai_jax.sets.elementwise import of_rank, select
 from verifai_jax.sets.form import Form, alike, is_point, padded, product, rounded, total, unknown
+from verifai_jax.sets.frames import FEW, of_layer
 from verifai_jax.sets.interpreter import (
     Equation,
     Interpreter,
@@ -293,7 +294,11 @@ def _dot(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
         if is_point(other) and np.isfinite(other.centre).all():
             text = f"...{own},{its}->...{result}"
             terms = int(np.prod([form.shape[own.index(c)] for c in joint[1]], dtype=np.int64))
-            return [_times(form, other.centre[0], text, dtype, terms)]
+            few = np.prod(step.outvars[0].aval.shape, dtype=np.int64) < FEW
+            if not few and len(form.shape) == 1:
+                form = of_layer(form, t.features)
+            sums = _times(form, other.centre[0], text, dtype, terms)
+            return [sums.unframed(lambda frame: not frame.of_layer) if few else sums]
     axes = result + "".join(joint[1])
 
     def spread(name: str, array: np.ndarray, lead: int) -> np.ndarray:

@@ -51,10 +51,19 @@ def rounding(dtype: DTypeLike) -> Rounding:
 
 
 class Frame(NamedTuple):
-    """The symbols after those of the features: which loop's step they belong to."""
+    """Symbols after those of the features: of a step of a loop, or of a layer of a network.
+
+    - `number`: greater than those of frames made before.
+    - `first`, `stop`: its symbols among all.
+    - `outer`: the frame of the symbols before them that are not features either; None without.
+    - `of_layer`: whether it is that of a layer.
+    """
 
     number: int
-    features: int
+    first: int
+    stop: int
+    outer: "Frame | None" = None
+    of_layer: bool = False
 
 
 class Form:
@@ -181,15 +190,21 @@ class Form:
             if getattr(self, name) is not None:
                 setattr(self, name, np.where(where, value, getattr(self, name)))
 
-    def unframed(self) -> "Form":
-        """Return a set that depends on features alone: other symbols become part of the radius."""
-        if self.frame is None or self.slopes is None:
+    def unframed(self, keep: Callable[[Frame], bool] = lambda frame: False) -> "Form":
+        """Return a set without the symbols of inner frames, which become part of the radius.
+
+        **Arguments:**
+
+        - `keep`: whether to keep a frame, with all outside of it; none of them when left out.
+        """
+        frame, count = self.frame, None
+        while frame is not None and not keep(frame):
+            frame, count = frame.outer, frame.first
+        if count is None or self.slopes is None:
             return self
-        count = self.frame.features
-        radius = self.radius + np.abs(self.slopes[count:]).sum(0)
-        radius = radius + SLACK * self.size
-        slopes = self.slopes[:count]
-        return Form(self.centre, slopes, radius, self.size, self.dtype, self.low, self.high)
+        radius = self.radius + np.abs(self.slopes[count:]).sum(0) + SLACK * self.size
+        ends = self.low, self.high
+        return Form(self.centre, self.slopes[:count], radius, self.size, self.dtype, *ends, frame)
 
 
 def overflown(low: Reals, high: Reals, highest: float) -> tuple[Reals, Reals]:
@@ -245,10 +260,13 @@ def rounded(
 
 
 def alike(forms: Sequence[Form]) -> tuple[list[Form], Frame | None, int]:
-    """Return forms of the newest frame among them, others without their own; and its symbols."""
-    newest = max((f.frame.number for f in forms if f.frame is not None), default=0)
-    forms = [f if f.frame is None or f.frame.number == newest else f.unframed() for f in forms]
-    frame = next((f.frame for f in forms if f.frame is not None), None)
+    """Return forms without frames that the newest among them is not within; and its symbols."""
+    frame = max((f.frame for f in forms if f.frame is not None), default=None)
+    around, known = frame, set[int]()
+    while around is not None:
+        known.add(around.number)
+        around = around.outer
+    forms = [f.unframed(lambda each: each.number in known) for f in forms]
     return forms, frame, max((0 if f.slopes is None else len(f.slopes) for f in forms), default=0)
 
 

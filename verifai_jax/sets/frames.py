@@ -1,9 +1,11 @@
-"""The symbols of a loop: what its steps leave behind, carried along instead of wrapped in boxes.
+"""Symbols of loops and of layers: what is not linear, carried along instead of wrapped in boxes.
 
-A step turns and shears the set of states, and what is not linear adds an uncertainty to each
-number. Boxes around boxes would grow by that at each step. Here the uncertainties of the numbers
-that a loop carries are those of one parallelepiped, with orthogonal sides after scaling, whose
-symbols go through the next step as those of the features do.
+A step of a loop turns and shears the set of states, and what is not linear adds an uncertainty to
+each number. Boxes around boxes would grow by that at each step. Here the uncertainties of the
+numbers that a loop carries are symbols, which go through the next step as those of the features do;
+once they are many, they become those of one parallelepiped, with orthogonal sides after scaling.
+The uncertainties of the units of a layer go through the layers after it as symbols of their own, up
+to a result of few numbers.
 
 Source: R. Lohner, Enclosing the solutions of ordinary initial and boundary value problems (1987);
 N. Nedialkov, K. Jackson, G. Corliss, Validated solutions of initial value problems for ordinary
@@ -15,11 +17,21 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from verifai_jax.sets.form import SLACK, Form, Frame, alike
+from verifai_jax.sets.form import SLACK, Form, Frame, alike, padded
 from verifai_jax.sets.whole import Whole
 
 WIDEST = 24
 """Numbers that a loop carries at most for its symbols to be worth their cost, which is squared."""
+MANY = 512
+"""Symbols at most of a layer and those before it."""
+FEW = 8
+"""Numbers of a result that do not carry the symbols of layers on: what follows would cost more."""
+WORTH = 0.002
+"""Share of the spread from which on what is not linear gets symbols of its own."""
+ORDER = 6
+"""Symbols for each number that a loop carries, beyond which they become those of a parallelepiped.
+With as many as there are numbers the quadrotor of benchmarks/verify.py has no bounds after 78
+steps, with six times as many they stay narrow, and the other problems take less time as well."""
 _NUMBERS = itertools.count(1)
 
 
@@ -61,11 +73,13 @@ def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[For
     noise = np.zeros((boxes, count, old - features + count))
     noise[:, :, : old - features] = slopes[features:].transpose(1, 2, 0)
     noise[:, np.arange(count), old - features + np.arange(count)] = radius
-    sides, rest = _sides(noise)
+    sides, rest = noise, np.zeros((boxes, count))
+    if noise.shape[2] > ORDER * count:
+        sides, rest = _sides(noise)
     new = np.concatenate([slopes[:features], sides.transpose(2, 0, 1)])
     radius = np.where(bounded, rest + 4 * SLACK * np.abs(noise).sum(2), np.inf)
     size = np.minimum(size, np.maximum(np.abs(low), np.abs(high)))
-    frame = Frame(next(_NUMBERS), features)
+    frame = Frame(next(_NUMBERS), features, len(new))
     start = 0
     for i, value, each in zip(kept, values, sizes, strict=True):
         part, shape = slice(start, start + each), (boxes, *value.shape)
@@ -76,6 +90,29 @@ def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[For
         out[i] = Form(pieces[0], own, pieces[1], pieces[2], value.dtype, *ends, frame)
         start += each
     return out
+
+
+def of_layer(units: Form, features: int) -> Form:
+    """Return the numbers of a layer, the radius of each as a symbol of its own.
+
+    **Arguments:**
+
+    - `units`: an array of one axis.
+    - `features`: symbols of the features.
+    """
+    outer, bounded = units.frame, np.isfinite(units.radius)
+    first = features if outer is None else outer.stop
+    count = units.shape[0]
+    if first + count > MANY or units.radius[bounded].sum() <= WORTH * units.spread[bounded].sum():
+        return units
+    own = np.where(bounded, units.radius, 0.0)[None] * np.eye(count)[:, None]
+    old = padded(units, first)
+    old = np.broadcast_to(old, (first, *np.broadcast_shapes(old.shape[1:], own.shape[1:])))
+    return Form(
+        units.centre, np.concatenate([old, np.broadcast_to(own, (count, *old.shape[1:]))]),
+        np.where(bounded, 0.0, np.inf), units.size, units.dtype, units.low, units.high,
+        Frame(next(_NUMBERS), first, first + count, outer, of_layer=True),
+    )  # fmt: skip
 
 
 def _sides(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

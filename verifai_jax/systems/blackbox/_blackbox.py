@@ -149,6 +149,11 @@ class PooledBlackBox(_RowByRow):
 
     pool: Pool
 
+    @property
+    def workers(self) -> int:
+        """Simulations that run side by side."""
+        return self.pool.workers
+
     def __call__(self, features: Features, key: Seed = None) -> Trace:
         """Simulate once, in a worker.
 

@@ -70,6 +70,11 @@ class Remote(System):
         """The names of the clients that are connected now."""
         return [client.name for client in tuple(self._open().clients) if client.here]
 
+    @property
+    def workers(self) -> int:
+        """Simulations that run side by side: one for each client that is connected now."""
+        return max(1, len(self.clients))
+
     def abstract(self, features: Features) -> Trace | None:
         """Return the form of the traces, if it is given."""
         return self.rules.declared.abstract()

@@ -1,0 +1,296 @@
+"""`verifai-jax mcp`: the commands as tools of an agent, by the Model Context Protocol over pipes.
+
+Messages are JSON-RPC 2.0, one a line. A tool is a command in a process of its own, with a budget of
+simulations and of seconds. Paths are below one folder. Formulas are parsed, and nothing else of a
+message is: what runs are files of problems that are in that folder.
+"""
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, TextIO
+
+import click
+
+from verifai_jax._version import __version__
+from verifai_jax.cli.exit_codes import CommandError
+
+VERSIONS = ("2025-11-25", "2025-06-18", "2025-03-26", "2024-11-05")
+"""Versions of the protocol, the newest first."""
+SHOWN = 8000
+"""Characters of what people read, and of an error, that an answer has at most."""
+OWN = "agent_problems"
+"""Folder of the problems that `check` writes."""
+NAME = r"[A-Za-z_][A-Za-z0-9_]{0,60}"
+
+Schema = Mapping[str, Any]
+PROBLEM = {"type": "string", "description": "A problem, FILE.py:NAME, of the folder."}
+RUN = {"type": "string", "description": "The folder of a run, as falsify returned it."}
+ROW = {"type": "integer", "minimum": 0, "description": "A row of the run; all when left out."}
+SEED = {"type": "integer", "minimum": 0, "default": 0}
+BUDGET = {"type": "integer", "minimum": 1, "default": 10_000, "description": "Simulations at most."}
+WORD = {"type": "string", "pattern": f"^{NAME}$"}
+FLAG = {"type": "boolean", "default": False}
+
+
+class Tool(NamedTuple):
+    """A command as a tool: its words, its arguments, and which of them follow the options."""
+
+    description: str
+    command: str
+    arguments: Mapping[str, Schema]
+    positional: tuple[str, ...]
+    required: tuple[str, ...] = ()
+
+    def schema(self) -> dict[str, Any]:
+        """Return the schema of all arguments."""
+        return {
+            "type": "object",
+            "properties": dict(self.arguments),
+            "required": list(self.required),
+            "additionalProperties": False,
+        }
+
+
+_RUN, _PROBLEM = ("run",), ("problem",)
+TOOLS = {
+    "list": Tool(
+        "List the problems of a Python file or a folder, with features and formulas.", "list",
+        {"location": {"type": "string", "default": "specs"}}, ("location",),
+    ),
+    "check": Tool(
+        "Lint a formula on signals of a problem. With `name`, if nothing is suspicious, a problem "
+        "with this formula is written, which the other tools take.", "formula lint",
+        {"formula": {"type": "string", "maxLength": 2000}, "problem": PROBLEM, "name": WORD,
+         "even_if_suspicious": FLAG}, ("formula",), ("formula", "problem"),
+    ),
+    "falsify": Tool(
+        "Search for failures of a problem; returns the folder of the run, and the worst row.",
+        "falsify", {"problem": PROBLEM, "budget": BUDGET, "seed": SEED, "search": WORD},
+        _PROBLEM, _PROBLEM,
+    ),
+    "confirm": Tool(
+        "Replay failures of a run in double precision, at finer steps, and by another engine.",
+        "confirm", {"run": RUN, "row": ROW, "engine": WORD}, ("run", "row"), _RUN,
+    ),
+    "explain": Tool(
+        "Say why a row of a run fails.", "explain --no-pictures", {"run": RUN, "row": ROW},
+        ("run", "row"), _RUN,
+    ),
+    "shrink": Tool(
+        "Find the failure nearest to the nominal values, beginning with a row of a run.",
+        "shrink --no-pictures", {"run": RUN, "row": ROW, "budget": BUDGET}, ("run", "row"), _RUN,
+    ),
+    "estimate": Tool(
+        "Estimate the probability of a failure, with an interval and a bound.", "estimate",
+        {"problem": PROBLEM, "budget": BUDGET, "seed": SEED}, _PROBLEM, _PROBLEM,
+    ),
+    "report": Tool(
+        "Write the evidence report on a run as an HTML file, and its claims as JSON.",
+        "report --no-studies", {"run": RUN, "assessment": FLAG}, _RUN, _RUN,
+    ),
+    "trace": Tool(
+        "Follow each requirement of a problem to its tests, runs, claims and reports.", "trace",
+        {"problem": PROBLEM}, _PROBLEM, _PROBLEM,
+    ),
+}  # fmt: skip
+KINDS = {"string": str, "integer": int, "boolean": bool}
+
+
+class Refused(ValueError):
+    """Arguments that a tool does not take."""
+
+
+@dataclass
+class Server:
+    """Tools on one folder.
+
+    - `folder`: below which all paths are.
+    - `budget`: simulations of one call at most.
+    - `total`: simulations of all calls at most.
+    - `seconds`: of one call at most.
+    """
+
+    folder: Path
+    budget: int
+    total: int
+    seconds: float
+    spent: int = field(default=0, init=False)
+
+    def answers(self, lines: TextIO) -> Iterator[str]:
+        """Yield an answer to each request, as a line."""
+        for line in filter(str.strip, lines):
+            try:
+                request = json.loads(line)
+            except ValueError:
+                yield _line(None, error={"code": -32700, "message": "the message is no JSON"})
+                continue
+            valid = isinstance(request, dict) and isinstance(request.get("method"), str)
+            if not valid or not isinstance(request.get("params", {}), dict):
+                yield _line(None, error={"code": -32600, "message": "this is no request"})
+            elif "id" in request:  # Nothing is answered to a notification.
+                yield self._answer(request["id"], request["method"], request.get("params", {}))
+
+    def _answer(self, number: object, method: str, params: Mapping[str, Any]) -> str:
+        match method:
+            case "initialize":
+                asked = params.get("protocolVersion")
+                return _line(number, result={
+                    "protocolVersion": asked if asked in VERSIONS else VERSIONS[0],
+                    "capabilities": {"tools": {}},
+                    "serverInfo": {"name": "verifai-jax", "version": __version__},
+                    "instructions": "list, check a formula, falsify, confirm, estimate, report.",
+                })  # fmt: skip
+            case "ping":
+                return _line(number, result={})
+            case "tools/list":
+                tools = [
+                    {"name": name, "description": tool.description, "inputSchema": tool.schema()}
+                    for name, tool in TOOLS.items()
+                ]
+                return _line(number, result={"tools": tools})
+            case "tools/call":
+                name, given = params.get("name"), params.get("arguments") or {}
+                if name not in TOOLS or not isinstance(given, dict):
+                    text = f"there is no tool {name!r}; there are {', '.join(TOOLS)}"
+                    return _line(number, error={"code": -32602, "message": text})
+                return _line(number, result=self.call(name, given))
+        return _line(number, error={"code": -32601, "message": f"no method {method!r}"})
+
+    def call(self, name: str, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Call a tool; what is wrong is said in its answer, for the agent to read."""
+        try:
+            return self._call(name, TOOLS[name], given)
+        except (ValueError, OSError) as error:
+            return _content(str(error), {}, failed=True)
+
+    def _call(self, name: str, tool: Tool, given: Mapping[str, Any]) -> dict[str, Any]:
+        values = checked(tool, given)
+        for key in ("problem", "location", "run"):
+            if key in values:
+                self._fence(key, values[key])
+        if "budget" in values:
+            left = min(self.budget, self.total - self.spent)
+            if values["budget"] > left:
+                text = f"a budget of {values['budget']:,} simulations is too large"
+                raise Refused(f"{text}: {left:,} are left for this call")
+            self.spent += values["budget"]
+        options = [
+            f"--{key}" if value is True else f"--{key}={value}"
+            for key, value in values.items()
+            if key not in (*tool.positional, "name", "even_if_suspicious") and value is not False
+        ]
+        after = [str(values[key]) for key in tool.positional if key in values]
+        words = [*tool.command.split(), "--json", *options, "--", *after]
+        done = self._run(words)
+        text = done.stderr[-SHOWN:].strip()
+        try:
+            result = json.loads(done.stdout) if done.stdout.strip() else {}
+        except ValueError:
+            result = {}
+        failed = done.returncode not in (0, 1)
+        result["command"] = shlex.join(["verifai-jax", *words])
+        if name == "check" and "name" in values and not failed:
+            if result.get("findings") and not values["even_if_suspicious"]:
+                text += "\nNo problem was written, as the formula is suspicious."
+            else:
+                result["problem"] = self._write(values)
+        return _content(text, result, failed)
+
+    def _run(self, words: list[str]) -> "subprocess.CompletedProcess[str]":
+        command = [sys.executable, "-m", "verifai_jax", *words]
+        try:
+            return subprocess.run(
+                command, cwd=self.folder, capture_output=True, text=True, timeout=self.seconds,
+                stdin=subprocess.DEVNULL, check=False, errors="replace",
+                env={**os.environ, "MPLBACKEND": "agg"},
+            )  # fmt: skip
+        except subprocess.TimeoutExpired:
+            text = f"it was ended after {self.seconds:zg} s; take a smaller budget"
+            raise Refused(text) from None
+
+    def _fence(self, key: str, value: str) -> None:
+        """Refuse a path outside of the folder, and a problem that is no file in it."""
+        path = value.rpartition(":")[0] if key == "problem" and ":" in value else value
+        whole = (self.folder / path).resolve() if "\0" not in path else Path("/")
+        if not whole.is_relative_to(self.folder) or not whole.exists() or path.startswith("-"):
+            raise Refused(f"{key} {value!r} is nothing in the folder of this server")
+        if key == "problem" and whole.suffix != ".py":
+            raise Refused(f"problem {value!r} must be FILE.py:NAME")
+
+    def _write(self, values: Mapping[str, Any]) -> str:
+        """Write a problem with another formula, and return its target."""
+        name = values["name"]
+        path = self.folder / OWN / f"{name}.py"
+        path.parent.mkdir(exist_ok=True)
+        text = (
+            "from dataclasses import replace\n\nimport verifai_jax as vj\n"
+            "from verifai_jax.core.targets import load_target\n\n"
+            f"base = load_target({values['problem']!r}, vj.Problem)\n"
+            f"problem = replace(\n    base,\n    name={name!r},\n"
+            f"    spec={{{name!r}: {values['formula']!r}}},\n"
+            "    priority=None,\n    requirements=None,\n)\ndel base\n"
+        )
+        if path.exists() and path.read_text(encoding="utf-8") != text:
+            raise Refused(f"there is another problem {name!r} in {OWN}: take another name")
+        path.write_text(text, encoding="utf-8")
+        return f"{OWN}/{name}.py:{name}"
+
+
+def checked(tool: Tool, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of a call, completed by defaults.
+
+    **Raises:** `Refused` for one that is unknown, missing, or not as its schema says.
+    """
+    for name in given:
+        if name not in tool.arguments:
+            raise Refused(f"there is no argument {name!r}; there are {', '.join(tool.arguments)}")
+    values = {}
+    for name, schema in tool.arguments.items():
+        if name not in given and "default" not in schema:
+            if name in tool.required:
+                raise Refused(f"the argument {name!r} is missing")
+            continue
+        value = given.get(name, schema.get("default"))
+        kind = KINDS[schema["type"]]
+        if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+            raise Refused(f"{name} must be of type {schema['type']}; got {value!r}")
+        if isinstance(value, str) and len(value) > schema.get("maxLength", 500):
+            raise Refused(f"{name} is too long")
+        if "pattern" in schema and not re.fullmatch(schema["pattern"], str(value)):
+            raise Refused(f"{name} must match {schema['pattern']}; got {value!r}")
+        if isinstance(value, int) and value < schema.get("minimum", 0):
+            raise Refused(f"{name} must be at least {schema['minimum']}; got {value}")
+        values[name] = value
+    return values
+
+
+def _content(text: str, result: Mapping[str, Any], failed: bool) -> dict[str, Any]:
+    parts = [{"type": "text", "text": each} for each in (text, json.dumps(result)) if each != "{}"]
+    return {"content": parts, "structuredContent": dict(result), "isError": failed}
+
+
+def _line(number: object, **answer: object) -> str:
+    return json.dumps({"jsonrpc": "2.0", "id": number, **answer})
+
+
+@click.command()
+@click.option("--folder", type=click.Path(path_type=Path), default=".", help="Of the project.")
+@click.option("--budget", type=click.IntRange(1), default=100_000, help="Simulations of a call.")
+@click.option("--total", type=click.IntRange(1), default=1_000_000, help="Simulations in all.")
+@click.option("--seconds", type=click.FloatRange(1), default=600.0, help="Seconds of a call.")
+def mcp(folder: Path, budget: int, total: int, seconds: float) -> None:
+    """Serve an agent over standard input and output, by the Model Context Protocol.
+
+    Its paths are below the folder, and its simulations and seconds at most as many.
+    """
+    if not folder.is_dir():
+        raise CommandError(f"there is no folder {folder}", 2)
+    for line in Server(folder.resolve(), budget, total, seconds).answers(sys.stdin):
+        click.echo(line)
