@@ -150,8 +150,8 @@ def harden(
     - `confidence`: with which the intervals before and after hold together.
     - `samples`, `attack`, `attack_simulations`: of each certificate, as in `certify`.
     - `added`: points to train around that a round adds at most.
-    - `own`, `failing`: shares of episodes that are the task's own, and that begin near failures;
-      the others are of the prior.
+    - `own`, `failing`: shares of episodes that are the task's own, and that begin near failures,
+      those of the prior included that fail anyway; the others are of the prior.
     - `tolerance`: share of the first policy's return that may be lost.
     - `episodes`: the number of episodes of the task itself, the same for all policies, that measure
       returns.
@@ -289,7 +289,11 @@ class Work:
         if len(found.points):
             columns = space.rows(space.features_at(found.points))
             self.added.append(pd.DataFrame(columns).assign(round=stage, source=found.sources))
-        shares = (plan.own, 1 - plan.own - plan.failing, plan.failing)
+        # The more of the prior fails, the more of its episodes begin at failures anyway.
+        rate = certificates[0].rate.estimate if certificates[0].rate else 0.0
+        failing = (plan.failing - (1 - plan.own) * rate) / max(1 - rate, 1e-9)
+        failing = min(max(failing, 0.0), plan.failing)
+        shares = (plan.own, 1 - plan.own - failing, failing)
         mixtures = [Mixture.of(space, shares, p) for p in (self.points, self.points[:0])]
         self.arms.mix(stage + 1, mixtures[: len(self.arms_named)])
 
