@@ -167,8 +167,66 @@ def cruise():
     return problem, 10.0, 1.0
 
 
+def quadrotor():
+    """Quadrotor: it rises by a metre, and stays there after four seconds."""
+    gravity, mass, inertia = 9.81, 1.4, (0.054, 0.054, 0.104)
+    control = network(
+        lambda height, ahead, aside, down, roll, pitch, p, q: (
+            -4.0 * (height - 1) + 4.5 * down, -0.5 * roll - 0.3 * p - 0.05 * aside,
+            -0.5 * pitch - 0.3 * q + 0.05 * ahead,
+        ),
+        [-0.5] + [-1] * 3 + [-0.2] * 2 + [-0.4] * 2, [1.5] + [1] * 3 + [0.2] * 2 + [0.4] * 2, 48,
+    )  # fmt: skip
+
+    def dynamics(t, s, u, f):
+        v, (roll, pitch, yaw), (p, q, r) = s["v"], s["angles"], s["rates"]
+        (sr, cr), (sp, cp), (sy, cy) = ((jnp.sin(a), jnp.cos(a)) for a in (roll, pitch, yaw))
+        jx, jy, jz = inertia
+        return {
+            "x": (
+                cp * cy * v[0] + (sr * sp * cy - cr * sy) * v[1] + (cr * sp * cy + sr * sy) * v[2],
+                cp * sy * v[0] + (sr * sp * sy + cr * cy) * v[1] + (cr * sp * sy - sr * cy) * v[2],
+                sp * v[0] - sr * cp * v[1] - cr * cp * v[2],
+            ),
+            "v": (
+                r * v[1] - q * v[2] - gravity * sp,
+                p * v[2] - r * v[0] + gravity * cp * sr,
+                q * v[0] - p * v[1] + gravity * (cp * cr - 1) - u[0] / mass,
+            ),
+            "angles": (
+                p + (sr * q + cr * r) * sp / cp, cr * q - sr * r, (sr * q + cr * r) / cp,
+            ),
+            "rates": (
+                (jy - jz) / jx * q * r + u[1] / jx, (jz - jx) / jy * p * r + u[2] / jy,
+                (jx - jy) / jz * p * q,
+            ),
+        }  # fmt: skip
+
+    names = ["north", "east", "height", "ahead", "aside", "down"]
+
+    def problem(threshold):
+        def initial(f, key):
+            zeros = (0 * f["north"],) * 3
+            start = [f[name] for name in names]
+            return {"x": tuple(start[:3]), "v": tuple(start[3:]), "angles": zeros, "rates": zeros}
+
+        system = vj.ode(
+            dynamics, initial, dt=0.05, duration=5.0, control_period=0.1,
+            controller=lambda t, s, f: control(
+                s["x"][2], *s["v"], *s["angles"][:2], *s["rates"][:2]
+            ),
+            signals=lambda t, s, u, f: {"height": s["x"][2]},
+        )  # fmt: skip
+        space = {name: vj.Box(-0.4, 0.4) for name in names}
+        return vj.Problem(
+            "quadrotor", space, system, f"always[4, 5] abs(height - 1) <= {threshold!r}"
+        )
+
+    return problem, 1.0, -1.0
+
+
 PROBLEMS = {"integrator": double_integrator, "pendulum": pendulum, "tora": tora,
-            "oscillator": van_der_pol, "acc": cruise}  # fmt: skip
+            "oscillator": van_der_pol, "acc": cruise, "quadrotor": quadrotor}  # fmt: skip
 
 
 def tightened(make: Callable, threshold: float, sign: float):

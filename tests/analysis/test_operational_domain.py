@@ -195,10 +195,34 @@ def test_files_are_read_again(domain, tmp_path):
     written = vj.odd_of(space, "made", units={"v": "m/s"}).write(tmp_path / "made.yaml")
     assert "float velocity" in written.read_text()
     assert vj.read_odd(written).space() == space
-    (tmp_path / "parts.yaml").write_text(
-        "IMPORT: again.yaml\nconversion: {length: {rod: 5.0292}}\n"
-    )
+    (tmp_path / "parts.yaml").write_text("IMPORT: again.yaml\n")
     assert vj.read_odd(tmp_path / "parts.yaml").document["ODD"] == domain.document["ODD"]
+
+
+def test_labels_groups_and_units_of_the_file(tmp_path):
+    (tmp_path / "odd.yaml").write_text("""
+TAXONOMY:
+  a: bool
+  b: boolean
+  depth: float length
+  road: [track, {paved: [street, motorway]}]
+MODULES:
+  m1: {LABEL: x, INCLUDE_AND: {a: true}}
+  m2: {LABELS: [x], INCLUDE_AND: {b: true}}
+  m3: {LABEL: x, ACTIVE: false, INCLUDE_AND: {a: false}}
+  n: {INCLUDE_AND: {x: true, depth: "[0 .. 5] fathom", road: paved}}
+conversion: {length: {fathom: {m: {scale: 1.8288}}}}
+""")
+    odd = vj.read_odd(tmp_path / "odd.yaml")
+    assert odd.roots == ("n",)
+    rows = pd.DataFrame(
+        [(a, b, d, road) for a in (True, False) for b in (True, False) for d in (9.1, 9.2)
+         for road in ("track", "street")],
+        columns=["a", "b", "depth", "road"],
+    )  # fmt: skip
+    expected = (rows["a"] | rows["b"]) & (rows["depth"] < 9.144) & (rows["road"] == "street")
+    assert odd.holds(rows).tolist() == expected.tolist()
+    assert odd.hull(odd.features["road"]) == frozenset({1, 2})
 
 
 @pytest.mark.parametrize(
@@ -210,7 +234,8 @@ def test_files_are_read_again(domain, tmp_path):
         ("      gap:", "      gape:", "unknown attribute or module of module town of .* 'gape'"),
         ("TITLE", "TITEL", "unknown entry of module town of .* 'TITEL'.*TITLE"),
         ("rain: [none", "rain: !!python/name:os.system [none", "is no YAML"),
-        ("ego_speed: float velocity", "ego_speed: velocity", "ego_speed is a list of literals, or"),
+        ("ego_speed: float velocity", "ego_speed:", "ego_speed is a list of literals, or"),
+        ("ego_speed: float velocity", "ego_speed: date", "kind date has no values to compare"),
         ('lanes: ">= 3"', "town: true", "in a circle: town -> town"),
     ],
 )

@@ -179,7 +179,7 @@ def test_a_front_is_drawn(tmp_path):
 
 
 @given(formulas(counted=True), recordings(), st.sampled_from(["hold", "truncate"]), st.booleans())
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 def test_the_first_sample_alone_has_the_same_value(formula, recording, end, boolean):
     signals = {name: np.asarray(v, float) for name, v in recording.items()}
     alone, every = (HostValues.of(Trace(signals, dt=DT), end) for _ in range(2))

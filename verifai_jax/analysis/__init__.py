@@ -12,7 +12,8 @@ from verifai_jax.analysis.data.columns import Column
 from verifai_jax.analysis.data.samples import Samples
 from verifai_jax.analysis.neighbours import Neighbours, k_closest, nearest, random_rows
 from verifai_jax.analysis.odd_coverage import OddCoverage
-from verifai_jax.analysis.operational_domain import OperationalDomain, odd_of, read_odd
+from verifai_jax.analysis.odd_files import odd_of, read_odd
+from verifai_jax.analysis.operational_domain import OperationalDomain
 from verifai_jax.analysis.overview import Analysis, analyze
 from verifai_jax.analysis.sensitivity.gradients import gradient_sensitivity
 from verifai_jax.analysis.sensitivity.morris import morris

@@ -10,7 +10,7 @@ Numbers are in the unit of the attribute, and literals are their indices.
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import reduce
 from typing import TypeAlias
 
@@ -47,12 +47,19 @@ UNIT_OF = {"duration": "s"} | {kind: unit for unit, (kind, size) in UNITS.items(
 """The unit of an attribute for which nobody says one, by what it measures."""
 
 
-def convert(value: float, unit: str, to: str) -> float:
-    """Return a number in another unit.
+Conversions: TypeAlias = Mapping[tuple[str, str], tuple[float, float]]
+"""Scale and offset from one unit to another, as a file says them."""
+
+
+def convert(value: float, unit: str, to: str, own: Conversions | None = None) -> float:
+    """Return a number in another unit, by a conversion of the file's `own` if there is one.
 
     **Raises:** `ValueError` for units that do not go together.
     """
     one, other = plain_unit(unit), plain_unit(to)
+    for (source, target), (scale, offset) in (own or {}).items():
+        if source == unit:
+            return convert(value * scale + offset, target, to)
     if one == other or not one:
         return value
     (kind, size), (other_kind, other_size) = (UNITS.get(u, (u, 1.0)) for u in (one, other))
@@ -68,6 +75,7 @@ class Attribute:
     - `name`: with the concepts above it, `dynamic.ego_speed`.
     - `kind`: `"float"`, `"integer"`, `"boolean"`, `"string"` or `"literal"`.
     - `literals`: its possible values, where they are listed.
+    - `groups`: of these, by names that conditions may use for them.
     - `feature`: that stands for it; empty for none.
     - `unit`: of the feature; the SI unit of what it measures when nobody says.
     - `reason`, `source`: why it is so, and who says so.
@@ -76,6 +84,7 @@ class Attribute:
     name: str
     kind: str
     literals: tuple[str, ...] = ()
+    groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict, repr=False)
     feature: str = ""
     unit: str = ""
     reason: str = ""
@@ -226,7 +235,12 @@ Resolve: TypeAlias = Callable[[str], Attribute | None]
 
 
 def read_group(
-    where: str, section: object, every: bool, resolve: Resolve, modules: Sequence[str]
+    where: str,
+    section: object,
+    every: bool,
+    resolve: Resolve,
+    modules: Sequence[str],
+    conversions: Conversions,
 ) -> Group:
     """Read a section of conditions: a mapping from names to expressions.
 
@@ -238,10 +252,10 @@ def read_group(
     for key, value in section.items():
         name, inside = str(key), f"{where}, {key}"
         if name in ("AND", "OR"):
-            parts.append(read_group(inside, value, name == "AND", resolve, modules))
+            parts.append(read_group(inside, value, name == "AND", resolve, modules, conversions))
         elif (attribute := resolve(name)) is not None:
             try:
-                parts.append(_read_test(attribute, value))
+                parts.append(_read_test(attribute, value, conversions))
             except ValueError as error:
                 raise ValueError(f"{inside}: {error}") from None
         elif name in modules:
@@ -255,9 +269,10 @@ def read_group(
     return Group(every, tuple(parts))
 
 
-def _read_test(attribute: Attribute, value: object) -> Test:
+def _read_test(attribute: Attribute, value: object, conversions: Conversions) -> Test:
     if attribute.literals:
-        said = [_written(each) for each in (value if isinstance(value, list) else [value])]
+        given = [written(each) for each in (value if isinstance(value, list) else [value])]
+        said = [name for each in given for name in attribute.groups.get(each, (each,))]
         for each in said:
             if each not in attribute.literals:
                 raise ValueError(f"{each!r} is none of its values, {', '.join(attribute.literals)}")
@@ -275,11 +290,12 @@ def _read_test(attribute: Attribute, value: object) -> Test:
         raise ValueError(
             f'expected "[low .. high] unit", "> number unit" or a number; got {text!r}'
         )
-    low, high = (convert(each, unit or "", attribute.unit) for each in (low, high))
+    low, high = (convert(x, unit or "", attribute.unit, conversions) for x in (low, high))
     low = -math.inf if word[:1] == "<" else low
     high = math.inf if word[:1] == ">" else high
     return Test(attribute.name, (low, high), word in ("<", ">"))
 
 
-def _written(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
+def written(value: object) -> str:
+    """Return a literal as a file writes it."""
+    return str(value).lower() if isinstance(value, bool | np.bool_) else str(value)

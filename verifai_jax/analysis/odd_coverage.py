@@ -9,6 +9,7 @@ found.next_points(10)                               # what to simulate next
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
+from typing import Any
 
 import jax
 import numpy as np
@@ -89,7 +90,7 @@ class OddCoverage(InNotebook):
         ]
         if self.prior_inside == self.prior_inside:
             lines[0] += f"; {format_percent(self.prior_inside)} of the prior is inside"
-        for name, row in self.table.iterrows():
+        for name, row in self.table.to_dict("index").items():
             if not row["feature"]:
                 lines.append(f"  {name}: never varied, as no feature stands for it")
                 continue
@@ -100,10 +101,12 @@ class OddCoverage(InNotebook):
                 f"{format_percent(row['volume'])} of the volume{prior}"
             )
         if len(self.pairs):
-            volume, worst = self.pairs["volume"], self.pairs["volume"].idxmin()
-            text = f"{format_percent(float(volume.mean()))} of the volume on average"
-            if len(volume) > 1:
-                text += f", {format_percent(volume[worst])} of {' with '.join(worst)}"
+            volumes = {each: row["volume"] for each, row in self.pairs.to_dict("index").items()}
+            mean = float(np.mean([*volumes.values()]))
+            text = f"{format_percent(mean)} of the volume on average"
+            if len(volumes) > 1:
+                worst: Any = min(volumes, key=volumes.__getitem__)
+                text += f", {format_percent(volumes[worst])} of {' with '.join(worst)}"
             lines.append(f"  pairs of attributes: {text}")
         return "\n".join(lines)
 
@@ -136,12 +139,12 @@ def odd_coverage(
     cuts = {each.name: _Cut(each, domain, cells) for each in domain.features.values()}
     rng = np.random.default_rng(seed)
     points = pd.DataFrame({cut.attribute.feature: cut.draw(rng) for cut in cuts.values()})
-    points = points[domain.holds(points)].reset_index(drop=True)
+    points = _rows(points, domain.holds(points))
     if not len(points):
         raise ValueError(f"no point of {domain.name} was found: its conditions leave nothing")
     exact = domain.is_box
     inside = domain.holds(frame)
-    codes = _coded(cuts, domain, frame[inside])
+    codes = _coded(cuts, domain, _rows(frame, inside))
     drawn = _coded(cuts, domain, points)
     share, mass_of = float("nan"), {}
     if samples.space is not None:
@@ -149,7 +152,7 @@ def odd_coverage(
         prior = pd.DataFrame(samples.space.rows(samples.space.sample(key, DRAWN)))
         within = domain.holds(prior)
         share = float(np.mean(within))
-        mass_of = _coded(cuts, domain, prior[within])
+        mass_of = _coded(cuts, domain, _rows(prior, within))
 
     def measured(names: tuple[str, ...]) -> dict[str, float]:
         possible = np.unique(_keys(drawn, names))
@@ -174,7 +177,7 @@ def odd_coverage(
     return OddCoverage(
         domain, pd.DataFrame.from_dict(rows, orient="index"),
         pd.DataFrame.from_dict(pairs, orient="index"), len(frame), int(np.sum(~inside)), share,
-        codes, points[:CANDIDATES], drawn,
+        codes, points.head(CANDIDATES), drawn,
     )  # fmt: skip
 
 
@@ -214,6 +217,11 @@ class _Cut:
             return np.array(self.values, object)[rng.integers(0, self.count, DRAWN)]
         found = rng.uniform(self.low, self.high, DRAWN)
         return np.clip(np.rint(found), self.low + 0.5, self.high - 0.5) if self.integer else found
+
+
+def _rows(frame: pd.DataFrame, which: np.ndarray) -> pd.DataFrame:
+    found: Any = frame[which]
+    return found.reset_index(drop=True)
 
 
 def _coded(cuts: Mapping[str, _Cut], domain: OperationalDomain, frame: pd.DataFrame) -> Codes:

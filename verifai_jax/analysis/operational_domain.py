@@ -12,8 +12,8 @@ problem varies their attributes, in which units, why, and who says so:
       speed: {attribute: dynamic.ego_speed, unit: m/s, reason: limit of the road, source: StVO 3}
 """
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -25,36 +25,21 @@ from jaxtyping import Bool, Float
 
 from verifai_jax.analysis.data.samples import Source
 from verifai_jax.analysis.odd_conditions import (
-    UNIT_OF,
-    UNITS,
     Attribute,
     Group,
     Hull,
     Module,
-    Reference,
-    Resolve,
     Test,
     Values,
     both,
-    convert,
     hull_of,
     module_holds,
-    read_group,
+    written,
 )
 from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.reads import documents
-from verifai_jax.core.yaml import read_yaml, write_yaml
+from verifai_jax.core.yaml import write_yaml
 from verifai_jax.features import Box, Categorical, DiscreteBox, Domain, FeatureSpace
-
-ABOUT = ("attribute", "unit", "reason", "source")
-"""What is said of a feature."""
-SECTIONS = ("TAXONOMY", "ODD", "MODULES", "IMPORT", "conversion")
-"""Parts of a file of OpenODD."""
-OF_MODULE = ("TITLE", "DESCRIPTION", "ACTIVE", "LABEL", "LABELS")
-"""Entries of a module, conditions apart."""
-KINDS = ("float", "integer", "boolean", "string")
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,8 +94,8 @@ class OperationalDomain:
             column = frame[name]
             if each.literals:
                 codes = {literal: index for index, literal in enumerate(each.literals)}
-                written = [_plain(value) for value in column]
-                found[each.name] = np.array([codes.get(text, -1) for text in written], float)
+                texts = [written(value) for value in column]
+                found[each.name] = np.array([codes.get(text, -1) for text in texts], float)
             else:
                 found[each.name] = column.to_numpy(float)
         return found
@@ -142,8 +127,9 @@ class OperationalDomain:
             if isinstance(values, list):
                 domains[name] = Categorical(*values)
             else:
-                box = DiscreteBox if each.kind == "integer" else Box
-                domains[name] = box(*values)
+                low, high = values
+                whole = each.kind == "integer"
+                domains[name] = DiscreteBox(int(low), int(high)) if whole else Box(low, high)
         return FeatureSpace(domains, None if self.is_box else self._accepts)
 
     def _accepts(self, features: Mapping[str, Any]) -> Any:
@@ -201,211 +187,3 @@ def words(attribute: Attribute, hull: Hull) -> str:
     if isinstance(hull, frozenset):
         return ", ".join(attribute.literals[code] for code in sorted(hull)) or "nothing"
     return " ".join(filter(None, (f"{hull[0]:zg} to {hull[1]:zg}", attribute.unit)))
-
-
-def read_odd(path: str | Path) -> OperationalDomain:
-    """Read an operational design domain from a file of ASAM OpenODD 1.0, or one that names such.
-
-    Attributes are floats and integers with a unit, booleans and literals. A condition is a range,
-    `"[0 .. 50] km/h"`, a comparison, a literal or a list of them, a group `AND` or `OR`, or a
-    module that holds or not. Units are converted into that of the feature.
-
-    **Arguments:**
-
-    - `path`: the file. Without `features` each attribute is a feature of its last name.
-
-    **Raises:** `FileNotFoundError`; `ValueError` that names the entry, for what is no such file.
-    """
-    path = Path(path)
-    whole = _mapping(path)
-    said: dict[str, dict[str, str]] = {}
-    if "openodd" in whole:
-        check_names(f"entry of {path}", whole, ("openodd", "name", "features"))
-        tree = {}
-        for name in _listed(whole["openodd"]):
-            tree = _joined(tree, _with_imports(path.parent / name))
-        for feature, about in (whole.get("features") or {}).items():
-            if not isinstance(about, Mapping) or "attribute" not in about:
-                raise ValueError(f"{path}: feature {feature!r} needs its attribute")
-            check_names(f"entry of feature {feature!r} of {path}", about, ABOUT)
-            said[str(feature)] = {key: str(value) for key, value in about.items()}
-    else:
-        tree = _joined({}, _with_imports(path))
-    return _domain(str(whole.get("name", path.stem)), str(path), tree, said)
-
-
-def odd_of(
-    space: FeatureSpace, name: str = "odd", units: Mapping[str, str] | None = None
-) -> OperationalDomain:
-    """Return the domain that a space of features spans, for `write`.
-
-    **Raises:** `ValueError` for a feature that is no range and no choice, and for a constraint.
-    """
-    taxonomy: dict[str, Any] = {}
-    include: dict[str, Any] = {}
-    if space.where is not None:
-        raise ValueError("a constraint is code, which a file of OpenODD does not hold")
-    for feature, domain in space.domains.items():
-        found, unit = domain.tuning, (units or {}).get(feature, "")
-        if found.choices:
-            taxonomy[feature] = include[feature] = [_plain(each) for each in found.choices]
-        elif isinstance(found.low, int | float) and isinstance(found.high, int | float):
-            kind = "integer" if found.scale == "integer" else "float"
-            measured, unit = (UNITS[unit][0], f" {unit}") if unit in UNITS else ("", "")
-            taxonomy[feature] = f"{kind} {measured}".strip()
-            include[feature] = f"[{found.low!r} .. {found.high!r}]{unit}"
-        else:
-            raise ValueError(f"feature {feature!r} is no range and no choice; got {domain!r}")
-    tree = {"TAXONOMY": taxonomy, "ODD": {name: {"INCLUDE_AND": include}}}
-    return _domain(name, name, tree, {})
-
-
-def _domain(
-    name: str, where: str, tree: Mapping[str, Any], said: Mapping[str, Mapping[str, str]]
-) -> OperationalDomain:
-    found = list(_attributes((), tree.get("TAXONOMY") or {}, where))
-    if not found:
-        raise ValueError(f"{where} has no attribute: TAXONOMY names them")
-    resolve = _resolver(found)
-    if said:
-        mapped = {}
-        for feature, about in said.items():
-            attribute = resolve(about["attribute"])
-            if attribute is None:
-                names = [each.name for each in found]
-                raise unknown_name(f"attribute of {where}", about["attribute"], names)
-            own = {key: about.get(key, "") for key in ("unit", "reason", "source")}
-            mapped[attribute.name] = {"feature": feature, **own}
-    else:
-        last = [each.name.rpartition(".")[2] for each in found]
-        mapped = {
-            each.name: {"feature": end if last.count(end) == 1 else each.name.replace(".", "_")}
-            for each, end in zip(found, last, strict=True)
-        }
-    sections = {**(tree.get("MODULES") or {}), **(tree.get("ODD") or {})}
-    attributes = []
-    for each in found:
-        own = {key: value for key, value in mapped.get(each.name, {}).items() if value}
-        if each.unit and own.get("unit"):
-            convert(1.0, each.unit, own["unit"])
-        attributes.append(replace(each, **own))
-    resolve = _resolver(attributes)
-    modules = {
-        str(key): _module(f"module {key} of {where}", section, resolve, [*sections])
-        for key, section in sections.items()
-    }
-    uses = {name: _used(module) for name, module in modules.items()}
-    for start in modules:
-        _refuse_circles(start, (), uses)
-    roots = [*(tree.get("ODD") or {})] or [
-        each for each in modules if not any(each in used for used in uses.values())
-    ]
-    active = tuple(each for each in roots if modules[each].active)
-    return OperationalDomain(name, tuple(attributes), modules, active, tree)
-
-
-def _module(where: str, section: object, resolve: Resolve, names: list[str]) -> Module:
-    if not isinstance(section, Mapping):
-        raise ValueError(f"{where} must be a mapping; got {section!r}")
-    words = [f"{verb}_{join}" for verb in ("INCLUDE", "EXCLUDE") for join in ("AND", "OR")]
-    check_names(f"entry of {where}", section, (*OF_MODULE, *words))
-    groups: dict[str, Group] = {}
-    for word in words:
-        if word in section:
-            verb = word[:7]
-            if verb in groups:
-                raise ValueError(
-                    f"{where} has {verb}_AND and {verb}_OR: take one, with a group in it"
-                )
-            every = word.endswith("AND")
-            groups[verb] = read_group(f"{where}, {word}", section[word], every, resolve, names)
-    active = section.get("ACTIVE", True) is not False
-    return Module(groups.get("INCLUDE"), groups.get("EXCLUDE"), active)
-
-
-def _attributes(above: tuple[str, ...], tree: object, where: str) -> Iterator[Attribute]:
-    if not isinstance(tree, Mapping):
-        raise ValueError(f"{where}: TAXONOMY maps names to kinds; got {tree!r}")
-    for key, value in tree.items():
-        names = (*above, str(key))
-        name = ".".join(names)
-        if isinstance(value, Mapping):
-            yield from _attributes(names, value, where)
-        elif isinstance(value, list) and value:
-            yield Attribute(name, "literal", tuple(map(_plain, value)))
-        elif isinstance(value, str) and value.split()[:1] and value.split()[0] in KINDS:
-            kind, measured = value.split()[0], value.split()[-1]
-            literals = ("false", "true") if kind == "boolean" else ()
-            yield Attribute(name, kind, literals, unit=UNIT_OF.get(measured, ""))
-        else:
-            raise ValueError(
-                f"{where}: {name} is a list of literals, or {', '.join(KINDS)} with what it "
-                f'measures, "float velocity"; got {value!r}'
-            )
-
-
-def _resolver(attributes: list[Attribute]) -> Resolve:
-    """Return what finds an attribute by its whole name, or by the end of it that is its own."""
-
-    def resolve(name: str) -> Attribute | None:
-        found = [a for a in attributes if a.name == name or a.name.endswith(f".{name}")]
-        exact = [each for each in found if each.name == name]
-        if len(found) > 1 and not exact:
-            names = ", ".join(each.name for each in found)
-            raise ValueError(f"{name!r} may be {names}: write it whole")
-        return (exact or found or [None])[0]
-
-    return resolve
-
-
-def _used(module: Module) -> set[str]:
-    return {each.module for each in module.conditions() if isinstance(each, Reference)}
-
-
-def _refuse_circles(name: str, above: tuple[str, ...], uses: Mapping[str, set[str]]) -> None:
-    if name in above:
-        raise ValueError(f"modules refer to each other in a circle: {' -> '.join([*above, name])}")
-    for other in uses[name]:
-        _refuse_circles(other, (*above, name), uses)
-
-
-def _mapping(path: Path) -> dict[str, Any]:
-    if not path.exists():
-        raise FileNotFoundError(f"there is no file of an operational design domain {path}")
-    documents.add(str(path.resolve()))
-    try:
-        whole = read_yaml(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is no YAML: {error}") from None
-    if not isinstance(whole, dict):
-        raise ValueError(f"{path} must be a mapping, TAXONOMY: ...; got {type(whole).__name__}")
-    return whole
-
-
-def _with_imports(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """Return a file of OpenODD together with those that it imports."""
-    if path in above:
-        raise ValueError(f"{path} imports itself")
-    whole = _mapping(path)
-    check_names(f"section of {path}", whole, SECTIONS)
-    tree: dict[str, Any] = {}
-    for name in _listed(whole.pop("IMPORT", None)):
-        tree = _joined(tree, _with_imports(path.parent / name, (*above, path)))
-    return _joined(tree, whole)
-
-
-def _listed(value: object) -> list[str]:
-    return [] if value is None else [*map(str, value)] if isinstance(value, list) else [str(value)]
-
-
-def _joined(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
-    """Return two trees as one; entries of the second go first."""
-    found = dict(one)
-    for key, value in other.items():
-        both = isinstance(value, Mapping) and isinstance(found.get(key), Mapping)
-        found[key] = _joined(found[key], value) if both else value
-    return found
-
-
-def _plain(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool | np.bool_) else str(value)

@@ -212,7 +212,8 @@ class Server:
                 env={**os.environ, "MPLBACKEND": "agg"},
             )  # fmt: skip
         except subprocess.TimeoutExpired:
-            raise Refused(f"it was ended after {self.seconds:zg} s; take a smaller budget") from None
+            text = f"it was ended after {self.seconds:zg} s; take a smaller budget"
+            raise Refused(text) from None
 
     def _fence(self, key: str, value: str) -> None:
         """Refuse a path outside of the folder, and a problem that is no file in it."""
@@ -282,9 +283,7 @@ def _line(number: object, **answer: object) -> str:
 @click.command()
 @click.option("--folder", type=click.Path(path_type=Path), default=".", help="Of the project.")
 @click.option("--budget", type=click.IntRange(1), default=100_000, help="Simulations of a call.")
-@click.option(
-    "--total", type=click.IntRange(1), default=1_000_000, help="Simulations in all."
-)
+@click.option("--total", type=click.IntRange(1), default=1_000_000, help="Simulations in all.")
 @click.option("--seconds", type=click.FloatRange(1), default=600.0, help="Seconds of a call.")
 def mcp(folder: Path, budget: int, total: int, seconds: float) -> None:
     """Serve an agent over standard input and output, by the Model Context Protocol.

@@ -22,7 +22,6 @@ from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator, Sent
 from verifai_jax.evaluation.kept_work import present
-from verifai_jax.evaluation.unfinished import Part, Unfinished
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
@@ -30,6 +29,7 @@ from verifai_jax.problem.problem import Problem
 if TYPE_CHECKING:
     from verifai_jax.core.executors import Executor
     from verifai_jax.evaluation.host_engine import HostEngine
+    from verifai_jax.evaluation.unfinished import Part
 
 EXACT = 2**24
 """Greatest integer up to which all integers are float32 numbers."""
@@ -267,7 +267,7 @@ class HeldKeys:
 
     def _block(self, points: Any, numbers: Any, temperature: float = 1.0) -> Verdicts:
         simulate = partial(self._simulated, points, numbers, temperature)
-        work: Unfinished | None = present()
+        work = present()
         if work is None:
             return simulate()
         if self._kept is None or self._kept.of is not work:

@@ -167,7 +167,7 @@ class Engine:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Decisions, known once it is compiled, that a user may not expect."""
+        """Decisions that a user may not expect, once the program is compiled."""
         return self.program.notes
 
     @property

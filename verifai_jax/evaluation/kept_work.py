@@ -4,12 +4,22 @@ work = present()                                    # an `Unfinished`; None if n
 """
 
 from contextvars import ContextVar
-from typing import Any
+from typing import Any, Protocol
 
-PRESENT: ContextVar[Any] = ContextVar("unfinished", default=None)
-"""The work; set by `evaluation.unfinished.keeping`, which a run imports only where it is used."""
+from verifai_jax.problem.problem import Problem
 
 
-def present() -> Any:
-    """Return the `Unfinished` work whose simulations are kept now, or None if there is none."""
+class KeptWork(Protocol):
+    """The part of an `evaluation.unfinished.Unfinished` that evaluators need."""
+
+    def part(self, problem: Problem, *mode: object) -> Any:
+        """Return the `Part` of the next evaluator."""
+
+
+PRESENT: ContextVar[KeptWork | None] = ContextVar("unfinished", default=None)
+"""The work; set by `evaluation.unfinished.keeping`."""
+
+
+def present() -> KeptWork | None:
+    """Return the work whose simulations are kept now, or None if there is none."""
     return PRESENT.get()

@@ -262,7 +262,10 @@ class Entries(NamedTuple):
     def take(self, value: PyTree, xp: Any) -> Float[Any, " count"]:
         """Return the numbers as a vector."""
         leaves = jax.tree.leaves(value)
-        taken = [xp.ravel(xp.asarray(leaves[i]))[np.asarray(index)] for i, index in self.parts]
+        taken = [xp.ravel(xp.asarray(leaves[i])) for i, _ in self.parts]
+        for at, (_, index) in enumerate(self.parts):
+            if index != tuple(range(taken[at].size)):
+                taken[at] = taken[at][np.asarray(index)]
         return taken[0] if len(taken) == 1 else xp.concatenate(taken)
 
     def put(self, value: PyTree, numbers: Float[Any, " count"], xp: Any) -> Any:

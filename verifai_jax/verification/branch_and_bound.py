@@ -20,6 +20,8 @@ from verifai_jax.verification.enclosure import TOGETHER, Enclosure
 
 REACH = 0.45
 """Where a box is sampled, as a share of its width from the middle: inside, not on its faces."""
+NO_INFLUENCE = 1e-6
+"""Change of the robustness along a coordinate, as a share of the greatest, that is no influence."""
 CANDIDATES = 4096
 """Failing points that are confirmed when the budget is spent, those of the largest boxes first."""
 
@@ -78,7 +80,8 @@ class BranchAndBound:
         if len(worth):
             bounds = self.enclosure(some.low[worth], some.high[worth])
             some.lowest[worth], some.highest[worth] = bounds.low, bounds.high
-            moves[worth] = bounds.moves
+            # Without bounds nothing is known of what moves: all coordinates count alike.
+            moves[worth] = np.where(bounds.moves.any(1, keepdims=True), bounds.moves, 1.0)
             state = np.where(bounds.holds, PROVED, np.where(bounds.high < 0, BROKEN, OPEN))
             # A box that the constraint cuts is split until it does so no more: its mass is unknown.
             state = np.where(bounds.inside, state, OPEN)
@@ -130,19 +133,21 @@ class BranchAndBound:
     ) -> Int[np.ndarray, " n"]:
         """Return the coordinate along which each box is to be split.
 
-        That is the one that changes the robustness most, or, as far as bounds are wider than what
-        simulations see, the one that moves the signals most, and with them what is not linear.
+        That is the one that changes the robustness most. As far as bounds are wider than what
+        simulations see, it is the widest one that changes it at all, or one that moves the signals,
+        and with them what is not linear, if it is at least half as wide.
         """
         # What counts most is that a point has a verdict, or is accepted, and its neighbour is not.
         values = np.where(np.isnan(robustness), 1e30, np.clip(robustness, -1e29, 1e29))
         middle, up, down = values[:, :1], values[:, 1::2], values[:, 2::2]
-        change = np.abs(up - down) + 2 * np.abs(up + down - 2 * middle)
+        change = _relative(np.abs(up - down) + 2 * np.abs(up + down - 2 * middle))
         seen = values.max(1) - values.min(1) + 1e-30
         wide = np.clip(some.highest - some.lowest, 1e-30, 1e29)
         loose = np.where(moves.any(1), np.clip(1 - seen / wide, 0, 1), 0)[:, None]
         # A coordinate without influence at these points may have one between them.
-        width = 0.1 * _relative(some.high - some.low)
-        score = (1 - loose) * _relative(change) + loose * _relative(moves) + width
+        width = _relative(some.high - some.low)
+        score = (1 - loose) * (change + 0.1 * width)
+        score += loose * (width * np.where(change > NO_INFLUENCE, 1.0, 0.1) + _relative(moves) / 2)
         return np.argmax(np.where(can, score, -1.0), axis=1)
 
     def confirm(self) -> None:
