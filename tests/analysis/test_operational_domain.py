@@ -159,16 +159,20 @@ def test_the_next_points_fill_what_is_empty(domain):
     assert len(whole.next_points(3)) == 0
 
 
-@pytest.mark.thorough
-def test_the_mass_is_that_of_the_prior(tmp_path):
+def wide():
     space = vj.FeatureSpace({"x": vj.TruncatedNormal(0, 1, -3, 3), "y": vj.Box(0.0, 2.0)})
-    odd = vj.odd_of(vj.FeatureSpace({"x": vj.Box(-1.0, 1.0), "y": vj.Box(0.0, 1.0)}), "part")
-    assert odd.is_box
 
     def system(features, key):
         return vj.Trace({"z": features["x"] * jnp.ones(2)}, dt=1.0)
 
-    run = vj.falsify(vj.Problem("p", space, system, "always z < 9"), "uniform", 12, progress=False)
+    return vj.Problem("p", space, system, "always z < 9")
+
+
+@pytest.mark.thorough
+def test_the_mass_is_that_of_the_prior():
+    odd = vj.odd_of(vj.FeatureSpace({"x": vj.Box(-1.0, 1.0), "y": vj.Box(0.0, 1.0)}), "part")
+    assert odd.is_box
+    run = vj.falsify(wide(), "uniform", 12, progress=False)
     found = odd.coverage(run, cells=4)
     assert found.prior_inside == pytest.approx(0.6827 / 0.9973 / 2, abs=0.01)
     kept = run.table.all.query("-1 <= x <= 1 and 0 <= y <= 1")
@@ -177,6 +181,12 @@ def test_the_mass_is_that_of_the_prior(tmp_path):
     assert found.table.loc["x", "volume"] == len(codes) / 4
     assert found.table.loc["x", "mass"] == pytest.approx(sum(share[c] for c in codes), abs=0.01)
     assert found.pairs.loc[("x", "y"), "cells"] == 16
+
+
+@pytest.mark.slow
+def test_a_report_says_what_is_covered(tmp_path):
+    odd = vj.odd_of(vj.FeatureSpace({"x": vj.Box(-1.0, 1.0)}), "part")
+    run = vj.falsify(wide(), "uniform", 12, progress=False)
     page = run.report(tmp_path / "r.html", odd=odd, studies=False, traces=0).read_text()
     assert "The operational design domain part" in page
     assert "are outside the domain, and not counted below" in page

@@ -517,8 +517,8 @@ def test_errors_say_what_to_do(circles, tmp_path):
         confirm(circles, safe)
     with pytest.raises(IndexError, match="row 999 is not in the table of 256 simulations"):
         confirm(circles, 999)
-    with pytest.raises(UnknownNameError, match="did you mean 'simulator'"):
-        confirm(circles, simulater="native")
+    with pytest.raises(UnknownNameError, match="did you mean 'engines'"):
+        confirm(circles, engine="native")
     with unchecked(), pytest.raises(TypeError, match="confirm needs a Run; got Problem"):
         confirm(circles.problem)
     circles.save(tmp_path / "run")

@@ -76,7 +76,7 @@ def test_without_a_compiler_it_has_the_source_alone(tmp_path, monkeypatch):
     def missing(*_):
         raise Unavailable("none")
 
-    monkeypatch.setattr(fmu_monitor, "library_file", missing)
+    monkeypatch.setattr(fmu_monitor, "compile_library", missing)
     file = vj.mtl.export_fmu("x > 0", DT, tmp_path / "x.fmu")
     assert zipfile.ZipFile(file).namelist() == ["modelDescription.xml", "sources/monitor.c"]
 

@@ -61,6 +61,16 @@ def test_a_rollout_carries_its_monitor():
     np.testing.assert_array_equal(values, expected)
 
 
+@pytest.mark.parametrize("formula", ["G[0,2] x > 0", "F[1,3] x > 1", "G[1,2] F[0,1] x > 0"])
+def test_a_number_of_samples_that_is_known_gives_the_same_value(formula):
+    monitor = online(formula, 1.0)
+    with jax.disable_jit():
+        state = monitor.init()
+        for count, x in enumerate((0.5, 2.0, -1.0, 3.0, 4.0, 0.2), start=1):
+            state = monitor.step(state, {"x": x})
+            assert monitor.finish(state, count) == monitor.finish(state)
+
+
 def test_the_interval_closes_as_soon_as_the_answer_is_known():
     monitor = online("F[0,1] (x > 0) & G[0,0.5] (x > -1)", 0.5)
     state = monitor.init()

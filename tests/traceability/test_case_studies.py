@@ -50,14 +50,19 @@ def trace(arguments: list[str]):
     return CliRunner().invoke(main, arguments)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param("infusion_pump", marks=pytest.mark.thorough),
-        pytest.param("cart_pole", marks=pytest.mark.slow),
-        pytest.param("tempe", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize("name", CHANGES)
+def test_each_requirement_has_a_formula_and_a_test(name, monkeypatch):
+    monkeypatch.chdir(CASES.parents[1])
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    words = commands(name)[-1]
+    asked = words[: words.index("--runs")]
+    done = trace([*asked, "--without", "runs", "--without", "reports", "--fail-on", "incomplete"])
+    assert done.exit_code == 0, done.output
+    assert "every link is there, and fits" in done.output
+
+
+@pytest.mark.slow  # Runs, estimates and pictures of a whole study.
+@pytest.mark.parametrize("name", CHANGES)
 def test_no_link_is_missing_and_a_change_touches_what_depends_on_it(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])

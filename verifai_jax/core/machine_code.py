@@ -28,15 +28,19 @@ class Unavailable(Exception):
 
 
 def compiler() -> Path:
-    """Return the compiler of this machine.
+    """Return the compiler of this machine, for a library that is kept.
 
     **Raises:** `Unavailable` where there is none, or no folder to keep what it makes.
     """
+    if cache_folder() is None:
+        raise Unavailable("the cache of compiled programs is switched off")
+    return _compiler()
+
+
+def _compiler() -> Path:
     found = next(filter(None, map(shutil.which, COMPILERS)), None) if os.name == "posix" else None
     if found is None:
         raise Unavailable("there is no C++ compiler: none of c++, g++, clang++ is in PATH")
-    if cache_folder() is None:
-        raise Unavailable("the cache of compiled programs is switched off")
     return Path(found).resolve()
 
 
@@ -57,7 +61,7 @@ def library_file(name: str, program: Callable[[], Program]) -> Path:
     try:
         folder = library_folder()
         path = next(filter(_is_whole, sorted(folder.glob(f"{name}-*.so"))), None)
-        return path or _compile(folder, name, *program())
+        return path or compile_library(folder, name, *program())
     except OSError as error:
         raise Unavailable(f"the cache of compiled programs cannot be used: {error}") from error
 
@@ -65,10 +69,11 @@ def library_file(name: str, program: Callable[[], Program]) -> Path:
 def library_folder() -> Path:
     """Return the folder of libraries, which only this user may write to.
 
-    **Raises:** `Unavailable` if others can write to it.
+    **Raises:** `Unavailable` if others can write to it, or if the cache is switched off.
     """
     base = cache_folder()
-    assert base is not None
+    if base is None:
+        raise Unavailable("the cache of compiled programs is switched off")
     folder = base / "native"
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     about = os.lstat(folder)
@@ -89,8 +94,12 @@ def _checksum(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()[:32]
 
 
-def _compile(folder: Path, name: str, source: str, flags: tuple[str, ...]) -> Path:
-    tool = compiler()
+def compile_library(folder: Path, name: str, source: str, flags: tuple[str, ...]) -> Path:
+    """Compile a library into a folder, and return its file, whose name ends in a checksum.
+
+    **Raises:** `Unavailable` where there is no compiler, or where it fails.
+    """
+    tool = _compiler()
     with tempfile.TemporaryDirectory(dir=folder) as cell:
         code, made = Path(cell) / "program.cpp", Path(cell) / "program.so"
         code.write_text(source)

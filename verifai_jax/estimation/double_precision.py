@@ -272,6 +272,7 @@ class HeldKeys:
             return simulate()
         if self._kept is None or self._kept.of is not work:
             self._kept = work.part(self.problem, *self._mode)
+            assert self._kept is not None
         return self._kept.recall_or(points, numbers, temperature, simulate)
 
     def _simulated(self, points: Any, numbers: Any, temperature: float) -> Verdicts:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from verifai_jax.evaluation.host_engine import HostEngine
     from verifai_jax.evaluation.journal import Journal
     from verifai_jax.evaluation.native_engine import NativeEngine
-    from verifai_jax.evaluation.unfinished import Part, Unfinished
+    from verifai_jax.evaluation.unfinished import Part
 
 
 NOT_NATIVE = (
@@ -235,7 +235,7 @@ class Evaluator:
 
     def part(self) -> "Part | None":
         """Return what is kept of work that goes on where an earlier process was killed, if any."""
-        work: Unfinished | None = None if self._keeps_traces else present()
+        work = None if self._keeps_traces else present()
         if work is not None and (self._kept is None or self._kept.of is not work):
             self._kept = work.part(self.problem, *self._mode)
         return None if work is None else self._kept

@@ -157,5 +157,5 @@ def _end_with(
     else:
         # Once every window is past nothing changes any more: all that came is enough.
         cells = jax.lax.cond(state.count > settling, lambda: state.cells, settled)
-    (value,), _ = advance(plan, now + settling, leaves, cells)
+    (value,), _ = advance(plan, jnp.asarray(now + settling), leaves, cells)
     return value

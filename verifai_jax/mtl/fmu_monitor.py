@@ -1,15 +1,17 @@
 """Monitors as FMUs of FMI 2 for co-simulation, for Simulink and other tools: `export_fmu`."""
 
+import contextlib
 import hashlib
 import re
 import sys
+import tempfile
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
 from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.machine_code import Unavailable, library_file
+from verifai_jax.core.machine_code import Unavailable, compile_library
 from verifai_jax.core.text import counted
 from verifai_jax.mtl.c_monitor import export_c
 from verifai_jax.mtl.formula import Formula
@@ -199,14 +201,15 @@ def export_fmu(
     guid = hashlib.sha256(source.encode()).hexdigest()[:32]
     source = source.replace("@guid", guid)
     target = "darwin64/monitor.dylib" if sys.platform == "darwin" else "linux64/monitor.so"
-    try:
-        binary = library_file(f"monitor-fmu-{guid}", lambda: (source, FLAGS))
-    except Unavailable:
-        binary = None
-    with replacing(path) as partial, zipfile.ZipFile(partial, "w") as archive:
+    with (
+        tempfile.TemporaryDirectory() as made,
+        replacing(path) as partial,
+        zipfile.ZipFile(partial, "w") as archive,
+    ):
         archive.writestr("modelDescription.xml", _description(path, guid, dt, inputs, outputs))
         archive.writestr("sources/monitor.c", source)
-        if binary is not None:
+        with contextlib.suppress(Unavailable):
+            binary = compile_library(Path(made), "monitor", source, FLAGS)
             archive.write(binary, f"binaries/{target}")
     return path
 
