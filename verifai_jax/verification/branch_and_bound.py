@@ -99,9 +99,14 @@ class BranchAndBound:
         kept[rows[split]] = False
         for name in ("state", "lowest", "highest", "witness", "confirmed"):
             getattr(self.boxes, name)[rows] = getattr(some, name)
-        along = self.influence(some, robustness, moves, can)
+        along, then = self.influence(some, robustness, moves, can)
         halves = some[split].halves(along[split], self.enclosure)
-        self.boxes = self.boxes[kept].with_more(halves)
+        # Halves of what has no bounds would have none either: another look would be in vain.
+        wild = np.zeros(len(some), bool)
+        wild[worth] = np.isinf(some.lowest[worth]) & np.isinf(some.highest[worth])
+        again = np.tile((wild & can[np.arange(len(some)), then] & (along != then))[split], 2)
+        quarters = halves[again].halves(np.tile(then[split], 2)[again], self.enclosure)
+        self.boxes = self.boxes[kept].with_more(halves[~again]).with_more(quarters)
 
     def star(self, some: Boxes) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
         """Simulate the middle of boxes, and both sides of it along each coordinate.
@@ -130,10 +135,10 @@ class BranchAndBound:
 
     def influence(
         self, some: Boxes, robustness: np.ndarray, moves: np.ndarray, can: np.ndarray
-    ) -> Int[np.ndarray, " n"]:
-        """Return the coordinate along which each box is to be split.
+    ) -> Int[np.ndarray, "2 n"]:
+        """Return the coordinate along which each box is to be split, and the next one.
 
-        That is the one that changes the robustness most. As far as bounds are wider than what
+        It is the one that changes the robustness most. As far as bounds are wider than what
         simulations see, it is the widest one that changes it at all, or one that moves the signals,
         and with them what is not linear, if it is at least half as wide.
         """
@@ -148,7 +153,8 @@ class BranchAndBound:
         width = _relative(some.high - some.low)
         score = (1 - loose) * (change + 0.1 * width)
         score += loose * (width * np.where(change > NO_INFLUENCE, 1.0, 0.1) + _relative(moves) / 2)
-        return np.argmax(np.where(can, score, -1.0), axis=1)
+        order = np.argsort(-np.where(can, score, -1.0), axis=1, kind="stable")
+        return order[:, [0, min(1, order.shape[1] - 1)]].T
 
     def confirm(self) -> None:
         """Find out which failing points of open boxes fail for certain."""
