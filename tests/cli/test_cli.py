@@ -17,6 +17,7 @@ from click.testing import CliRunner
 from verifai_jax.cli import arguments, doctor
 from verifai_jax.cli.doctor import TESTED, bad_pairs
 from verifai_jax.cli.main import main
+from verifai_jax.cli.next_folder import next_folder
 from verifai_jax.falsification.run_folder import load
 from verifai_jax.store.files import sealed
 
@@ -229,7 +230,7 @@ def test_commands_that_start_together_take_folders_of_their_own(tmp_path, monkey
 
     def take():
         ready.wait()
-        with arguments.next_folder("runs", "tiny") as folder:
+        with next_folder("runs", "tiny") as folder:
             (folder / "mine").write_text("")
             taken.append(folder.name)
 

@@ -13,6 +13,7 @@ from verifai_jax.cli import arguments
 from verifai_jax.cli.exit_codes import BROKEN, INTERRUPTED, CommandError
 from verifai_jax.cli.gates import RATE, Gate, check_gate, exceeds, fail_on
 from verifai_jax.cli.json_output import command, describe_run, give_result
+from verifai_jax.cli.next_folder import given_or_next
 
 if TYPE_CHECKING:
     from verifai_jax.falsification.run import Run
@@ -143,7 +144,7 @@ def falsify(
             name: given[name] for name in ("max_seconds", "stop_after", "progress", "keep_going")
         }
         with (
-            arguments.given_or_next(resume, "runs", "", goes_on),
+            given_or_next(resume, "runs", "", goes_on),
             arguments.on_cluster(cluster) as executor,
         ):
             run = falsification.resume(
@@ -164,7 +165,7 @@ def falsify(
         problem = arguments.load_problem(target, only)
         earlier = None if warm_start is None else arguments.read_run(warm_start)
         with (
-            arguments.given_or_next(folder, "runs", problem.name, goes_on) as path,
+            given_or_next(folder, "runs", problem.name, goes_on) as path,
             arguments.on_cluster(cluster) as executor,
         ):
             run = falsification.falsify(

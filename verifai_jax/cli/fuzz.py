@@ -10,6 +10,7 @@ from verifai_jax.cli import arguments
 from verifai_jax.cli.falsify import print_run
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result
+from verifai_jax.cli.next_folder import given_or_next
 
 
 @command()
@@ -47,7 +48,7 @@ def fuzz(
     problem = arguments.load_problem(target)
     ends = {"--max-seconds": options["max_seconds"], "--stop-after": options["stop_after"]}
     goes_on = partial(arguments.resuming, "falsify", target=target, options=ends)
-    with arguments.given_or_next(folder, "runs", problem.name, goes_on) as path:
+    with given_or_next(folder, "runs", problem.name, goes_on) as path:
         run = run_fuzz(problem, cells=chosen or None, folder=path, target=target, **options)
     print_run(run, pictures, ends)
     parts = [

@@ -8,6 +8,7 @@ from verifai_jax.cli import arguments
 from verifai_jax.cli.falsify import check_run, print_run
 from verifai_jax.cli.gates import Gate, fail_on
 from verifai_jax.cli.json_output import command
+from verifai_jax.cli.next_folder import given_or_next
 
 
 @command()
@@ -45,7 +46,7 @@ def merge(
             remedy="--problem specs/FILE.py:NAME",
         )
     problem = arguments.load_problem(target, only)
-    with arguments.given_or_next(folder, "runs", problem.name) as path:
+    with given_or_next(folder, "runs", problem.name) as path:
         run = merge_parts(folders, problem, folder=path, progress=progress)
     print_run(run, pictures)
     check_run(run, fail_on)

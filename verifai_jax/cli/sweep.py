@@ -12,6 +12,7 @@ from verifai_jax.cli import arguments
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, draw, give_result
+from verifai_jax.cli.next_folder import given_or_next
 
 if TYPE_CHECKING:
     from verifai_jax.sweeps.result import Sweep
@@ -123,7 +124,7 @@ def sweep(
     kept = cache_file(Path() if cache is None else cache.absolute())
     try:
         with (
-            arguments.given_or_next(folder, "sweeps", study.name, goes_on, kept) as path,
+            given_or_next(folder, "sweeps", study.name, goes_on, kept) as path,
             arguments.on_cluster(cluster) as executor,
         ):
             folder = path

@@ -1,12 +1,9 @@
 """The least departure from nominal that still fails: a counterexample made small.
 
-    small = shrink(run)                                 # from the worst row
     small = shrink(run, 17, by="distance", budget=5000)
-    print(small); small.features; small.replay().plot()
 
-As a property-testing library does with its failing example: first the count, then the distance
-(MacIver and Donaldson, Test-case reduction via test-case generation, ECOOP 2020), with batches,
-and with gradients where there are some.
+First the count, then the distance, in batches and along gradients (MacIver and Donaldson, Test-case
+reduction via test-case generation, ECOOP 2020).
 """
 
 import math

@@ -1,7 +1,6 @@
 """Runs: the checks and choices before the first simulation, of new runs and of resumed ones.
 
 run = falsify(problem, search="cross_entropy", budget=20_000, seed=0)
-run = falsify(problem, search=search.Gradient(patience=8), stop_after=10)
 run = resume(run, budget=50_000)
 """
 
@@ -103,9 +102,8 @@ def falsify(
 
     - `problem`: what to break.
     - `search`: a name (`verifai_jax.search.names()`), or a search with its options. `"auto"` is
-      `portfolio`, unless the system is a black box whose first two simulations take half a second
-      or longer: then it is one that spends arithmetic to save simulations, `trace_surrogate`. The
-      run's record says which; name it for the same table whatever the machine's speed.
+      `portfolio`, or `trace_surrogate`, which saves simulations, if the first two simulations of a
+      black box take half a second or longer. Name it for the same table on a machine of any speed.
     - `budget`: simulations at most; the last batch is cut to fit.
     - `batch`: simulations a round. Active searches learn once a round: a small batch spends
       fewer simulations, a large one less time. By default 1024, and for a search that learns at
@@ -119,7 +117,7 @@ def falsify(
     - `warm_start`: an earlier run or table with the same features, from which a search that learns
       starts. Its rows are not copied.
     - `folder`: where rows are kept on disk as they come; must not hold another run.
-    - `precision`: `"float32"` or `"float64"`, of simulations and verdicts.
+    - `precision`: of simulations and verdicts, `"float32"` or `"float64"`.
     - `backend`: the backend of a system that has several (`"mjx"`, `"native"`); the faster one that
       the search can use when left out, as measured here. Name it for the same table on every
       machine.
@@ -133,38 +131,30 @@ def falsify(
       failures that are far from each other (`search.Diverse`). True or `"inputs"`: in their
       inputs; `"behaviour"`: in what happens, that is the predicate that decides, when it does, and
       the shape of the trace.
-    - `objective`: what the search makes better: `"robustness"`, how badly the property breaks, or
-      `"likelihood"`, how probable a failure is under the features' distributions
-      (`search.Likeliest`, around `cross_entropy` where no search is named). `vj.shrink(run,
-      by="likelihood")` goes on to the likeliest failure, and `run.improbability()` says how likely
-      each is.
+    - `objective`: what the search makes better: `"robustness"`, or `"likelihood"`, how probable a
+      failure is under the features' distributions (`search.Likeliest`, around `cross_entropy` where
+      no search is named). `vj.shrink(run, by="likelihood")` goes on from there.
     - `first`: features that are simulated before the search proposes any, and told to it where it
       learns: as in `simulate`. They count in the budget, and the run then has no failure rate.
-    - `callbacks`: functions called after each round with the number of simulations and a dictionary
-      of plain numbers; `vj.CSVLogger` and `vj.TensorBoardLogger` are ready ones.
+    - `callbacks`: functions called after each round with the number of simulations and plain
+      numbers by name, such as `vj.CSVLogger` and `vj.TensorBoardLogger`.
     - `progress`: show a progress bar; by default on a terminal or in a notebook.
     - `target`: how the command line names the problem, for the record.
     - `executor`: whose workers simulate: Dask's `client.get_executor()`, `clusters.RayExecutor()`,
       a process pool, or anything else with `concurrent.futures`' `submit`. The table is the one of
       this machine alone, bit for bit, on workers with its kind of processor.
-    - `keep_going`: whether to simulate on where all of the first simulations raise. When left out
-      the run ends there with an error, after 16 that raise the same, or a first round of a system
-      that simulates many at once: an error of the problem would cost the whole budget.
+    - `keep_going`: whether to simulate on if all of the first simulations raise. Otherwise the run
+      ends with an error after 16 that raise the same, or after a first round of many at once.
     - `engine`: `"xla"`, or `"native"`: rows from the 513th on are simulated by vector code that
       the machine's own C++ compiler makes of the problem, two to five times as fast where no
-      large network is in the loop. It agrees with XLA up to rounding, and XLA decides what is near
-      to zero. `"auto"` takes it if the budget is worth the compilation, which the run records. What
-      cannot be translated (other precisions, unusual operations) is simulated by XLA, and the notes
-      say why.
-    - `cheap`: a cheap model of the same features. It is searched first, with 20 times the budget;
-      at most a quarter of the budget is then spent on what it found, the gravest first and no two
-      alike, from which the search goes on. Only `problem` decides what fails.
-    - `proved`: what `verify` found of this problem, or the file of it. What it proved is not
-      simulated, and the run is of the rest: `proved.rest(problem)`, with which it is resumed from a
-      folder.
+      large network is in the loop. It agrees with XLA up to rounding; XLA decides what is near to
+      zero, and simulates what cannot be translated. `"auto"` takes it if the budget is worth it.
+    - `cheap`: a cheap model of the same features, searched first with 20 times the budget. At
+      most a quarter of the budget is spent on what it found. Only `problem` decides what fails.
+    - `proved`: what `verify` found of this problem, or its file. The run is of the rest, and is
+      resumed with it: `proved.rest(problem)`.
 
-    Ctrl-C ends the run and returns what is finished. What is likely a mistake of the problem is in
-    the run's `notes`, and above the progress bar.
+    Ctrl-C ends the run and returns what is finished. Likely mistakes of the problem are in `notes`.
 
     **Returns:** the run: its table, its statistics, and replays of its rows.
 

@@ -52,10 +52,8 @@ class Run(InNotebook):
       into the table. What is left is that of callbacks and checkpoints.
     - `version`: the version of verifai_jax.
     - `prior`: whether the rows are independent samples of the feature space.
-    - `origin`: where the rows come from, and why they are no such samples: `"first"` (rows that
-      were given came first), `"given"` (all rows were), `"sequence"` (the points of a sequence that
-      spreads them), `"coverage"` and `"learned"` (a search that goes where coverage grows, or where
-      failures are); empty in a record that does not say.
+    - `origin`: why the rows are no such samples: `"first"` (given rows came first), `"given"` (all
+      were given), `"sequence"` (of points that spread), `"coverage"`, `"learned"` (by the search).
     - `folder`: on disk; None for a run in memory.
     - `target`: the problem's name on the command line.
     - `problem`: None for a run that was loaded without it.

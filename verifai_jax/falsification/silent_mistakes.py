@@ -81,9 +81,7 @@ def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
         # One of its own: the journal of the run keeps rows of its table only.
         monitor = engine.monitor if isinstance(engine, HostEngine) else None
         engine = HostEngine(problem, engine.precision, monitor=monitor)
-    elif (
-        not is_quick(problem) or _samples(problem, cast(Engine, engine).layout.padded) > MAX_SAMPLES
-    ):
+    elif not is_quick(problem) or _samples(problem, cast(Engine, engine).padded) > MAX_SAMPLES:
         return ()
     space = problem.space
     nominal = space.completed(problem.nominal or {})

@@ -39,10 +39,8 @@ def usual_batch(
 ) -> int:
     """Return the default batch: twenty rounds or more for a search that learns.
 
-    A power of two, so that shapes are few.
-
-    One that stops at few counterexamples gets small batches: it is likely to end in its first.
-    Where it does not learn it has some five hundred to a thousand rounds at most.
+    A power of two, so that shapes are few; small for one that stops at few counterexamples, which
+    is likely to end in its first. Where it does not learn it has at most a thousand rounds.
 
     **Arguments:**
 

@@ -4,9 +4,6 @@
     DiscreteBox(1, 4), DiscreteBox([0, 0], [3, 5])      # box.py: an integer, a vector of two
     Categorical("ppo", "sac"), Constant(9.8)            # choice.py
     Array(Struct({"x": Box(0, 50), "v": Box(0, 20)}), length=3)             # compound.py, arrays.py
-    Array(Box(0, 50), length=(1, 3))                                        # arrays.py
-    Normal(0, 1), TruncatedNormal(0, 1, -2, 2), LogUniform(0.05, 0.5)       # distributions.py
-    Signal(Box(-1, 1), knots=16, hold="linear")                             # signal.py
     Automaton("idle", {("idle", "gust"): dict(wait=Box(1, 5))}, max_events=3)     # automaton.py
 
 The unit cube is the probability space: uniform coordinates give the prior on the values.

@@ -3,7 +3,6 @@
     x, theta = signal("x"), signal("theta")
     always((abs(x) <= 2.4) & (theta.abs() <= 0.2095), 0, 4)
     (x > 1).until(signal("y") >= 0, 0.2, 0.6)
-    ~(x > 1) >> eventually(x < 0, 0, 2)
 
 A formula is a frozen tree, hashable and equal by value, so it is a static argument under `jax.jit`.
 Sugar (implication, equivalence, weak until, release) is rewritten into the few nodes below when it

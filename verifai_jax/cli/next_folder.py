@@ -1,0 +1,60 @@
+"""The folder into which a command writes: the one that was given, or the next of several."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+
+@contextlib.contextmanager
+def given_or_next(
+    folder: Path | None,
+    parent: str,
+    name: str,
+    goes_on: Callable[[Path], str] | None = None,
+    record: str | Path = "run.json",
+) -> Iterator[Path]:
+    """Return the folder that was given, or else the next one, as `next_folder` makes it.
+
+    **Arguments:**
+
+    - `goes_on`: writes the command that goes on with the folder, which is said for those who kill
+      this one.
+    - `record`: file that the folder has from when on that is possible.
+    """
+    from verifai_jax.core.progress import goes_on_with
+
+    with contextlib.ExitStack() as held:
+        path = held.enter_context(next_folder(parent, name)) if folder is None else folder
+        if goes_on is not None:
+            held.enter_context(goes_on_with(goes_on(path), (path / record).is_file))
+        yield path
+
+
+@contextlib.contextmanager
+def next_folder(parent: str, name: str) -> Iterator[Path]:
+    """Make the first of parent/NAME-1, parent/NAME-2, ... that is missing, for this process alone.
+
+    A command that ends without a file in it removes it.
+    """
+    from verifai_jax.core.text import folder_name
+    from verifai_jax.store.locks import writing
+
+    name, number, first = folder_name(name), 1, not Path(parent).exists()
+    while True:
+        folder = Path(parent) / f"{name}-{number}"
+        try:
+            with writing(folder):
+                folder.mkdir(parents=True)
+            break
+        except ValueError as error:
+            # Another command may have made it since one looked; making it decides.
+            if not isinstance(error.__cause__, FileExistsError) or not folder.parent.is_dir():
+                raise
+            number += 1
+    try:
+        yield folder
+    finally:
+        with contextlib.suppress(OSError):
+            folder.rmdir()
+            if first:
+                folder.parent.rmdir()
