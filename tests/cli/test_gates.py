@@ -66,7 +66,11 @@ def test_every_command_has_json():
     groups = [command.commands for command in COMMANDS if isinstance(command, click.Group)]
     single = [command for command in COMMANDS if not isinstance(command, click.Group)]
     inner = [command for group in groups for command in group.values()]
-    assert all(isinstance(command, ReportingCommand) for command in single + inner)
+    # What `mcp` writes is JSON anyway, message by message.
+    plain = {
+        command.name for command in single + inner if not isinstance(command, ReportingCommand)
+    }
+    assert plain == {"mcp"}
 
 
 def test_values_as_plain_data():
