@@ -67,7 +67,7 @@ def test_added_items_are_counted_and_listed_wherever_they_are(tmp_path):
     assert not any("nan" in text for text in drawn)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_items_that_go_count_once():
     small = shrunk("always many > 1", [])
     assert small.changed == {"cars.length": (2, 1)}

@@ -29,7 +29,7 @@ def found():
     return vj.modes(problem, budget=20_000, progress=False)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_two_half_planes_with_noise_are_two_modes_with_their_probabilities(found):
     assert len(found) == 2
     assert found.simulations <= 20_000
@@ -42,7 +42,7 @@ def test_two_half_planes_with_noise_are_two_modes_with_their_probabilities(found
     assert any("mode.random_key" in note for note in found.notes)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_a_mode_hands_out_fails_again(found):
     for mode, changed in zip(found, "xy", strict=True):
         again = mode.replay()
@@ -84,7 +84,7 @@ def test_with_chance_of_its_own_modes_say_how_often_a_point_fails_within_the_bud
     assert "so each point fails with a probability" in str(found)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("budget", [1000, 2600])
 def test_what_fails_now_and_then_is_one_mode_with_its_probability(budget):
     count = [0]

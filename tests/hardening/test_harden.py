@@ -189,7 +189,7 @@ def test_it_is_shown_and_saved(whole, tmp_path):
     np.testing.assert_array_equal(loaded.act(observed), result.policy.act(observed))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_function_that_trains_gets_where_its_episodes_begin(tmp_path):
     trainer = Trainer(
         by_starts, example=lambda observation: jnp.zeros(1), observation=np.zeros(1), workers=1

@@ -28,6 +28,7 @@ def test_the_tightest_bound_that_no_search_breaks(problem):
     assert "found by search, no proof" in mined.summary()
 
 
+@pytest.mark.slow
 def test_a_simulation_that_tells_two_readings_apart(problem):
     found = mtl.distinguish("always x > 3", "eventually[0, 0.5] x < 4.5", problem, budget=500)
     assert found.holds in [(True, False), (False, True)]

@@ -139,7 +139,7 @@ def test_explores_for_ever_and_more_when_it_leads_nowhere():
         assert abs(int(state.explored) / 200 - share) < 0.03
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("batch", [1, 48])
 @pytest.mark.parametrize("search", [SMALL, IMPROVEMENT], ids=["thompson", "improvement"])
 def test_small_and_large_batches(search, batch):

@@ -47,13 +47,14 @@ REFUSED = {
 
 
 # These take seconds to compile for each cube; what is continuous alone is so in the wide one.
-LARGE = ("Bayes", "Portfolio", "CMAES", "TuRBO", "TraceSurrogate")
+LARGE = ("Bayes", "CMAES", "TuRBO", "TraceSurrogate")
+QUICK = ("empty", "mixed")
 EACH = [
     pytest.param(
         search,
         cube,
         id=f"{search!r}-{name}",
-        marks=pytest.mark.thorough if type(search).__name__ in LARGE and name != "empty" else (),
+        marks=pytest.mark.slow if type(search).__name__ in LARGE and name not in QUICK else (),
     )
     for search in SEARCHES
     for name, cube in CUBES.items()

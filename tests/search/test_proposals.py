@@ -44,7 +44,7 @@ def play(proposals, rounds, gradient):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.thorough if name in LARGE else ())
+        pytest.param(name, marks=pytest.mark.slow if name in LARGE else ())
         for name in names()
         if name != "grid"
     ],

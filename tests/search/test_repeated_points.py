@@ -101,7 +101,7 @@ def test_verifais_test_of_bayesian_optimization_by_the_default_search():
     assert found >= 9
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_resumed_it_remembers_the_points_of_the_process_before(tmp_path):
     bowl = problem(1, -50)
     whole = vj.falsify(bowl, budget=60, batch=4, seed=1).table.all

@@ -94,7 +94,7 @@ def test_the_key_decides_only_if_scrambled():
     np.testing.assert_array_equal(points(plain, 2, 8, 0), points(plain, 2, 8, 1))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_contract_of_searches_holds():
     for cube in (Cube(()), Cube((0,) * 200)):
         check_search(Sobol(), cube)
