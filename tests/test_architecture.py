@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "verifai_jax"
 
@@ -195,6 +197,7 @@ def asked_of(source: str, room: str, kinds: set[str]) -> list[str]:
     return asked
 
 
+@pytest.mark.thorough
 def test_nobody_outside_of_its_room_asks_for_the_class_of_a_formula_a_domain_or_a_search():
     wrong = []
     for room, bases in KINDS.items():

@@ -134,6 +134,7 @@ def test_what_cannot_work_is_refused_with_the_reason():
         coverage(judged(x=[1.0, 2.0]), cells=1)
 
 
+@pytest.mark.thorough
 def test_pictures_are_drawn_and_written(tmp_path):
     from PIL import Image
 

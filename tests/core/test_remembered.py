@@ -182,6 +182,7 @@ def test_a_search_is_the_same_recalled(folder, monkeypatch, search):
         assert first.equals(other)
 
 
+@pytest.mark.thorough
 def test_gradients_begin_first_where_they_are_recalled(folder):
     def begun():
         engine = Engine(falling(), 4, gradient=True, clauses=True)

@@ -108,6 +108,7 @@ def test_what_cannot_fail_gets_a_bound_and_no_estimate():
     assert answer.high == pytest.approx(1 - 0.05 ** (1 / answer.prior.simulations), rel=1e-6)
 
 
+@pytest.mark.thorough
 def test_boolean_robustness_has_no_slope_and_is_counted():
     answer, _ = answered(lambda u: np.where(u[:, 0] < 3e-4, -1.0, 1.0), 1, 30_000, seed=1)
     assert answer.probability is None or answer.low < 3e-4 < answer.high

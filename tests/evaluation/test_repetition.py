@@ -91,6 +91,7 @@ def test_a_counter_in_a_file_is_memory_too(tmp_path):
     assert of_run == of_confirm
 
 
+@pytest.mark.thorough
 def test_a_deterministic_system_is_confirmed_and_costs_little():
     steady = Counter(lambda a, count: a - 0.5)
     run = falsified(steady, 40)

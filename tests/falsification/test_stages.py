@@ -37,6 +37,7 @@ def safe():
     return vj.falsify(problem(-1.0), budget=8 * BATCH, batch=BATCH, confirm=False)
 
 
+@pytest.mark.thorough
 def test_descents_join_when_no_failure_comes(safe):
     differentiated = safe.table.all["differentiated"].to_numpy()
     assert not differentiated[: PATIENT * BATCH].any()
@@ -46,6 +47,7 @@ def test_descents_join_when_no_failure_comes(safe):
     assert (first["x"], first["y"]) == (0.5, 0.5)
 
 
+@pytest.mark.thorough
 def test_small_rounds_begin_with_descents():
     run = vj.falsify(problem(-1.0), budget=MANY, batch=MANY, confirm=False)
     assert run.table.all["differentiated"].iloc[0]

@@ -78,6 +78,7 @@ def test_a_question_is_plain_data_that_says_what_is_known():
     assert any("2 from 2 questions" in note for note in run.notes)
 
 
+@pytest.mark.thorough
 def test_what_cannot_be_simulated_is_left_out_and_said():
     questions = []
 

@@ -158,6 +158,7 @@ def test_one_of_six_proposals_is_the_guess_of_the_model_whatever_the_batch(monke
 
 
 class TestDefault:
+    @pytest.mark.thorough
     def test_quick_black_boxes_have_the_portfolio(self):
         calls = []
 

@@ -97,6 +97,7 @@ def test_observations_are_scaled_clipped_and_stacked():
     np.testing.assert_allclose(seen, [2, 2, 3, 3, 4, 4])
 
 
+@pytest.mark.thorough
 def test_weights_are_a_pytree_with_gradients_and_in_double_precision():
     loaded = policy(FILES / "ppo.zip")
     observation = jnp.array([0.1, 0.2, -0.3, 0.4])

@@ -41,6 +41,7 @@ def test_continuous_as_verifai():
     np.testing.assert_allclose(np.array(seen)[:, 0], expected, atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_discrete_as_verifai():
     # Conformance case ce-03: DiscreteBox((2, 5)) has a bin for each integer.
     feedback = [(3, -1.0), (5, -1.0), (2, 1.0)]

@@ -51,6 +51,7 @@ def test_least_against_a_linear_program(seed, count):
     assert value <= np.max(clauses[:count]) + 1e-4
 
 
+@pytest.mark.thorough
 def test_boxes_of_all_rows_that_are_simulated():
     """In large batches only the first rows are simulated: each lies in its descent's box."""
     search, cube, batch = Gradient(), Cube((0,) * D), 256

@@ -49,6 +49,7 @@ def test_the_deciding_instant_is_that_of_explain(text):
         assert value == signals["xy".index(name)][round(why.time / 0.25)]
 
 
+@pytest.mark.thorough
 def test_an_outcome_by_hand():
     def system(f, key):
         time = jnp.arange(16.0)
@@ -81,6 +82,7 @@ def test_an_outcome_by_hand():
     assert (few[1], few[2], few[2 + SEGMENTS - 1]) == (1, 0, 3)
 
 
+@pytest.mark.thorough
 def test_how_unlike_outcomes_are():
     one = np.zeros(OUTCOME, np.float32)
     other_predicate, later, steeper, unknown = (one.copy() for _ in range(4))

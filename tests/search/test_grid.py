@@ -32,6 +32,7 @@ def whole(search, cube, batch=7):
     return points
 
 
+@pytest.mark.thorough
 def test_orders_are_permutations():
     run = jax.jit(permuted, static_argnums=1)
     for total in (1, 2, 3, 5, 7, 12, 441, 10_201):
@@ -112,6 +113,7 @@ def test_large_indices_are_exact():
     assert search.ask(after, cube, 8)[1].index == total
 
 
+@pytest.mark.thorough
 def test_a_grid_counts_its_points():
     assert Grid().total(Cube((0, 0, 4))) == 21 * 21 * 4
     assert Grid().total(Cube(())) == 1

@@ -109,6 +109,7 @@ def shares(**changes):
     return float(descent._share(state._replace(**changes)))
 
 
+@pytest.mark.thorough
 def test_shares_follow_the_evidence():
     most, least = descent.MAX_SHARE, descent.MIN_SHARE
     assert shares() == pytest.approx(most / 4)

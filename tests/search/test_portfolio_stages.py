@@ -122,6 +122,7 @@ def test_a_failure_ends_the_count_of_barren_rounds():
     assert int(state.barren) == 128
 
 
+@pytest.mark.thorough
 def test_suggested_starts_are_descended_from_at_once():
     state, batch = begin(4), MANY + 1
     told = portfolio.Observations(jnp.full((4, 3), 0.25), jnp.full(4, 0.5), jnp.ones(4, bool))

@@ -133,6 +133,7 @@ class TestUniform:
         assert len(np.unique(u)) > 1990
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("dim", [0, 1, 5, 40])
 def test_halton_points_are_the_same_in_a_loop_and_written_out(dim, monkeypatch):
     index = np.arange(64, dtype=np.uint32) * 977_771 + 1

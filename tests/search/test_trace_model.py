@@ -33,6 +33,7 @@ def data():
     return jnp.asarray(x, jnp.float32), jnp.asarray(coefficients, jnp.float32), jnp.asarray(mask)
 
 
+@pytest.mark.thorough
 def test_short_lengths_and_near_rows_leave_a_finite_model_that_can_be_fitted():
     """In 32 bits squares of points have no digits left for the distance of neighbours."""
     rng = np.random.default_rng(0)
@@ -160,6 +161,7 @@ def test_components_give_back_the_traces():
     assert models.principal_components(traces[:2])[1].shape == (models.COMPONENTS, 200)
 
 
+@pytest.mark.thorough
 def test_a_wider_draw_is_as_much_farther_from_the_mean(data):
     x, coefficients, mask = data
     hyper = models.first_hyper(WIDTH)

@@ -107,6 +107,7 @@ def test_two_searches_want_what_either_does_in_the_smaller_rounds():
     assert both == Wants(coverage_ids=True, no_verdict_rows=True, max_batch=16)
 
 
+@pytest.mark.thorough
 def test_parts_of_a_space_get_what_each_wants():
     class Noting(Search):
         seen: ClassVar[list[Observations]] = []

@@ -121,6 +121,7 @@ def test_trainings_on_workers_give_the_same_table(halving):
     same_tables(here, there)
 
 
+@pytest.mark.thorough
 def test_nominal_returns_are_those_of_the_task_itself():
     # The reset is not random: one episode says all.
     study = drifting({"rate": vj.LogUniform(0.01, 1.0), "reward_scale": vj.Box(1.0, 9.0)})

@@ -120,6 +120,7 @@ def python_controller(time, state, features):
 class TestControllersInPython:
     SPACE = vj.FeatureSpace({"k": vj.Box(0, 2)})
 
+    @pytest.mark.thorough
     def test_native_calls_them_and_says_so(self):
         system = cart(controller=python_controller, backend="native", keyframe=0)
         problem = vj.Problem("cart", self.SPACE, system, "always x < 0.505")
