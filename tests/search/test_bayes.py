@@ -83,7 +83,7 @@ def test_the_same_robustness_everywhere_gives_the_prior(value, valid):
     np.testing.assert_allclose(u, expected, atol=1e-6)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_space_of_few_points_is_searched_through():
     # Eleven of twelve choices are tried before any is tried again, but for exploration.
     cube = Cube((4, 3), ordered=(False, False))
@@ -98,7 +98,7 @@ def test_a_space_of_few_points_is_searched_through():
     assert int(state.verdicts) == 32
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_huge_values_do_not_hide_the_others():
     # The process sees a bowl whether or not a far part of it is enormous.
     def rho(u):
@@ -127,7 +127,7 @@ def test_what_is_kept():
     assert set(times.tolist()) == {0, 1, 2, 3}
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_explores_for_ever_and_more_when_it_leads_nowhere():
     cube, search = Cube((0, 0)), Bayes(capacity=32, candidates=32)
     ask, _ = jitted(search)
