@@ -10,6 +10,7 @@ with 1 if a figure is off.
 
 import argparse
 import re
+import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -128,6 +129,17 @@ def rare() -> float:
     return float(vj.falsify(problem, stop_after=1, progress=False).simulations)
 
 
+def rare_median() -> float:
+    """Return the median of simulations up to that failure, over 50 seeds."""
+    from specs.cartpole import rare as problem
+
+    def first(seed: int) -> int:
+        run = vj.falsify(problem, stop_after=1, seed=seed, confirm=False, progress=False)
+        return int(run.table.counterexamples.index[0]) + 1
+
+    return statistics.median(map(first, range(50)))
+
+
 def shrunk() -> float:
     """Count the features away from nominal that are enough for it."""
     from specs.cartpole import rare as problem
@@ -167,6 +179,7 @@ MEASURES: dict[str, Callable[[], float]] = {
     "balance": balance,
     "balance_confirmed": balance_confirmed,
     "rare": rare,
+    "rare_median": rare_median,
     "shrunk": shrunk,
     "rules_covered": rules_covered,
     "rules_precision": rules_precision,
