@@ -140,6 +140,13 @@ def enclosed(tree: Expression, low: np.ndarray, high: np.ndarray) -> tuple[np.nd
     return tuple(np.broadcast_to(end, len(low)) for end in ends)
 
 
+def _xla_fails(tree: Expression, drawn: np.ndarray) -> np.ndarray:
+    """Return at which points XLA gives NaN for arcs of subnormal numbers, as JAX 0.12's does."""
+    subnormal = (drawn != 0) & (np.abs(drawn) < np.finfo(np.float32).tiny)
+    arcs = any(name in str(tree) for name in ("asin", "atan"))
+    return subnormal.any(axis=0) & (arcs and bool(jnp.isnan(jnp.arctan(np.float32(1e-39)))))
+
+
 def escapes(tree: Expression, low: np.ndarray, high: np.ndarray, drawn: np.ndarray) -> list[str]:
     """Return which values lie outside of their bounds, as sentences."""
     least, greatest = enclosed(tree, low, high)
@@ -151,7 +158,7 @@ def escapes(tree: Expression, low: np.ndarray, high: np.ndarray, drawn: np.ndarr
         known = (least > -np.inf) | (greatest < np.inf)
         wrong = (values < least[:, None]) | (values > greatest[:, None])
         if kind == "float32":
-            wrong |= np.isnan(values) & known[:, None]
+            wrong |= np.isnan(values) & known[:, None] & ~_xla_fails(tree, drawn)
             wrong |= np.isinf(values) & ~np.where(
                 values > 0, np.isinf(greatest)[:, None], np.isinf(least)[:, None]
             )
