@@ -27,6 +27,8 @@ DRAWN = 2**15
 """Points of the domain, and of the prior, by which shares are measured: to half a percent."""
 MAX_VALUES = 20
 """Values of an integer up to which each is a cell of its own."""
+MAX_CELLS = 2**30
+"""Cells of an attribute at most, for which a pair of cells is one number."""
 CANDIDATES = 4096
 """Points of the domain among which the next ones are chosen."""
 
@@ -238,5 +240,5 @@ def _keys(codes: Codes, names: tuple[str, ...]) -> Int[np.ndarray, " n"]:
         return np.array([], int)
     found, lost = np.zeros(len(codes[names[0]]), int), np.zeros(len(codes[names[0]]), bool)
     for name in names:
-        found, lost = found * 1000 + codes[name], lost | (codes[name] < 0)
+        found, lost = found * MAX_CELLS + codes[name], lost | (codes[name] < 0)
     return np.where(lost, -1, found)

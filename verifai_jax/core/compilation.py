@@ -77,7 +77,7 @@ class Compilation:
         self._how: tuple[XlaOptimization, bool, bool] = effort, splits, wide
         self._lowered: jax.stages.Lowered | None = lowered
         self._future: Future[jax.stages.Compiled] = _pool().submit(
-            _compiled, name, lowered, effort, splits, wide
+            _compiled, name, lowered, *self._how
         )
         self._program: jax.stages.Compiled | None = None
 

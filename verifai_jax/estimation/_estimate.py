@@ -171,7 +171,7 @@ def estimate(
             uniform=simulated.uniform,
             draws=depends_on_key(choice.problem),
             one_by_one=choice.problem.black_box and executor is None,
-            workers=getattr(choice.problem.system, "workers", 1),
+            workers=choice.problem.system.workers,
             rest=rest,
         )
         slow = simulations_are == "slow" or cheap is not None

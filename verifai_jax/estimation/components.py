@@ -12,6 +12,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
+from verifai_jax.estimation.normal_space import to_normal_space
+
 
 @runtime_checkable
 class Component(Protocol):
@@ -187,12 +189,12 @@ def radial_score(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
 
 def _between(low: np.ndarray, high: np.ndarray, uniform: np.ndarray) -> np.ndarray:
     """Return standard normal numbers between two borders, exact in both tails."""
-    from scipy.special import ndtr, ndtri
+    from scipy.special import ndtr
 
     mirrored = low > 0
     a, b = np.where(mirrored, -high, low), np.where(mirrored, -low, high)
     rank = np.where(mirrored, 1 - uniform, uniform)  # It must still grow with the result.
-    z = ndtri(np.clip(ndtr(a) + rank * (ndtr(b) - ndtr(a)), 1e-300, 1 - 1e-16))
+    z = to_normal_space(ndtr(a) + rank * (ndtr(b) - ndtr(a)))
     return np.where(mirrored, -z, z)
 
 

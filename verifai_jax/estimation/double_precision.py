@@ -21,7 +21,7 @@ from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator, Sent
-from verifai_jax.evaluation.kept_work import present
+from verifai_jax.evaluation.kept_work import present_part
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
@@ -267,13 +267,10 @@ class HeldKeys:
 
     def _block(self, points: Any, numbers: Any, temperature: float = 1.0) -> Verdicts:
         simulate = partial(self._simulated, points, numbers, temperature)
-        work = present()
-        if work is None:
+        self._kept = kept = present_part(self._kept, self.problem, *self._mode)
+        if kept is None:
             return simulate()
-        if self._kept is None or self._kept.of is not work:
-            self._kept = work.part(self.problem, *self._mode)
-            assert self._kept is not None
-        return self._kept.recall_or(points, numbers, temperature, simulate)
+        return kept.recall_or(points, numbers, temperature, simulate)
 
     def _simulated(self, points: Any, numbers: Any, temperature: float) -> Verdicts:
         count, size = len(points), self.batch

@@ -199,9 +199,7 @@ class LimitState:
         """Draw points of the prior, or of its rest, whatever the constraint says of them."""
         if self.rest is None:
             return rng.standard_normal((n, self.dim))
-        from scipy.special import ndtri
-
-        return ndtri(np.clip(self.rest.draw(rng, n), 1e-300, 1 - 1e-16))
+        return to_normal_space(self.rest.draw(rng, n))
 
     def __call__(self, z: Float[np.ndarray, "n d"]) -> Scores:
         """Simulate points of normal space.
@@ -342,6 +340,13 @@ def to_unit_cube(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
     from scipy.special import ndtr
 
     return ndtr(z)
+
+
+def to_normal_space(u: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Map probabilities to standard normal numbers, which are finite at 0 and 1, too."""
+    from scipy.special import ndtri
+
+    return ndtri(np.clip(u, 1e-300, 1 - 1e-16))
 
 
 def scores_of(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:

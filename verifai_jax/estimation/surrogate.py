@@ -32,7 +32,7 @@ from verifai_jax.estimation.gaussian_surrogate import CHUNK, Surrogate
 from verifai_jax.estimation.importance import ImportanceSamples
 from verifai_jax.estimation.mixture import Mixture
 from verifai_jax.estimation.monte_carlo import Counts
-from verifai_jax.estimation.normal_space import Begun, Ended, LimitState
+from verifai_jax.estimation.normal_space import Begun, Ended, LimitState, to_normal_space
 from verifai_jax.estimation.splitting import SplittingRun, run_splitting
 
 FAR = 3.5
@@ -213,12 +213,11 @@ def _given(covariance: Float[np.ndarray, "n n"], count: int) -> Float[np.ndarray
 
 def _state_of(limit_state: LimitState, surrogate: Surrogate, caution: float) -> LimitState:
     """Return the surrogate as a limit state, at which nothing is simulated."""
-    from scipy.special import ndtri
 
     def evaluate(
         u: Float[np.ndarray, "n d"],
     ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-        z = ndtri(np.clip(u, 1e-300, 1 - 1e-16))
+        z = to_normal_space(u)
         mean, std = surrogate.predict(z)
         rho = mean - caution * std
         return rho, rho < 0, np.ones(len(rho), bool)

@@ -20,7 +20,7 @@ from verifai_jax.core.programs import power_of_two
 from verifai_jax.core.progress import count_done
 from verifai_jax.evaluation.engine import Engine, Wanted, engine_for
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
-from verifai_jax.evaluation.kept_work import present
+from verifai_jax.evaluation.kept_work import present_part
 from verifai_jax.evaluation.raising import ALIKE, Raising
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
@@ -235,10 +235,10 @@ class Evaluator:
 
     def part(self) -> "Part | None":
         """Return what is kept of work that goes on where an earlier process was killed, if any."""
-        work = None if self._keeps_traces else present()
-        if work is not None and (self._kept is None or self._kept.of is not work):
-            self._kept = work.part(self.problem, *self._mode)
-        return None if work is None else self._kept
+        if self._keeps_traces:
+            return None
+        self._kept = present_part(self._kept, self.problem, *self._mode)
+        return self._kept
 
     def begin(
         self,

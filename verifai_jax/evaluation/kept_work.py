@@ -1,6 +1,6 @@
 """The work that evaluators of this process are part of, while its simulations are kept in a folder.
 
-work = present()                                    # an `Unfinished`; None if nothing is kept
+kept = present_part(kept, problem, "float32", 0)    # a `Part`; None if nothing is kept
 """
 
 from contextvars import ContextVar
@@ -23,3 +23,17 @@ PRESENT: ContextVar[KeptWork | None] = ContextVar("unfinished", default=None)
 def present() -> KeptWork | None:
     """Return the work whose simulations are kept now, or None if there is none."""
     return PRESENT.get()
+
+
+def present_part(kept: Any, problem: Problem, *mode: object) -> Any:
+    """Return an evaluator's `Part` of the present work; None if nothing is kept.
+
+    **Arguments:**
+
+    - `kept`: its part of the work before, or None. That of the present work is returned as it is.
+    - `problem`, `mode`: as for a new `Part`.
+    """
+    work = present()
+    if work is None or (kept is not None and kept.of is work):
+        return None if work is None else kept
+    return work.part(problem, *mode)

@@ -377,10 +377,12 @@ def _as_study(
             "harden needs problem=, a function from a policy to the Problem of its closed loop"
         )
     else:
-        if isinstance(given, Trainer) and algorithm is not None:
+        if not isinstance(given, Trainer):
+            trainer = Trainer(given) if algorithm is None else Trainer(given, algorithm)
+        elif algorithm is None:
+            trainer = given
+        else:
             raise ValueError("a Trainer has algorithms; give no other")
-        trainer = given if isinstance(given, Trainer) else Trainer(given)
-        trainer = trainer if algorithm is None else Trainer(given, algorithm)
         space = {"steps": Categorical(trainer.steps)}
         study = Study(trainer.name, space, trainer, problem, p=0.01 if p is None else p)
     trainer = study.trainer

@@ -71,7 +71,7 @@ class Parametric:
         return self._filled(self.tree, values, True)
 
     def _filled(self, f: Formula, values: Mapping[str, float], positive: bool | None) -> Formula:
-        """Return a formula with values; `positive` is None where its comparisons stay as they are.
+        """Return a formula with values; `positive` is None if its comparisons stay as they are.
 
         What is counted can make the formula true, or false.
         """

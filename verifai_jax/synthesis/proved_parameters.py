@@ -64,7 +64,7 @@ def prove_around(
     precision: str = "float32",
     seed: int = 0,
 ) -> ProvedParameters | None:
-    """Prove a box of parameters around a point; None where no box was proved in time.
+    """Prove a box of parameters around a point; None if no box was proved in time.
 
     **Arguments:**
 

@@ -73,6 +73,7 @@ class System(ForUsers):
     - `notes`: sentences for the notes of a run, on what the system changed in what it was given.
     - `reverse_hint`: a sentence for users, on what makes reverse mode work where it does not.
     - `dt`: the sampling period in seconds of what `fold` simulates.
+    - `workers`: simulations of a black box that run side by side.
     - `exact_step`: True where the step is part of what the system is, as in an environment that its
       authors define by a difference equation: no finer step simulates the same system.
     - `traced_factor`: True where JAX may trace the factor that `refined` takes.
@@ -89,7 +90,7 @@ class System(ForUsers):
         "can_simulate_batch", "can_simulate_each", "constants", "derived", "effort", "exact_step",
         "fold", "forward_up_to", "known_signals", "lanes", "likely", "links", "may_draw", "passing",
         "refined", "renewed", "reverse_hint", "simulate_batch", "simulate_each", "switches",
-        "traced_factor", "unroll", "why_error", "why_not", "with_backend", "with_links",
+        "traced_factor", "unroll", "why_error", "why_not", "with_backend", "with_links", "workers",
     ))  # fmt: skip
 
     black_box: bool = False
@@ -100,6 +101,7 @@ class System(ForUsers):
     notes: tuple[str, ...] = ()
     reverse_hint: str = ""
     dt: float | None = None
+    workers: int = 1
     exact_step: bool = False
     traced_factor: bool = False
     backends: tuple[str, ...] = ()

@@ -66,15 +66,9 @@ int fmi2DoStep(C2 *c, double t, double h, int p) {
   return s; }
 """
 
-THREE = r"""
-typedef void (*Log)(void*, int, const char*, const char*);
-void *fmi3InstantiateCoSimulation(const char *n, const char *g, const char *r, bool v, bool l,
-    bool e, bool a, const unsigned *q, size_t nq, void *env, Log log, void *u) {
-  if (strcmp(g, "token")) return 0;
-  Model *x = calloc(1, sizeof(Model)); reset(x); return x; }
+ANY_THREE = r"""
 void fmi3FreeInstance(void *c) { free(c); }
 int fmi3EnterInitializationMode(void *c, bool a, double b, double d, bool e, double f) { return 0; }
-int fmi3ExitInitializationMode(Model *c) { c->r[4] = c->r[2]; return 0; }
 int fmi3Terminate(void *c) { return 0; }
 int fmi3Reset(Model *c) { reset(c); return 0; }
 int fmi3SetFloat64(Model *c, const uint32_t *v, size_t n, const double *x, size_t m) {
@@ -83,9 +77,22 @@ int fmi3GetFloat64(Model *c, const uint32_t *v, size_t n, double *x, size_t m) {
   for (size_t i = 0; i < n; i++) x[i] = c->r[v[i]]; return 0; }
 int fmi3SetInt32(Model *c, const uint32_t *v, size_t n, const int32_t *x, size_t m) {
   c->mode = x[0]; return 0; }
+"""
+"""What all models have in FMI 3."""
+
+THREE = (
+    ANY_THREE
+    + r"""
+typedef void (*Log)(void*, int, const char*, const char*);
+void *fmi3InstantiateCoSimulation(const char *n, const char *g, const char *r, bool v, bool l,
+    bool e, bool a, const unsigned *q, size_t nq, void *env, Log log, void *u) {
+  if (strcmp(g, "token")) return 0;
+  Model *x = calloc(1, sizeof(Model)); reset(x); return x; }
+int fmi3ExitInitializationMode(Model *c) { c->r[4] = c->r[2]; return 0; }
 int fmi3DoStep(Model *c, double t, double h, bool p, bool *e, bool *end, bool *r, double *last) {
   int s = advance(c, h); *e = *r = false; *end = s == 2; return s == 2 ? 0 : s; }
 """
+)
 
 
 BALL_VARIABLES = {
@@ -150,22 +157,14 @@ int fmi2CompletedIntegratorStep(Model *c, int no, int *enter, int *end) {
   *enter = asks(c); *end = ends(c); return 0; }
 """
 
-BALL_THREE = r"""
+BALL_THREE = (
+    ANY_THREE
+    + r"""
 void *fmi3InstantiateModelExchange(const char *n, const char *g, const char *r, bool v, bool l,
     void *env, void *log) {
   if (strcmp(g, "token")) return 0;
   Model *x = calloc(1, sizeof(Model)); reset(x); return x; }
-void fmi3FreeInstance(void *c) { free(c); }
-int fmi3EnterInitializationMode(void *c, bool a, double b, double d, bool e, double f) { return 0; }
 int fmi3ExitInitializationMode(void *c) { return 0; }
-int fmi3Terminate(void *c) { return 0; }
-int fmi3Reset(Model *c) { reset(c); return 0; }
-int fmi3SetFloat64(Model *c, const uint32_t *v, size_t n, const double *x, size_t m) {
-  for (size_t i = 0; i < n; i++) c->r[v[i]] = x[i]; return 0; }
-int fmi3GetFloat64(Model *c, const uint32_t *v, size_t n, double *x, size_t m) {
-  for (size_t i = 0; i < n; i++) x[i] = c->r[v[i]]; return 0; }
-int fmi3SetInt32(Model *c, const uint32_t *v, size_t n, const int32_t *x, size_t m) {
-  c->mode = x[0]; return 0; }
 int fmi3EnterEventMode(void *c) { return 0; }
 int fmi3EnterContinuousTimeMode(void *c) { return 0; }
 int fmi3UpdateDiscreteStates(Model *c, bool *again, bool *end, bool *n, bool *x, bool *timed,
@@ -183,6 +182,7 @@ int fmi3GetEventIndicators(Model *c, double *z, size_t n) { z[0] = c->r[4]; retu
 int fmi3CompletedIntegratorStep(Model *c, bool no, bool *enter, bool *end) {
   *enter = asks(c); *end = ends(c); return 0; }
 """
+)
 
 TEXT = 'name="text" valueReference="21" causality="output" variability="discrete"'
 INCLUDES = "\n".join(MODEL.splitlines()[1:5]) + "\n"
