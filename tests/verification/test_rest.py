@@ -111,6 +111,29 @@ def test_a_run_simulates_nothing_that_is_proved(proved, tmp_path):
     assert len(more.table) == 300
 
 
+@pytest.mark.thorough
+def test_a_search_begins_where_bounds_are_loosest():
+    """A needle of a share of 3e-6: its box has the lowest bound of all that are left."""
+
+    def system(f, key):
+        far = ((f["x"] - 0.3127) ** 2 + (f["y"] - 0.6841) ** 2) / 1e-6
+        ripple = 0.06 * jnp.sin(40 * f["x"]) * jnp.sin(40 * f["y"])
+        return vj.Trace({"m": (0.05 + ripple - 5 * jnp.exp(-far)) * jnp.ones(2)}, dt=1.0)
+
+    space = {"x": vj.Box(0, 1), "y": vj.Box(0, 1)}
+    problem = vj.Problem("needle", space, system, "always m >= -0.02")
+    found = vj.verify(problem, boxes=1500, samples=0, progress=False)
+    assert 0.5 < found.proved.mass < 1
+    counts = []
+    for options in ({"proved": found}, {}):
+        one = problem if options else found.rest(problem)
+        run = vj.falsify(one, "cross_entropy", 8192, batch=64, stop_after=1, seed=0,
+                         progress=False, **options)  # fmt: skip
+        counts.append(len(run.table) if run.table.all["violated"].any() else 10**9)
+    assert counts[0] < counts[1]
+    assert counts[0] <= 1024
+
+
 def test_a_proof_of_another_problem_proves_nothing(proved):
     for other, what in ((squares(factor=1.01), "model"), (squares("always x <= 2"), "formulas")):
         with pytest.raises(ValueError, match=f"verification is of another problem: its {what}"):

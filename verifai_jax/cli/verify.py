@@ -19,6 +19,7 @@ from verifai_jax.cli.json_output import command, give_result, show_result
 @arguments.SEED
 @arguments.ONLY
 @arguments.PRECISION
+@click.option("--continuous", is_flag=True, help="Verify the differential equation at all times.")
 @click.option(
     "--into", type=click.Path(path_type=Path), help="File for the result, or to go on with."
 )

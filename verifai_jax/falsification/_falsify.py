@@ -65,6 +65,9 @@ if TYPE_CHECKING:
     from verifai_jax.statistics.stopping import StoppingRule
     from verifai_jax.verification import Verification
 
+LOOSE = 8
+"""Share of the budget, as its inverse, for the boxes that a proof leaves, at most."""
+
 
 @suggests_options
 @reproducible_settings()
@@ -152,7 +155,8 @@ def falsify(
     - `cheap`: a cheap model of the same features, searched first with 20 times the budget. At
       most a quarter of the budget is spent on what it found. Only `problem` decides what fails.
     - `proved`: what `verify` found of this problem, or its file. The run is of the rest, and is
-      resumed with it: `proved.rest(problem)`.
+      resumed with it: `proved.rest(problem)`. A search that learns begins where the bounds of the
+      robustness are lowest, with an eighth of the budget at most, unless `first` says otherwise.
 
     Ctrl-C ends the run and returns what is finished. Likely mistakes of the problem are in `notes`.
 
@@ -190,6 +194,9 @@ def falsify(
             precision=precision, progress=False,
         )  # fmt: skip
         first = cheaply.gravest_rows(found, cheap, budget)
+    elif proved is not None and first is None and search.learns and stop_when is None:
+        first = proved.loosest(problem, max(1, budget // LOOSE))
+        first = first if len(first) else None
     given = check_first(problem, first, stop_when, precision)
     callbacks = check_callbacks(callbacks)
     earlier = earlier_rows(warm_start, problem)

@@ -22,11 +22,6 @@ from verifai_jax.reports.sections import (
 from verifai_jax.reports.studies import png
 from verifai_jax.verification.result import Verification
 
-DISCRETE = (
-    "What is verified is the system in discrete time as it is simulated, in real arithmetic and "
-    "with the rounding of its precision; no differential equation."
-)
-"""Assumption of what is proved and of what is broken."""
 SAMPLED = (
     "The bound on what is undecided rests on independent samples of it, and holds whenever one "
     "stops."
@@ -53,16 +48,18 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
     low, high = result.probability
     sure = format_percent(result.confidence)
     bounds = f"{format_percent(low)} at least, {format_percent(high)} at most"
+    what = "solution" if result.continuous else "simulation"
+    verified = f"What is verified is {result.subject}."
     boxes, samples = f"{len(result.boxes):,} boxes", f"{int(result.boxes.samples.sum()):,} samples"
     claims = [
-        Claim("C1", f"No simulation fails in {shares[0]} of the prior.", (boxes,),
-              (MODEL, DISCRETE)),
+        Claim("C1", f"No {what} fails in {shares[0]} of the prior.", (boxes,),
+              (MODEL, verified)),
         Claim("C2", f"The failure probability is {bounds}, at {sure}.", (boxes, samples),
-              (MODEL, DISCRETE, SAMPLED)),
+              (MODEL, verified, SAMPLED)),
     ]  # fmt: skip
     if broken.mass:
         found = f"Boxes of {shares[1]} of the prior contain a point that fails for certain."
-        claims.append(Claim("C3", found, (boxes,), (MODEL, DISCRETE)))
+        claims.append(Claim("C3", found, (boxes,), (MODEL, verified)))
     parts: list[tuple[str, Child, Child]] = [
         (name, format_percent(part.mass), format_percent(part.volume))
         for name, part in (
@@ -87,14 +84,14 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
                 ("What was the prior?", "see what was asked", "asked"),
                 ("How many boxes are there?", boxes, "found"),
                 ("How probable is a failure?", f"{bounds}, at {sure}", "found"),
-                ("Which assumption is under what is proved?", DISCRETE, "limits"),
+                ("Which assumption is under what is proved?", verified, "limits"),
                 model_answer(model),
             ]
         ),
         Section(
             "asked",
             "What was asked",
-            (paragraph(f"Where no simulation of {result.name} fails, for certain."), *asked),
+            (paragraph(f"Where no {what} of {result.name} fails, for certain."), *asked),
         ),
         Section(
             "found",
@@ -116,7 +113,7 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
                     [
                         f"{shares[2]} of the prior is undecided; at most "
                         f"{format_percent(result.failure_bound)} of it fails, at {sure}.",
-                        DISCRETE, SAMPLED, MODEL, *result.notes,
+                        verified, SAMPLED, MODEL, *result.notes,
                     ]
                 ),
             ),
@@ -128,7 +125,7 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
             (
                 preformatted(
                     f"vj.verify(problem, boxes={result.looked_at}, precision={result.precision!r}, "
-                    f"confidence={result.confidence})"
+                    f"confidence={result.confidence}, continuous={result.continuous})"
                 ),
                 paragraph(f"Made with verifai_jax {result.version}."),
                 *provenance_content(links, model),

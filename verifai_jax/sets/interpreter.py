@@ -58,6 +58,8 @@ class Interpreter:
 
     def __init__(self, boxes: int, features: int, known: Known | None = None) -> None:
         self.boxes, self.features, self.known = boxes, features, known
+        self.latest: tuple[Any, ...] | None = None
+        """The last step of a differential equation: what it was made of, and its results."""
 
     def __call__(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
         """Evaluate a traced program; what is not defined becomes a set that is everything.

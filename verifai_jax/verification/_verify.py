@@ -11,6 +11,7 @@ from verifai_jax.core.progress import shows_progress
 from verifai_jax.problem.problem import Problem
 from verifai_jax.verification.boxes import Boxes
 from verifai_jax.verification.branch_and_bound import BranchAndBound
+from verifai_jax.verification.continuous import between_samples
 from verifai_jax.verification.enclosure import Enclosure, enclosable
 from verifai_jax.verification.result import Verification, as_verification, described
 
@@ -33,6 +34,7 @@ def verify(
     confidence: float = 0.95,
     seed: int = 0,
     precision: str = "float32",
+    continuous: bool = False,
     resume: Verification | str | Path | None = None,
     progress: bool | None = None,
 ) -> Verification:
@@ -42,7 +44,7 @@ def verify(
     for all of them, in real arithmetic and with the rounding of the simulation; *broken* if it
     contains a point whose robustness is negative for certain. Boxes that are neither are split
     where the robustness changes most, the largest first. What is verified is the system in discrete
-    time as it is simulated, with its steps, and no differential equation.
+    time as it is simulated, with its steps; or, if `continuous`, the differential equation itself.
 
     **Arguments:**
 
@@ -53,12 +55,17 @@ def verify(
     - `confidence`: the confidence of that bound, which holds whenever one stops.
     - `seed`: the seed of the samples.
     - `precision`: the precision of the simulations that are verified, `"float32"` or `"float64"`.
+    - `continuous`: verify the differential equation of a system that `vj.ode` made, in real
+      arithmetic and at all times, with the controller's output held between its samples. Its
+      dynamics must be smooth, without switches or an end, its formulas without until, since and
+      next. Nothing is sampled; searches and estimates simulate steps, and do not take the result.
     - `resume`: an earlier result of the same problem, or its file, to go on with.
     - `progress`: as in `falsify`.
 
     **Returns:** the result: the three volumes, the three probabilities, the boxes.
 
-    **Raises:** `ProblemError` for a black box, and for a system that draws random numbers;
+    **Raises:** `ProblemError` for a black box, for a system that draws random numbers, and for what
+    `continuous` cannot be about;
     `MissingRule` for an operation that sets cannot go through, with its name and line; `ValueError`
     for options out of range, and for the result of another problem.
     """
@@ -73,18 +80,20 @@ def verify(
     check_fraction("confidence", confidence)
     in_precision(precision)
     seconds = 60.0 if budget is None and boxes is None else budget
+    precision = "float64" if continuous else precision
     problem = enclosable(problem, precision)
+    about = between_samples(problem) if continuous else problem
     before = None if resume is None else as_verification(resume)
     if before is not None:
-        before.check_same(problem, precision)
+        before.check_same(problem, precision, continuous)
     sources, begun = problem.sources(), time.time()
-    enclosure = Enclosure(problem, precision)
+    enclosure = Enclosure(about, precision)
     found = Boxes.whole(enclosure) if before is None else before.boxes.copy()
     work = BranchAndBound(problem, enclosure, found, seed)
     end = None if seconds is None else started + seconds * (1 - REST)
     stopped = work.go_on(end, boxes)
     work.confirm()
-    work.sample(samples)
+    work.sample(0 if continuous else samples)
     seconds = time.perf_counter() - started
     return Verification(
         **described(problem),
@@ -99,6 +108,7 @@ def verify(
         seconds=seconds + (0 if before is None else before.seconds),
         stopped=stopped,
         notes=(f"{work.contradicted} {CONTRADICTED}",) if work.contradicted else (),
+        continuous=continuous,
         version=__version__,
         sources=sources.settled(begun).to_json(),
     )  # fmt: skip

@@ -28,7 +28,8 @@ class Boxes:
 
     - `low`, `high`: `[n, dim]`, corners.
     - `state`: `[n]`, `OPEN`, `PROVED`, `BROKEN` or `OUTSIDE`.
-    - `lowest`, `highest`: `[n]`, bounds of the robustness; infinite where nothing is known.
+    - `lowest`, `highest`: `[n]`, bounds of the robustness; infinite where nothing is known, and
+      `highest` until sets were evaluated for the box itself.
     - `witness`: `[n, dim]`, a point that fails as simulated; NaN without one.
     - `confirmed`: `[n]`, whether the witness fails for certain.
     - `failures`, `samples`: `[n]`, of independent samples of the box.
@@ -119,7 +120,10 @@ class Boxes:
         return wide
 
     def halves(self, coordinate: Int[np.ndarray, " n"], enclosure: Enclosure) -> "Boxes":
-        """Return both halves of each box along a coordinate, open, with the witness in its half."""
+        """Return both halves of each box along a coordinate, open, with the witness in its half.
+
+        What bounds the robustness from below does so for both.
+        """
         rows = np.arange(len(self))
         low, high = self.low[rows, coordinate], self.high[rows, coordinate]
         middle = low / 2 + high / 2
@@ -134,6 +138,7 @@ class Boxes:
             Boxes.between(self.low.copy(), self.high),
         )
         left.high[rows, coordinate] = right.low[rows, coordinate] = middle
+        left.lowest[:] = right.lowest[:] = self.lowest
         known = self.has_witness
         below = self.witness[rows, coordinate] < middle
         left.witness[known & below] = self.witness[known & below]

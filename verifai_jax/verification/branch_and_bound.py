@@ -49,7 +49,7 @@ class BranchAndBound:
                 now = time.perf_counter()
                 open_ones = np.flatnonzero((self.boxes.state == OPEN) & self.wanted(self.boxes))
                 can = self.boxes[open_ones].splittable(self.enclosure).any(1)
-                new = np.isinf(self.boxes.lowest[open_ones])
+                new = np.isinf(self.boxes.highest[open_ones])
                 open_ones = open_ones[can | new]
                 if not len(open_ones):
                     return "all boxes are decided or too narrow"
@@ -78,7 +78,8 @@ class BranchAndBound:
         slope = np.abs(robustness[:, 1::2] - robustness[:, 2::2]).sum(1) / (4.2 * REACH)
         passes = proper & ~failing.any(1) & (robustness[:, 0] - slope >= 0)
         fails = proper & failing.all(1) & (robustness[:, 0] + slope <= 0)
-        worth = np.flatnonzero(passes | fails | ~proper)
+        can = some.splittable(self.enclosure)
+        worth = np.flatnonzero(passes | fails | ~proper | ~can.any(1))
         moves = np.zeros(some.low.shape)
         if len(worth):
             bounds = self.enclosure(some.low[worth], some.high[worth])
@@ -89,14 +90,14 @@ class BranchAndBound:
             # A box that the constraint cuts is split until it does so no more: its mass is unknown.
             state = np.where(bounds.inside, state, OPEN)
             state = np.where(bounds.outside, OUTSIDE, state)
-            # A simulation outside of its bounds would be a mistake of this program.
-            seen = robustness[worth]
+            # A simulation outside of its bounds would be a mistake of this program; that of a
+            # differential equation is off by the error of its steps.
+            seen = np.where(self.enclosure.problem is self.problem, robustness[worth], np.nan)
             wrong = (np.nanmin(seen, 1, initial=np.inf) < bounds.low) & ~bounds.outside
             wrong |= (np.nanmax(seen, 1, initial=-np.inf) > bounds.high) & bounds.inside
             self.contradicted += int(wrong.sum())
             some.state[worth] = np.where(wrong, OPEN, state)
         some.confirmed[:] = some.state == BROKEN
-        can = some.splittable(self.enclosure)
         split = (some.state == OPEN) & can.any(1)
         kept = np.ones(len(self.boxes), bool)
         kept[rows[split]] = False

@@ -27,6 +27,14 @@ from verifai_jax.verification.boxes import BROKEN, OUTSIDE, PROVED, Boxes
 from verifai_jax.verification.rest import Rest, RestSpace
 
 KIND = "verification"
+DISCRETE = (
+    "the system in discrete time as it is simulated, in real arithmetic and with the rounding of "
+    "{precision}; no differential equation"
+)
+CONTINUOUS = (
+    "the differential equation at all times, in real arithmetic, with the controller's output held "
+    "between its samples; no simulation in steps"
+)
 
 
 class Part(NamedTuple):
@@ -46,12 +54,13 @@ class Verification(Drawn, InNotebook):
     - `features`, `formulas`, `model`, `precision`: what was verified, the system by a
       hash.
     - `confidence`: the confidence of bounds by samples.
+    - `continuous`: whether it is about the differential equation.
     - `looked_at`: boxes that were looked at; `simulations`; `seconds`; `stopped`: why it ended.
     - `notes` for people; `version`; `sources`: what the model was made of, as a run records it.
     """
 
     _picture = "verification", "plot_verification"
-    _internal = frozenset(("check_same", "left", "note"))
+    _internal = frozenset(("check_same", "left", "loosest", "note"))
 
     name: str
     columns: tuple[str, ...]
@@ -70,12 +79,18 @@ class Verification(Drawn, InNotebook):
     notes: tuple[str, ...]
     version: str
     sources: Mapping[str, Any] = field(repr=False)
+    continuous: bool = False
 
     @cached_property
     def verdicts(self) -> np.ndarray:
         """`"proved"`, `"broken"`, `"undecided"` or `"outside"` (of the constraint), box by box."""
         words = np.array(["undecided", "proved", "broken", "outside"])[self.boxes.state]
         return np.where(self.boxes.confirmed, "broken", words)
+
+    @property
+    def subject(self) -> str:
+        """What was verified, the steps of simulations or the differential equation."""
+        return CONTINUOUS if self.continuous else DISCRETE.format(precision=self.precision)
 
     def _part(self, rows: Bool[np.ndarray, " n"]) -> Part:
         inside = self.boxes.state != OUTSIDE
@@ -174,8 +189,7 @@ class Verification(Drawn, InNotebook):
             f"{format_percent(high)} at most{f' at {sure}' if undecided.mass > 0 else ''}",
             f"  boxes        {len(self.boxes):,} of {self.looked_at:,} that were looked at, "
             f"{self.simulations:,} simulations in {self.seconds:z.1f} s, stopped: {self.stopped}",
-            "  verified     the system in discrete time as it is simulated, in real arithmetic and "
-            f"with the rounding of {self.precision}; no differential equation",
+            f"  verified     {self.subject}",
         ]  # fmt: skip
         return "\n".join([*lines, *(f"  note         {note}" for note in self.notes)])
 
@@ -184,11 +198,15 @@ class Verification(Drawn, InNotebook):
     def _notebook_parts(self) -> list[str]:
         return [picture_html(self.plot()), frame_html(self.table)]
 
-    def check_same(self, problem: Problem, precision: str) -> None:
+    def check_same(self, problem: Problem, precision: str, continuous: bool = False) -> None:
         """Refuse another problem than the one that was verified.
 
         **Raises:** `ValueError` that says what differs.
         """
+        if continuous != self.continuous:
+            raise ValueError(
+                f"this verification is about {self.subject}; verify with continuous={continuous}"
+            )
         for what, now in {**described(problem), "precision": precision}.items():
             then = getattr(self, what)
             if then != now:
@@ -210,6 +228,24 @@ class Verification(Drawn, InNotebook):
         """A sentence on simulations of the rest."""
         share = format_percent(self.proved.mass)
         return f"{share} of the prior is proved and not simulated; all rates are of the rest"
+
+    def loosest(self, problem: Problem, count: int) -> pd.DataFrame:
+        """Return rows of what is not proved for a search to begin with, where bounds are loosest.
+
+        They are points that fail as simulated, and then middles of boxes: those first of which the
+        robustness has the lowest bound.
+
+        **Arguments:**
+
+        - `problem`: that of `rest`.
+        - `count`: rows at most.
+        """
+        boxes = self.boxes[~np.isin(self.boxes.state, (PROVED, OUTSIDE))]
+        boxes = boxes[np.lexsort((-boxes.mass, boxes.lowest, ~boxes.has_witness))]
+        known, middle = boxes.has_witness[:, None], boxes.low / 2 + boxes.high / 2
+        points = np.where(known, boxes.witness, middle).astype(np.float32)
+        points = points[problem.space.accepts_points(points)][:count]
+        return pd.DataFrame(problem.space.rows(problem.space.features_at(points)))
 
     def rest(self, problem: Problem, precision: str = "float32") -> Problem:
         """Return the problem without what is proved, for searches that spend nothing there.

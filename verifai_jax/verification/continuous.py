@@ -1,0 +1,64 @@
+"""A problem whose signals, on sets, are those at all times between two samples.
+
+    problem = between_samples(problem)      # of a system that `vj.ode` made
+
+Sample k of a signal stands for its values from time k `dt` until the next sample, with the control
+that is held then; the last one for the end alone. Windows of `always` and `eventually` over such
+samples contain each instant of the windows over time, and each of their samples holds an instant of
+them, so that bounds of the robustness over sets are bounds of that in continuous time.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import PyTree
+
+from verifai_jax.mtl.expression import durations_in
+from verifai_jax.mtl.formula import Next, Prev, Witness
+from verifai_jax.problem.problem import Problem, ProblemError
+from verifai_jax.sets import flow
+from verifai_jax.systems.ode.closed_loop import Ode, substep
+from verifai_jax.systems.pytree_checks import default_signals
+
+
+def between_samples(problem: Problem) -> Problem:
+    """Return the problem about the differential equation; its system is one for sets alone.
+
+    **Raises:** `ProblemError` for a system that `vj.ode` did not make, or that ends or jumps at
+    instants of its own, and for a formula about single samples.
+    """
+    loop = problem.system
+    if not isinstance(loop, Ode):
+        raise ProblemError(
+            f"continuous=True is about the equations of a system that vj.ode made; that of problem "
+            f"{problem.name!r} is a {type(loop).__name__}. Leave it out to verify the system in "
+            "discrete time"
+        )
+    for given, name in (
+        (loop.switches, "switches"), (loop.terminate, "terminate"), (loop.exact_step, "exact_step"),
+    ):  # fmt: skip
+        if given:
+            raise ProblemError(
+                f"continuous=True needs a plant that moves continuously for the whole duration; "
+                f"the system of problem {problem.name!r} has {name}=. Leave one of both out"
+            )
+    for formula in problem.formulas.values():
+        for part in formula.subformulas(valued=True):
+            if isinstance(part, Next | Prev | Witness) or durations_in(part):
+                raise ProblemError(
+                    f"continuous=True knows formulas of comparisons, not, and, or, always, "
+                    f"eventually, historically and once; {part} is about single samples"
+                )
+
+    def during(time: Any, state: PyTree, control: Any, features: Any) -> Any:
+        left = jnp.where(time < (loop.steps - 0.5) * loop.dt, loop.dt, 0.0)
+        inside = replace(loop, method=lambda *step: flow(*step)[1])
+        states = substep(inside, features, control, time, state, left)
+        now = flow(lambda time, clock: jnp.ones_like(clock), time, time, left)[1]
+        if loop.signals is None:
+            return default_signals(states, control)
+        return loop.signals(now, states, control, features)
+
+    system = replace(loop, method=lambda *step: flow(*step)[0], signals=during)
+    return replace(problem, system=system)
