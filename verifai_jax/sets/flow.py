@@ -136,7 +136,8 @@ def _evaluated_once(program: Program, constants: Sequence[Any], *inputs: Array) 
             inner, consts = getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
             return run_through(inner, consts, operands, lambda one: one.val, step)
         key = each.primitive, str(each.params), *(
-            id(one) if isinstance(one, jax.core.Tracer | np.ndarray) else (str(one), type(one))
+            id(one) if isinstance(one, jax.core.Tracer) or np.ndim(one)
+            else (str(one), type(one), getattr(one, "dtype", None))
             for one in operands
         )  # fmt: skip
         if key not in known:
@@ -144,8 +145,12 @@ def _evaluated_once(program: Program, constants: Sequence[Any], *inputs: Array) 
                 if not any(isinstance(one, jax.core.Tracer) for one in operands):
                     stack.enter_context(jax.ensure_compile_time_eval())
                 found = each.primitive.bind(*operands, **each.params)
+                found = found if each.primitive.multiple_results else [found]
+                # As numbers of the program's text they are the same wherever it is traced.
+                if not any(isinstance(one, jax.core.Tracer) for one in found):
+                    found = [np.asarray(one) for one in found]
             # The operands live on, so that no other number gets the same identity.
-            known[key] = operands, found if each.primitive.multiple_results else [found]
+            known[key] = operands, found
         return known[key][1]
 
     return run_through(program, constants, inputs, lambda one: one.val, step)
