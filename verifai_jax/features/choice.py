@@ -407,6 +407,3 @@ class Constant(Domain):
     @property
     def held_at(self) -> PyTree:
         return self.value
-
-    def __repr__(self) -> str:
-        return f"Constant({short(self.value)})"
