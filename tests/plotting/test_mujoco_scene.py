@@ -137,6 +137,7 @@ def test_film_and_strip(motion, gl, tmp_path):
         assert image.size == (3 * 100 + 2 * 4, 90 + films.HEADER)
 
 
+@pytest.mark.thorough
 def test_a_push_is_an_arrow(motion, gl):
     pushes = motion.pushes.copy()
     pushes[0, 1, 0] = 5.0
