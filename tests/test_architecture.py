@@ -197,7 +197,11 @@ def asked_of(source: str, room: str, kinds: set[str]) -> list[str]:
                     modules.add(alias.asname or alias.name)
     asked = []
     for node in ast.walk(tree):
-        if isinstance(node, ast.Call) and ast.unparse(node.func) in ("isinstance", "issubclass"):
+        if (
+            isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Name)
+            and node.func.id in ("isinstance", "issubclass")
+        ):
             classes = node.args[1]
         elif isinstance(node, ast.MatchClass):
             classes = node.cls

@@ -190,7 +190,7 @@ def test_without_a_renderer_one_line_says_what_to_do(seen, tmp_path, monkeypatch
     assert "Cannot initialize a EGL device display.; without a screen set" in message
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("setting", ["disable", "glfw", "egl", None])
 def test_real_settings_draw_or_explain(setting):
     code = f"""

@@ -255,7 +255,7 @@ def test_a_function_of_the_script_itself(tmp_path):
     assert not [line for line in done.stderr.splitlines() if "is still importing" not in line]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_script_without_a_guard_is_told_so(tmp_path):
     done = run(script(tmp_path, SCRIPT + "\n    main()\n"))
     assert done.returncode == 1
