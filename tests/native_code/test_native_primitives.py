@@ -305,7 +305,7 @@ def test_a_branch_keeps_what_is_used_after_it():
                                      line, new)  # fmt: skip
 
         def step(carry, x):
-            alone, twice, kept, shared, inner, large = carry
+            alone, twice, kept, shared, inner, chosen, large = carry
             needed, value = row[0] > x, row[1] + x
             alone = once(needed, alone, value)
             twice = once(row[2] > x, once(needed, twice, value), 2 * value)
@@ -313,12 +313,12 @@ def test_a_branch_keeps_what_is_used_after_it():
             shared = once(needed, shared, value), once(row[2] > x, shared, -value)
             inner, _ = lax.scan(lambda c, y: (once(needed, c, y + inner[1]), y), inner,
                                 jnp.arange(3.0))  # fmt: skip
-            chosen = lax.cond(row[3] > x, lambda v: once(needed, v, value), lambda v: v + 1, kept)
+            chosen = lax.cond(row[3] > x, lambda v: once(needed, v, value), lambda v: v + 1, chosen)
             large = once(needed, large, value)
-            after = (alone, twice, chosen, jnp.maximum(*shared), inner, large)
+            after = (alone, twice, kept, jnp.maximum(*shared), inner, chosen, large)
             return after, (before.sum() + push(needed, before, x).sum(), large[-1])
 
-        start = tuple(row[0] * jnp.ones(n) for n in (3, 3, 3, 3, 3, 40))
+        start = tuple(row[0] * jnp.ones(n) for n in (3, 3, 3, 3, 3, 3, 40))
         return lax.scan(step, start, jnp.arange(-16.0, 17.0) / 8)
 
     # Of few binary digits, so that nothing is rounded.
