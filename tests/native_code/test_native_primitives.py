@@ -313,7 +313,7 @@ def test_a_branch_keeps_what_is_used_after_it():
             shared = once(needed, shared, value), once(row[2] > x, shared, -value)
             inner, _ = lax.scan(lambda c, y: (once(needed, c, y + inner[1]), y), inner,
                                 jnp.arange(3.0))  # fmt: skip
-            chosen = lax.cond(row[3] > x, lambda v: once(needed, v, value), lambda v: v + 1, chosen)
+            chosen = lax.cond(row[3] > x, lambda v: v + 1, lambda v: once(needed, v, value), chosen)
             large = once(needed, large, value)
             after = (alone, twice, kept, jnp.maximum(*shared), inner, chosen, large)
             return after, (before.sum() + push(needed, before, x).sum(), large[-1])
