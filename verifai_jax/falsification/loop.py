@@ -56,10 +56,10 @@ class Rounds:
     `first` are rows of given features (`given_rows`) that are simulated before the search proposes
     any; `suggestions` are those that somebody gives on the way, None if nobody is asked.
     `record_checksum` is that of the run's record, for the checkpoints. `only_budget_ends` is
-    whether nothing but the budget is to end the run. `checks` names the closer replays that were made. `watch` has the seconds of all: to
-    `COMPILE`; to `SEARCH`, which the search took for its proposals and to learn, and whoever
-    suggests points to think of them; to `SIMULATE`, and to put the rows into the table; to
-    `CONFIRM`. The rest is whoever advances the rounds.
+    whether only the budget is to end the run. `checks` names the closer replays that were made.
+    `watch` has the seconds of all: to `COMPILE`; to `SEARCH`, which the search took for its
+    proposals and to learn, and whoever suggests points to think of them; to `SIMULATE`, and to put
+    the rows into the table; to `CONFIRM`. The rest is whoever advances the rounds.
     """
 
     def __init__(
@@ -107,8 +107,7 @@ class Rounds:
         self.checkpoint: dict[str, Any] = {}
         self.record_checksum = 0
         self._pending: Any = None  # Points of the first round that are proposed already.
-        self._has_workers = executor is not None
-        self.only_budget_ends = False
+        self._has_workers, self.only_budget_ends = executor is not None, False
         self._prefetch: Prefetch | None = None
         self._saved = time.perf_counter()
         self._raising = Raising()
@@ -189,17 +188,16 @@ class Rounds:
     def _begin_prefetching(self, limit: int) -> "Prefetch | None":
         """Begin to simulate rounds ahead, up to so many rows; None where that is not done.
 
-        In this process not where the run may end before its budget, so that nothing is simulated in
-        vain, and not where simulations are kept, by the thread that began, for another process.
+        In this process it is not where the run may end before its budget, nor where simulations are
+        kept for another process, by the thread that began.
         """
-        done = len(self.table)
+        done, proposals = len(self.table), self.learning.proposals
         here = self.only_budget_ends and limit > done + self.batch and present() is None
-        here = here and not self.problem.black_box and self.suggestions is None
-        if self.search.learns or not (self._has_workers or here):
+        asked = self.problem.black_box or self.suggestions is not None
+        if self.search.learns or not (self._has_workers or (here and not asked)):
             return None
         from verifai_jax.falsification.prefetch import Prefetch
 
-        proposals = self.learning.proposals
         return Prefetch(proposals, self.evaluate, self.batch, limit, done, self._searching)
 
     def _simulate(self, batch: Batch, first: int) -> Verdicts:
@@ -400,10 +398,8 @@ class Rounds:
     @property
     def exhausted(self) -> bool:
         """True if a finite search has come to its end."""
-        waiting = self._pending is not None or (
-            self._prefetch is not None and not self._prefetch.empty
-        )
-        proposals = self.learning.proposals
+        ahead, proposals = self._prefetch, self.learning.proposals
+        waiting = self._pending is not None or (ahead is not None and not ahead.empty)
         return proposals is not None and proposals.exhausted and not waiting
 
     def close(self) -> None:
@@ -417,10 +413,9 @@ class Rounds:
         **Raises:** `OSError` where it cannot be written.
         """
         now = time.perf_counter()
-        if self.folder is None or (seldom and now - self._saved < 1.0):
+        # Without a checkpoint it was interrupted before there was a search, and begins anew.
+        if self.folder is None or not self.checkpoint or (seldom and now - self._saved < 1.0):
             return
-        if not self.checkpoint:
-            return  # Interrupted before there was a search: it begins where it would have.
         self._saved = now
         rows = self.table.digest(int(self.checkpoint.get("rows", 0)))
         write_checkpoint(self.checkpoint, self.folder, rows, self.record_checksum)

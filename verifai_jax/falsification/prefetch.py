@@ -11,9 +11,9 @@ when the run ends is as if it had never been proposed.
 
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -21,7 +21,7 @@ from jaxtyping import Float
 
 from verifai_jax.core.precision import reproducible_settings
 from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.evaluation.executor_engine import ExecutorEngine
+from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.search.proposals import Proposals
 
@@ -30,19 +30,11 @@ AHEAD = 3
 one is confirmed for longer than another takes."""
 
 
-class _Pending(Protocol):
-    """Verdicts on their way."""
-
-    def result(self) -> Verdicts: ...
-
-    def cancel(self) -> object: ...
-
-
 class _Round(NamedTuple):
     """One round: its points, where it begins among those sent together, the state after it."""
 
     points: Float[Any, "n d"]
-    pending: _Pending
+    pending: Pending | Future[Verdicts]
     begin: int
     checkpoint: dict[str, Any]
 
@@ -120,7 +112,7 @@ class Prefetch:
         """Rows that are on their way at a time."""
         return AHEAD * self._batch if self._workers is None else self._workers.ahead
 
-    def _submit(self, points: Float[Any, "n d"], first: int) -> _Pending:
+    def _submit(self, points: Float[Any, "n d"], first: int) -> Pending | Future[Verdicts]:
         if self._thread is None:
             return self._evaluate.submit(points, first)
         return self._thread.submit(self._simulated, points, first)
