@@ -7,8 +7,7 @@ from sklearn.ensemble import ExtraTreesRegressor
 
 import verifai_jax as vj
 from verifai_jax.sweeps.fanova import Boxes, leaf_boxes, variance_shares
-from verifai_jax.sweeps.importance import hyperparameter_importance
-from verifai_jax.sweeps.trends import trends
+from verifai_jax.sweeps.importance import hyperparameter_importance, trends
 
 SPACE = vj.FeatureSpace(
     {
