@@ -28,7 +28,9 @@ SECONDS = 0.1
 """CPU time of one turn, so that the clock's resolution does not matter."""
 
 
-def prepare(file: Path, exchange: bool) -> tuple[list[str], Callable[[], Any], Callable[[], Any]] | None:
+def prepare(
+    file: Path, exchange: bool
+) -> tuple[list[str], Callable[[], Any], Callable[[], Any]] | None:
     """Return outputs, and functions that simulate once, here and by FMPy; None without any."""
     description: Any = read_model_description(str(file))
     offered = description.modelExchange if exchange else description.coSimulation
