@@ -77,7 +77,7 @@ def test_what_was_planted_is_found(planted):
     assert "return depends on discount" in text
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_components_of_the_unsafe_and_the_safe(planted):
     # The learning rate is confined to one half of its range in both, so others vary more.
     for components in (planted.unsafe, planted.safe):
