@@ -93,7 +93,7 @@ class Domain(ForUsers, abc.ABC):
     ))  # fmt: skip
 
     arguments: ClassVar[tuple[str, ...] | None] = None
-    """Attributes of which it can be made again, for JSON; None for a domain of a user's own."""
+    """Attributes from which it can be rebuilt; None for a domain defined by a user."""
 
     def __repr__(self) -> str:
         if self.arguments is None:
@@ -224,7 +224,7 @@ class Domain(ForUsers, abc.ABC):
         return one_line(repr(self))
 
     def parts(self, name: str) -> "tuple[tuple[str, Domain], ...]":
-        """Return the domains of which each value is made, with the names of their columns.
+        """Return the domains of a value's parts, with the names of their columns.
 
         **Arguments:**
 
@@ -405,7 +405,7 @@ def as_numbers(value: object, name: str) -> Float[np.ndarray, "*shape"]:
 
 
 _NO_NUMBERS = (str, bytes, complex, np.complexfloating, np.datetime64, np.timedelta64)
-"""Types that NumPy converts to a real number, and that are none."""
+"""Types that NumPy converts to real numbers, although they are not numbers here."""
 
 
 def as_scalar(value: Value) -> Value:

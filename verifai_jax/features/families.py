@@ -2,8 +2,8 @@
 
     FeatureSpace({"load": LogNormal(3.0, 0.5), "wait": Exponential(12.0)})
 
-As of a `Normal`, coordinates reach a probability of 2^-26 (1.5e-8) on either side, and 0 and 1
-stand for the values there.
+As with `Normal`, coordinates reach tails of probability 2^-26 (1.5e-8); 0 and 1 stand for the
+values there.
 """
 
 import math

@@ -292,7 +292,7 @@ class Next(Formula):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Prev(Formula):
-    """`f` at the previous sample; where there is none, false (or true, if `weak`)."""
+    """`f` at the previous sample; at the first one, false (or true, if `weak`)."""
 
     operand: Formula
     weak: bool = False
