@@ -85,7 +85,7 @@ def _tested_files() -> list[Path]:
     try:
         options = tomllib.loads(file.read_text(encoding="utf-8")).get("tool", {}).get("pytest", {})
     except ValueError as error:
-        raise ValueError(f"{file} is no TOML: {error}") from None
+        raise ValueError(f"{file} is not TOML: {error}") from None
     patterns = options.get("ini_options", {}).get("vj_specs", [])
     patterns = patterns.split() if isinstance(patterns, str) else patterns
     return sorted({path for pattern in patterns for path in Path().glob(str(pattern))})

@@ -282,7 +282,8 @@ class Domain(ForUsers, abc.ABC):
         return None
 
     def spans(self, duration: float) -> list[tuple[float, float]] | None:
-        """Return from when to when each control point acts, in seconds; None without any.
+        """Return the begin and the end of the time in which each control point acts, in seconds, or
+        None.
 
         **Arguments:**
 
