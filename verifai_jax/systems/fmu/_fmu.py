@@ -111,29 +111,27 @@ class FMUSimulation:
         features: Features,
     ) -> Trace:
         steps = round(self.duration / self.dt)
-        names = list(self.outputs.values())
-        rows = np.zeros((steps + 1, len(names)))
+        names = tuple(self.outputs.values())
 
         def at(time: float) -> dict[str, float]:
             return {name: float(course(time)) for name, course in moving.items()}
 
         instance.begin({**constant, **at(0.0)}, steps * self.dt)
-        rows[0], valid = instance.get(names), 1
+        rows = [instance.get(names)]
         for step in range(steps):
             time = step * self.dt
-            inputs = at(time)
+            inputs = at(time) if moving else {}
             if self.controller is not None:
-                seen = dict(zip(self.outputs, rows[step].tolist(), strict=True))
+                seen = dict(zip(self.outputs, rows[step], strict=True))
                 inputs.update(self.controller(time, seen, features))
             if inputs:
                 instance.set(inputs)
-            going = instance.step(time, self.dt)
-            if not going:
+            if not instance.step(time, self.dt):
                 break
-            rows[step + 1] = instance.get(names)
-            valid += 1
-        rows[valid:] = rows[valid - 1]
-        signals = {name: rows[:, i] for i, name in enumerate(self.outputs)}
+            rows.append(instance.get(names))
+        valid = len(rows)
+        table = np.array(rows + rows[-1:] * (steps + 1 - valid))
+        signals = {name: table[:, i] for i, name in enumerate(self.outputs)}
         return Trace(signals, dt=self.dt, valid=None if valid > steps else np.int32(valid))
 
     def _variable(self, feature: str) -> str | None:

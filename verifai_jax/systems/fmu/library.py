@@ -8,10 +8,11 @@ An FMU is a program of this process: what it does to the process it does to the 
 """
 
 import ctypes
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from ctypes import byref, c_bool, c_char_p, c_double, c_int, c_size_t, c_uint32, c_void_p
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from verifai_jax.systems.fmu.description import Description, Variable
 
@@ -43,6 +44,16 @@ class _Callbacks(ctypes.Structure):
     )
 
 
+class _Group(NamedTuple):
+    """Variables of one type, with their indices, and arguments by which they are set and read."""
+
+    kind: str
+    getter: str
+    indices: list[int]
+    buffer: Any
+    arguments: tuple[Any, ...]
+
+
 class FMUError(RuntimeError):
     """A function of an FMU failed; the message is what the FMU said."""
 
@@ -60,8 +71,9 @@ class Instance:
 
     def __init__(self, description: Description, folder: Path) -> None:
         self.description, self.messages = description, []
-        self._groups: dict[tuple[str, ...], list[tuple[str, list[int], Any, Any]]] = {}
+        self._groups: dict[tuple[str, ...], list[_Group]] = {}
         self._functions: dict[str, Any] = {}
+        self._bound: dict[str, Callable[..., int]] = {}
         self._two, three = description.version == 2, description.version == 3
         self._prefix = f"fmi{description.version}"
         try:
@@ -93,6 +105,13 @@ class Instance:
         if not self._component:
             raise FMUError(f"{description.file.name} made no instance{self._said()}")
         self._begun = False
+        # Arguments of a step in C's types, made once: FMI 3 answers by flags and a time.
+        self._clock, self._span = c_double(), c_double()
+        self._step_flags: Any = (c_bool * 3)()
+        self._reached_time = c_double()
+        flags = [byref(self._step_flags, i) for i in range(3)]
+        answers = () if self._two else (*flags, byref(self._reached_time))
+        self._rest_of_step = ((c_int if self._two else c_bool)(1), *answers)
 
     def begin(self, values: Mapping[str, float], duration: float) -> None:
         """Set start values, and initialize; after an earlier simulation the instance is reset."""
@@ -114,32 +133,30 @@ class Instance:
 
     def step(self, time: float, size: float) -> bool:
         """Simulate one step; False if the FMU ended its simulation."""
-        if self._two:
-            status = self._call("DoStep", c_double(time), c_double(size), c_int(1))
-            return status != DISCARD
-        flags = [c_bool(False) for _ in range(3)]
-        last = c_double(0.0)
-        pointers = (byref(flag) for flag in flags)
-        status = self._call(
-            "DoStep", c_double(time), c_double(size), c_bool(True), *pointers, byref(last)
-        )
-        return status != DISCARD and not flags[1].value
+        self._clock.value, self._span.value = time, size
+        status = self._call("DoStep", self._clock, self._span, *self._rest_of_step)
+        return status != DISCARD and not self._step_flags[1]
 
     def set(self, values: Mapping[str, float]) -> None:
         """Set variables by name."""
-        for kind, indices, references, buffer in self._grouped(tuple(values)):
-            numbers = list(values.values())
-            for i, index in enumerate(indices):
-                buffer[i] = numbers[index] if kind in FLOATS else round(numbers[index])
-            self._exchange("Set", kind, references, buffer)
+        numbers = list(values.values())
+        for group in self._grouped(tuple(values)):
+            for i, index in enumerate(group.indices):
+                number = numbers[index]
+                group.buffer[i] = number if group.kind in FLOATS else round(number)
+            self._call(f"Set{group.kind}", *group.arguments)
 
-    def get(self, names: Sequence[str]) -> list[float]:
+    def get(self, names: tuple[str, ...]) -> list[float]:
         """Return the values of variables by name."""
+        groups = self._grouped(names)
+        for group in groups:
+            self._call(group.getter, *group.arguments)
+        if len(groups) == 1:
+            return [*map(float, groups[0].buffer)]
         found = [0.0] * len(names)
-        for kind, indices, references, buffer in self._grouped(tuple(names)):
-            self._exchange("Get", kind, references, buffer)
-            for i, index in enumerate(indices):
-                found[index] = float(buffer[i])
+        for group in groups:
+            for index, value in zip(group.indices, group.buffer, strict=True):
+                found[index] = float(value)
         return found
 
     def free(self) -> None:
@@ -148,44 +165,41 @@ class Instance:
         if component:
             self._function("FreeInstance", None)(c_void_p(component))
 
-    def _grouped(self, names: tuple[str, ...]) -> list[tuple[str, list[int], Any, Any]]:
-        """Return variables by type: their indices, references, and a buffer for their values."""
+    def _grouped(self, names: tuple[str, ...]) -> "list[_Group]":
+        """Return variables by type, with memory for their values."""
         if names not in self._groups:
-            by_type: dict[str, list[tuple[int, Variable]]] = {}
+            by_type: dict[str, dict[int, Variable]] = {}
             for index, name in enumerate(names):
                 variable = self.description.variable(name)
-                by_type.setdefault(variable.type, []).append((index, variable))
-            self._groups[names] = [
-                (
-                    kind,
-                    [index for index, _ in those],
-                    (c_uint32 * len(those))(*(variable.reference for _, variable in those)),
-                    (self._c_type(kind) * len(those))(),
-                )
-                for kind, those in by_type.items()
-            ]
+                by_type.setdefault(variable.type, {})[index] = variable
+            self._groups[names] = [self._group(kind, those) for kind, those in by_type.items()]
         return self._groups[names]
 
-    def _c_type(self, kind: str) -> Any:
-        return c_bool if kind == "Boolean" and not self._two else C_TYPES[kind]
-
-    def _exchange(self, verb: str, kind: str, references: Any, buffer: Any) -> None:
-        count = c_size_t(len(references))
-        counts = () if self._two else (count,)
-        self._call(f"{verb}{kind}", references, count, buffer, *counts)
+    def _group(self, kind: str, variables: Mapping[int, Variable]) -> "_Group":
+        references = (c_uint32 * len(variables))(*(v.reference for v in variables.values()))
+        c_type = c_bool if kind == "Boolean" and not self._two else C_TYPES[kind]
+        buffer, count = (c_type * len(variables))(), c_size_t(len(variables))
+        arguments = (references, count, buffer, *(() if self._two else (count,)))
+        return _Group(kind, f"Get{kind}", [*variables], buffer, arguments)
 
     def _call(self, name: str, *arguments: Any) -> int:
         """Call a function of the instance.
 
         **Raises:** `FMUError` where it fails.
         """
-        status = self._function(name, c_int)(c_void_p(self._component), *arguments)
-        if status > DISCARD or (status == DISCARD and name != "DoStep"):
+        status = (self._bound.get(name) or self._bind(name))(*arguments)
+        if status > WARNING and (status > DISCARD or name != "DoStep"):
             raise FMUError(
                 f"{self._prefix}{name} of {self.description.file.name} failed with status "
                 f"{status}{self._said()}"
             )
         return status
+
+    def _bind(self, name: str) -> Callable[..., int]:
+        """Return a function of the instance; calls are many, so it is looked up once."""
+        function = self._function(name, c_int)
+        self._bound[name] = partial(function, c_void_p(self._component))
+        return self._bound[name]
 
     def _function(self, name: str, returns: Any) -> Any:
         if name not in self._functions:
