@@ -28,7 +28,9 @@ SECONDS = 0.1
 """CPU time of one turn, so that the clock's resolution does not matter."""
 
 
-def prepare(file: Path, exchange: bool) -> tuple[list[str], Callable[[], Any], Callable[[], Any]] | None:
+def prepare(
+    file: Path, exchange: bool
+) -> tuple[list[str], Callable[[], Any], Callable[[], Any]] | None:
     """Return outputs, and functions that simulate once, here and by FMPy; None without any."""
     description: Any = read_model_description(str(file))
     offered = description.modelExchange if exchange else description.coSimulation
@@ -51,9 +53,11 @@ def prepare(file: Path, exchange: bool) -> tuple[list[str], Callable[[], Any], C
     kind = "ModelExchange" if exchange else "CoSimulation"
     folder = extract(str(file), tempfile.mkdtemp())
     instance = instantiate_fmu(folder, description, kind)
+    new = instance.getFMUState() if description.fmiVersion[0] == "3" else instance.getFMUstate()
+    restore = instance.setFMUState if description.fmiVersion[0] == "3" else instance.setFMUstate
 
     def theirs() -> Any:
-        instance.reset()
+        restore(new)
         return simulate_fmu(
             folder, validate=False, stop_time=duration, output_interval=dt, output=outputs,
             relative_tolerance=TOLERANCE, record_events=False, fmi_type=kind,
@@ -64,11 +68,11 @@ def prepare(file: Path, exchange: bool) -> tuple[list[str], Callable[[], Any], C
 
 
 def difference(outputs: list[str], trace: Any, table: Any) -> float:
-    """Return the greatest difference between both results, as a share of a signal's range."""
+    """Return the greatest difference before an early end, as a share of a signal's range."""
     found = 0.0
     for signal, name in zip(trace.signals.values(), outputs, strict=True):
         ours, theirs = np.asarray(signal, float), np.asarray(table[name], float)
-        length = min(len(ours), len(theirs))
+        length = min(len(ours) if trace.valid is None else int(trace.valid), len(theirs))
         gap = np.abs(ours[:length] - theirs[:length]).max()
         found = max(found, gap / max(np.ptp(theirs), 1e-9))
     return found
