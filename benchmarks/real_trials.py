@@ -52,9 +52,9 @@ def main() -> None:
         covered += [row[0] for row in rows]
         share, needed = np.mean([row[0] for row in rows]), np.array([row[1] for row in rows])
         print(
-            f"{kind:12} {len(rows)} worlds, covered {share:z.3f}, trials needed "
-            f"{needed.mean():z.2f} of those of Clopper and Pearson (median {np.median(needed):z.2f}, "
-            f"greatest {needed.max():z.2f})",
+            f"{kind:12} {len(rows)} worlds, covered {share:z.3f}, trials needed, as a share of "
+            f"those of Clopper and Pearson: mean {needed.mean():z.2f}, median "
+            f"{np.median(needed):z.2f}, greatest {needed.max():z.2f}",
             flush=True,
         )
     print(f"all: covered {np.mean(covered):z.3f}")
