@@ -48,7 +48,7 @@ class Importance(Drawn, InNotebook):
     not trained on; `missing`: why there is no model of the one or the other; `name` of the run.
     """
 
-    _picture = "bars", "plot_importance"
+    _picture = "overview", "plot_importance"
     """The losses as bars."""
 
     table: pd.DataFrame

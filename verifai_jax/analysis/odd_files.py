@@ -24,8 +24,8 @@ from verifai_jax.analysis.odd_conditions import (
 )
 from verifai_jax.analysis.operational_domain import OperationalDomain
 from verifai_jax.core.errors import check_names, unknown_name
+from verifai_jax.core.foreign_files import read_yaml
 from verifai_jax.core.reads import documents
-from verifai_jax.core.yaml import read_yaml
 from verifai_jax.features import FeatureSpace
 
 ABOUT = ("attribute", "unit", "reason", "source")

@@ -105,9 +105,9 @@ BACKEND = click.option(
 ENGINE = click.option(
     "--engine",
     type=click.Choice(["auto", "xla", "native"]),
-    default="xla",
+    default="auto",
     show_default=True,
-    help="native: code by this machine's C++ compiler, for many simulations.",
+    help="native: code by this machine's C++ compiler, auto: for many simulations.",
 )
 """What a traced system is compiled by."""
 

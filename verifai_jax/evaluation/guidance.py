@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from verifai_jax.core.outcomes import OUTCOME, SEGMENTS, SIGNALS
+from verifai_jax.core.clauses import OUTCOME, SEGMENTS, SIGNALS
 from verifai_jax.core.trace import Trace, as_array
 from verifai_jax.mtl.deciding import deciding_instant
 from verifai_jax.problem.problem import Problem

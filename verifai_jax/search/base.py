@@ -21,10 +21,9 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.checks import check_count, check_fraction
-from verifai_jax.core.clauses import CLAUSES
+from verifai_jax.core.clauses import CLAUSES, OUTCOME
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.notebook import ForUsers
-from verifai_jax.core.outcomes import OUTCOME
 
 KIND = 1 << 16
 """Coverage ids of one kind: a coverage id is `kind * KIND + number`. An int32 has room for 32 768

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from verifai_jax.core.outcomes import OUTCOME, SEGMENTS, SIGNALS
+from verifai_jax.core.clauses import OUTCOME, SEGMENTS, SIGNALS
 
 MEMORY = 256
 """Outcomes that are remembered; the last ones. As many as `Diverse` archives failures by

@@ -7,7 +7,7 @@ Classes are recognised by their names: Gymnasium is an optional package, and old
 same.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -248,3 +248,12 @@ def named_numbers(name: str, value: object) -> dict[str, np.ndarray]:
     for key, part in parts:
         named |= named_numbers(f"{name}.{key}" if name else str(key), part)
     return named
+
+
+# What environments compute once from their attributes, and would not follow a feature.
+DERIVED: dict[str, dict[str, Callable[[Any], Any]]] = {
+    "CartPoleEnv": {
+        "total_mass": lambda env: env.masspole + env.masscart,
+        "polemass_length": lambda env: env.masspole * env.length,
+    }
+}

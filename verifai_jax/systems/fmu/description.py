@@ -16,7 +16,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from verifai_jax.core.errors import missing_name
-from verifai_jax.core.xml import read_xml
+from verifai_jax.core.foreign_files import read_xml
 
 MAX_BYTES = 64 << 20
 """Bytes of a description at most."""

@@ -20,8 +20,7 @@ from typing import Any
 from verifai_jax.core.trace import Status
 from verifai_jax.systems.base import Outcome
 from verifai_jax.systems.remote import connection, wire
-from verifai_jax.systems.remote.absence import Absence
-from verifai_jax.systems.remote.connection import Batch, Client, Point, Rules, keep_alive
+from verifai_jax.systems.remote.connection import Absence, Batch, Client, Point, Rules, keep_alive
 
 log = logging.getLogger("verifai_jax.remote")
 
