@@ -5,12 +5,13 @@
     (x > 1).until(signal("y") >= 0, 0.2, 0.6)
 
 A formula is a frozen tree, hashable and equal by value, so it is a static argument under `jax.jit`.
-Sugar (implication, equivalence, weak until, release) is rewritten into the few nodes below when it
-is written, and restored when it is printed. The table `OPERATORS` of `words` describes an operator;
-its kind of node gives its meaning: `Join`, `Window`, `Witness`, or `Derived` from other operators.
+Implication, weak until and the like are rewritten into the nodes below, and restored in print. The
+table `OPERATORS` of `words` describes an operator; its kind of node gives its meaning: `Join`,
+`Window`, `Witness`, or `Derived` from other operators.
 """
 
 import abc
+import functools
 import html
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -32,7 +33,8 @@ Formulaic: TypeAlias = Union["Formula", Term]
 class Formula(Tree):
     """A property of a trace at every instant, true or false, with a margin (its robustness)."""
 
-    children: ClassVar[tuple[str, ...]] = ()
+    children: ClassVar[tuple[str, ...]] = ("operand",)
+    """Names of the fields that hold operands."""
 
     def __and__(self, other: Formulaic) -> "Formula":
         return conjunction(self, other)
@@ -154,6 +156,7 @@ class Formula(Tree):
 class Leaf(Formula):
     """A formula without operands."""
 
+    children = ()
     timeless = True
 
 
@@ -164,7 +167,6 @@ class Constant(Leaf):
     value: bool
 
     def text(self) -> Text:
-        """Return `TRUE` or `FALSE`."""
         return Text("TRUE" if self.value else "FALSE", "name")
 
 
@@ -186,16 +188,13 @@ class Predicate(Leaf):
             )
 
     def terms(self) -> tuple[Term, ...]:
-        """Return both sides."""
         return self.left, self.right
 
     @property
     def compared(self) -> tuple[Term, str, Term]:
-        """Both sides with the comparison between them."""
         return self.left, self.comparison, self.right
 
     def text(self) -> Text:
-        """Return both sides with the comparison between them."""
         return Text(f"{self.left} {self.comparison} {self.right}", "leaf")
 
 
@@ -213,11 +212,9 @@ class Atom(Leaf):
             )
 
     def terms(self) -> tuple[Term, ...]:
-        """Return the expression."""
         return (self.expression,)
 
     def text(self) -> Text:
-        """Return the text of the expression."""
         text = str(self.expression)
         # A signal or one of its components ends where it ends, whatever comes after it.
         return Text(text, "name" if self.expression.is_signal else "leaf")
@@ -228,7 +225,6 @@ class Not(Formula):
     """`!f`."""
 
     operand: Formula
-    children: ClassVar[tuple[str, ...]] = ("operand",)
     word = "not"
 
 
@@ -259,7 +255,6 @@ class Window(Formula):
 
     operand: Formula
     interval: Interval = field(default=EVERYTHING)
-    children: ClassVar[tuple[str, ...]] = ("operand",)
     sign: ClassVar[int]
 
 
@@ -292,17 +287,15 @@ class Next(Formula):
     """`f` at the next sample; at the last one, `f` there, whatever the end of trace."""
 
     operand: Formula
-    children: ClassVar[tuple[str, ...]] = ("operand",)
     word = "next"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Prev(Formula):
-    """`f` at the previous sample; where there is none, false (or true, if `weak`)."""
+    """`f` at the previous sample; at the first one, false (or true, if `weak`)."""
 
     operand: Formula
     weak: bool = False
-    children: ClassVar[tuple[str, ...]] = ("operand",)
 
     @property
     def word(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -340,17 +333,22 @@ class Derived(Formula, abc.ABC):
 
     timeless = True  # Its meaning is what looks ahead or back.
 
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if isinstance(meaning := vars(cls).get("meaning"), property):
+            # Made once, since walks know a part by its identity.
+            cls.meaning = functools.cached_property(meaning.fget)  # pyright: ignore
+            cls.meaning.__set_name__(cls, "meaning")
+
     @property
     @abc.abstractmethod
     def meaning(self) -> Formula:
         """The formula of other operators that it stands for."""
 
     def below(self) -> tuple[Node, ...]:
-        """Return the nodes among its fields, and its meaning."""
         return *super().below(), self.meaning
 
     def valued(self) -> tuple[Formula, ...]:
-        """Return its meaning."""
         return (self.meaning,)
 
 
@@ -388,8 +386,7 @@ def build(word: str, operands: Iterable[Formula], interval: Interval = EVERYTHIN
 def surface(f: Formula) -> tuple[str, tuple[Formula, ...], Interval | None]:
     """Return how a formula reads: its operator's word, the operands, and the interval if any.
 
-    Sugar that was rewritten away (`->`, `<->`, `xor`, weak until, release, rise, fall) is
-    recognised.
+    Sugar that was rewritten away, such as `->` or `rise`, is recognised.
     """
     match f:
         case Not(Or((And((p, q)), And((Not(r), Not(s)))))) if p == r and q == s:
