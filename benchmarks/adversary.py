@@ -95,6 +95,7 @@ class Game:
 
     def played(self, plant, disturbance, period):
         """Return the smallest margin of a period, and the state after it."""
+
         def small(carry, _):
             now, time = carry
             after = substep(self.loop, {}, disturbance, time, now, self.loop.dt)
