@@ -29,7 +29,7 @@ class Mostly(ast.Formula):
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class Coin(ast.Leaf):
+class Coin(ast.Formula):
     """A leaf of somebody else's."""
 
 
