@@ -6,7 +6,7 @@
 
 A formula is a frozen tree, hashable and equal by value, so that `jax.jit` takes it as static. The
 table `OPERATORS` of `words` describes an operator; its kind of node gives its meaning: `Join`,
-`Window`, `Witness`, or `Derived` from others, as implication and weak until are.
+`Window`, `Witness`, or `Derived`. Implication and weak until are these, but print as written.
 """
 
 import abc
