@@ -53,9 +53,11 @@ def prepare(
     kind = "ModelExchange" if exchange else "CoSimulation"
     folder = extract(str(file), tempfile.mkdtemp())
     instance = instantiate_fmu(folder, description, kind)
+    new = instance.getFMUState() if description.fmiVersion[0] == "3" else instance.getFMUstate()
+    restore = instance.setFMUState if description.fmiVersion[0] == "3" else instance.setFMUstate
 
     def theirs() -> Any:
-        instance.reset()
+        restore(new)
         return simulate_fmu(
             folder, validate=False, stop_time=duration, output_interval=dt, output=outputs,
             relative_tolerance=TOLERANCE, record_events=False, fmi_type=kind,
@@ -66,11 +68,11 @@ def prepare(
 
 
 def difference(outputs: list[str], trace: Any, table: Any) -> float:
-    """Return the greatest difference between both results, as a share of a signal's range."""
+    """Return the greatest difference before an early end, as a share of a signal's range."""
     found = 0.0
     for signal, name in zip(trace.signals.values(), outputs, strict=True):
         ours, theirs = np.asarray(signal, float), np.asarray(table[name], float)
-        length = min(len(ours), len(theirs))
+        length = min(len(ours) if trace.valid is None else int(trace.valid), len(theirs))
         gap = np.abs(ours[:length] - theirs[:length]).max()
         found = max(found, gap / max(np.ptp(theirs), 1e-9))
     return found

@@ -4,10 +4,9 @@
     always((abs(x) <= 2.4) & (theta.abs() <= 0.2095), 0, 4)
     (x > 1).until(signal("y") >= 0, 0.2, 0.6)
 
-A formula is a frozen tree, hashable and equal by value, so it is a static argument under `jax.jit`.
-Implication, weak until and the like are rewritten into the nodes below, and restored in print. The
+A formula is a frozen tree, hashable and equal by value, so that `jax.jit` takes it as static. The
 table `OPERATORS` of `words` describes an operator; its kind of node gives its meaning: `Join`,
-`Window`, `Witness`, or `Derived` from other operators.
+`Window`, `Witness`, or `Derived`. Implication and weak until are these, but print as written.
 """
 
 import abc
@@ -33,7 +32,7 @@ Formulaic: TypeAlias = Union["Formula", Term]
 class Formula(Tree):
     """A property of a trace at every instant, true or false, with a margin (its robustness)."""
 
-    children: ClassVar[tuple[str, ...]] = ("operand",)
+    children: ClassVar[tuple[str, ...]] = ()
     """Names of the fields that hold operands."""
 
     def __and__(self, other: Formulaic) -> "Formula":
@@ -156,7 +155,6 @@ class Formula(Tree):
 class Leaf(Formula):
     """A formula without operands."""
 
-    children = ()
     timeless = True
 
 
@@ -225,6 +223,7 @@ class Not(Formula):
     """`!f`."""
 
     operand: Formula
+    children = ("operand",)
     word = "not"
 
 
@@ -254,6 +253,7 @@ class Window(Formula):
     """The least (`sign` -1) or the greatest (1) value over an interval, ahead or back."""
 
     operand: Formula
+    children = ("operand",)
     interval: Interval = field(default=EVERYTHING)
     sign: ClassVar[int]
 
@@ -287,6 +287,7 @@ class Next(Formula):
     """`f` at the next sample; at the last one, `f` there, whatever the end of trace."""
 
     operand: Formula
+    children = ("operand",)
     word = "next"
 
 
@@ -295,6 +296,7 @@ class Prev(Formula):
     """`f` at the previous sample; at the first one, false (or true, if `weak`)."""
 
     operand: Formula
+    children = ("operand",)
     weak: bool = False
 
     @property
@@ -331,6 +333,7 @@ class Derived(Formula, abc.ABC):
     A subclass has its operands and its interval as fields, and defines `meaning`.
     """
 
+    children = ("operand",)
     timeless = True  # Its meaning is what looks ahead or back.
 
     def __init_subclass__(cls) -> None:

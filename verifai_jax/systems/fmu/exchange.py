@@ -46,8 +46,7 @@ class _EventInfo(Structure):
 class ExchangeInstance(Instance):
     """An instance of an FMU for model exchange; arguments and errors are those of `Instance`."""
 
-    _running = False
-    _solver: Any = None
+    _running = _prepared_for_states = False
 
     def begin(self, values: Mapping[str, float], duration: float) -> None:
         """Set start values, and initialize; after an earlier simulation the instance is reset."""
@@ -55,19 +54,29 @@ class ExchangeInstance(Instance):
         super().begin(values, duration)
         self._running, self._ended = True, False
         self._inputs, self._time, self._longest = dict(values), 0.0, duration / MIN_STEPS
-        size, count = self._sizes()
+        if not self._prepared_for_states:
+            self._prepare(*self._sizes())
+        self._solver: Any = self._integrator() if self._size else None
+        self._settle()
+
+    def _prepare(self, size: int, count: int) -> None:
+        """Make memory for states and indicators, and the calls that use it."""
+        self._size, self._watched = size, count
         self._states, self._state_view = _shared(size)
         self._slopes, self._slope_view = _shared(size)
-        self._indicators, self._indicator_view = _shared(count)
+        indicators, self._indicator_view = _shared(count)
         self._values_before = np.zeros(count)
-        # Arguments in C's types, made once.
-        self._size, self._count = c_size_t(size), c_size_t(count)
         kind = c_int if self._two else c_bool
-        self._asks, self._ends, self._clock = kind(), kind(), c_double()
-        self._step_ends = kind(True), byref(self._asks), byref(self._ends)
-        self._slopes_name = "GetDerivatives" if self._two else "GetContinuousStateDerivatives"
-        self._solver = self._integrator() if size else None
-        self._settle()
+        self._asks, self._ends = kind(), kind()
+        slopes = "Derivatives" if self._two else "ContinuousStateDerivatives"
+        self._set_time = self._prepared("SetTime", self._clock)
+        self._set_states = self._prepared("SetContinuousStates", self._states, c_size_t(size))
+        self._get_states = self._prepared("GetContinuousStates", self._states, c_size_t(size))
+        self._get_slopes = self._prepared(f"Get{slopes}", self._slopes, c_size_t(size))
+        self._get_indicators = self._prepared("GetEventIndicators", indicators, c_size_t(count))
+        ask = (kind(True), byref(self._asks), byref(self._ends))
+        self._complete = self._prepared("CompletedIntegratorStep", *ask)
+        self._prepared_for_states = True
 
     def set(self, values: Mapping[str, float]) -> None:
         """Set variables by name; a change of an input is an event."""
@@ -90,9 +99,10 @@ class ExchangeInstance(Instance):
             if self._time >= end or self._ended:
                 return not self._ended
             event = self._integrate(min(end, self._next))
-            self._call("CompletedIntegratorStep", *self._step_ends)
-            self._ended = self._ended or bool(self._ends.value)
-            if self._asks.value or event or self._time >= self._next:
+            if self.description.asks_after_steps:
+                self._complete()
+                self._ended = self._ended or bool(self._ends.value)
+            if event or self._asks.value or self._time >= self._next:
                 events += 1
                 if events > MAX_EVENTS:
                     raise self._chatters("events in a step of communication")
@@ -101,22 +111,29 @@ class ExchangeInstance(Instance):
         raise self._unsolved(end)
 
     def _integrate(self, end: float) -> bool:
-        """Take one step of the integrator at most, and return whether an indicator has changed."""
+        """Take one step of the integrator at most, and return whether an indicator has changed.
+
+        An FMU that need not see each step of the integrator is taken to the last one only.
+        """
         begin = self._time
         if self._solver is not None:
             if self._reached <= begin:
-                self._advance(begin)
+                self._advance()
+            if self._reached < end and not (self._watched or self.description.asks_after_steps):
+                self._time = self._reached
+                return False
             end = min(end, self._reached)
-        self._values_before[:] = self._indicator_view
+        if self._watched:
+            self._values_before[:] = self._indicator_view
         self._go(end)
         if self._signs() == self._signs_before:
             return False
         self._find_event(begin, end)
         return True
 
-    def _advance(self, begin: float) -> None:
-        """Take one step of the integrator from a time."""
-        solver = self._solver
+    def _advance(self) -> None:
+        """Take one step of the integrator."""
+        solver, begin = self._solver, self._reached
         if self._restarts:
             solver.set_initial_value(self._state_view.copy(), begin)
             self._restarts = False
@@ -130,7 +147,7 @@ class ExchangeInstance(Instance):
         solver, self._time = self._solver, time
         if solver is None:
             self._clock.value = time
-            self._call("SetTime", self._clock)
+            self._set_time()
         else:
             self._move(time, solver.y if time == solver.t else solver.integrate(time))
 
@@ -161,28 +178,29 @@ class ExchangeInstance(Instance):
 
     def _signs(self) -> bytes:
         """Return which indicators are positive."""
-        if self._count.value:
-            self._call("GetEventIndicators", self._indicators, self._count)
+        if not self._watched:
+            return b""
+        self._get_indicators()
         return (self._indicator_view > 0).tobytes()
 
     def _slope(self, time: float, states: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         self._move(time, states)
-        self._call(self._slopes_name, self._slopes, self._size)
+        self._get_slopes()
         return self._slope_view
 
     def _move(self, time: float, states: Float[np.ndarray, " n"]) -> None:
         """Take the FMU to a time and its states."""
         self._clock.value = time
-        self._call("SetTime", self._clock)
+        self._set_time()
         self._state_view[:] = states
-        self._call("SetContinuousStates", self._states, self._size)
+        self._set_states()
 
     def _integrator(self) -> Any:
         """Make the integrator of this simulation."""
         from scipy.integrate import ode
 
-        nominals, nominal = _shared(self._size.value)
-        self._call("GetNominalsOfContinuousStates", nominals, self._size)
+        nominals, nominal = _shared(self._size)
+        self._call("GetNominalsOfContinuousStates", nominals, c_size_t(self._size))
         tolerances = TOLERANCE * np.where(nominal == 0, 1.0, np.abs(nominal))
         solver: Any = ode(self._slope).set_integrator(
             "lsoda", rtol=TOLERANCE, atol=tolerances, max_step=self._longest
@@ -199,8 +217,8 @@ class ExchangeInstance(Instance):
         else:
             raise self._chatters("rounds of one event")
         self._call("EnterContinuousTimeMode")
-        if self._size.value:
-            self._call("GetContinuousStates", self._states, self._size)
+        if self._size:
+            self._get_states()
         self._signs_before, self._reached, self._restarts = self._signs(), self._time, True
 
     def _event(self) -> bool:
