@@ -28,8 +28,8 @@ from verifai_jax.core.errors import UnknownNameError, missing_name, nearest_name
 from verifai_jax.core.text import format_time, printable
 
 if TYPE_CHECKING:
+    from verifai_jax import Formula
     from verifai_jax.core.trace import Trace
-    from verifai_jax.mtl import Formula
     from verifai_jax.mtl.resampling import Missing
 
 
