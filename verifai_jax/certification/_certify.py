@@ -339,7 +339,7 @@ def repeat_failures(
 
     - `blocks`: that simulate the policies.
     - `policy`: its number.
-    - `sampled`, `attacked`: its simulations, of which verdicts are replaced.
+    - `sampled`, `attacked`: its simulations, whose verdicts are replaced.
 
     **Returns:** the counts, which as text say what that means of the system.
     """

@@ -149,7 +149,7 @@ CORPUS = "counterexamples"
 
 @dataclass(frozen=True)
 class Session:
-    """The settings of one test, given by whoever runs it.
+    """The settings of one test, given by the test runner.
 
     - `root`: folder that the corpus lies in.
     - `corpus`: folder of the corpus, as a path from there.
@@ -190,5 +190,5 @@ def session(settings: Session) -> Iterator[Session]:
 
 
 def current_session() -> Session:
-    """Return the session, or that of whoever calls a test as a plain function."""
+    """Return the session, or default settings when a test is called as a plain function."""
     return _SESSION.get() or Session()

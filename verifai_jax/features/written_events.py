@@ -85,7 +85,7 @@ class WrittenEvents:
         )
 
     def _absent(self, dtype: Any) -> dict[str, jax.Array]:
-        """Return what each parameter is where there is none."""
+        """Return the value of each parameter in an empty slot."""
         return {
             name: domains[0].from_unit(jnp.full(domains[0].size, 0.5, dtype))
             for name, domains in self.tables.domains.items()

@@ -184,7 +184,7 @@ class FormulaBuilder(ExpressionBuilder):
             )
 
     def _touching(self, tree: Tree, side: int) -> Tree | None:
-        """Return the arithmetic of an operand of `^` where it touches it; None if there is none."""
+        """Return the arithmetic of an operand of `^` where it touches it, or None."""
         while tree.data in _CONNECTIVES and (side or tree.data not in ("negation", "temporal")):
             tree = tree.children[side]
         match tree.data:
@@ -316,7 +316,7 @@ class FormulaBuilder(ExpressionBuilder):
 
 
 def _edge(tree: Tree, side: int) -> Tree:
-    """Return the first (0) or last (-1) operand in a tree that is none of an open operator."""
+    """Return the first (0) or last (-1) operand in a tree outside of an open operator."""
     while tree.data in (*_CONNECTIVES, "cmp", "sum", "product", "power"):
         if not isinstance(tree.children[side], Tree):
             break

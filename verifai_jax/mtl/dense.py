@@ -185,7 +185,7 @@ def window(
 
 
 class _Highest:
-    """The greatest of the values from one index to another, both included; -inf if there is none.
+    """The greatest of the values from one index to another, both included; -inf for no values.
 
     A table of the extremes of 1, 2, 4, 8 ... neighbours.
     """

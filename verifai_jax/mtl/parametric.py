@@ -5,8 +5,8 @@
     template.formula({"T": 4.0, "d": 2.0})
     template.direction("d")               # -1: a larger d is harder to satisfy
 
-A text is parsed once. A number stands in the tree as a signal named `?d`, and a time as a float
-that nobody writes, so that putting values in is a walk over the tree.
+A text is parsed once. In the tree a number is a signal named `?d`, and a time is a float that no
+text has, so values are put in by a walk over the tree.
 
 The file `templates.toml` is a library of requirements that people often write, with their sources:
 

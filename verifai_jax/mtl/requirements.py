@@ -49,7 +49,7 @@ class Requirement:
     """A demand with an identifier, and the formula that stands for it.
 
     - `id`: by which tables and reports name it.
-    - `formula`: what is required; None for one of which a problem has the formula, or nobody.
+    - `formula`: what is required; None if a problem has the formula, or if it is not written yet.
     - `text`: the sentence that the formula stands for.
     - `unit`: the unit of its robustness.
     - `source`: a standard or a document, with its number.
@@ -261,7 +261,7 @@ def read_reqif(path: Path, fields: Sequence[str]) -> list[dict[str, object]]:
     an id has its identifier in the file as one. Its `links` are those that it has, and the targets
     of its relations.
 
-    **Raises:** `ValueError` for what is no ReqIF, or declares a document type.
+    **Raises:** `ValueError` for a file that is not ReqIF, or declares a document type.
     """
     root = read_xml(path.read_bytes(), str(path))
     if _tag(root) != "REQ-IF":

@@ -98,7 +98,7 @@ class Scene:
         return depth
 
     def _kinds(self) -> list[list[Solid]]:
-        """Return the solids of each kind that there are."""
+        """Return the solids of each kind."""
         groups = [[solid for solid in self.solids if type(solid) is kind] for kind in KINDS]
         return [group for group in groups if group]
 

@@ -84,7 +84,7 @@ def plot_clusters(clusters: Clusters, path: str | Path | None = None) -> Figure:
 
 
 def distinguishing_columns(clusters: Clusters) -> tuple[str, str]:
-    """Return the two columns of which the clusters explain most of the variation."""
+    """Return the two columns whose variation the clusters explain best."""
 
     def explained(total: Float[np.ndarray, "n d"]) -> float:
         spread = ((total - total.mean(axis=0)) ** 2).sum()

@@ -313,7 +313,7 @@ def _is_own(kind: type) -> bool:
 
 
 def _own_classes(kind: type) -> Iterator[type]:
-    """Return a class and those that it inherits from, of which code needs a definition."""
+    """Return a class and its bases that need a definition in the code."""
     return (each for each in reversed(kind.__mro__) if _is_own(each))
 
 

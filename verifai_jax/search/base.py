@@ -42,7 +42,7 @@ class Observations(NamedTuple):
       very low where there are fewer than `CLAUSES`.
     - `clause_gradients`: their gradients with respect to `u`; zero in rounds whose plan does not
       differentiate.
-    - `outcomes`: what happened (`core.outcomes`), NaN where it is not known.
+    - `outcomes`: what happened (`core.clauses`), NaN if unknown.
     - `coverage_ids`: numbers of what each simulation covered, -1 for nothing; `coverage_ids //
       KIND` is the kind of thing.
 

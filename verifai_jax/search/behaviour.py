@@ -4,7 +4,7 @@
     seen = seen.widened(outcomes).recorded(outcomes)
     seen.unlike(outcomes, others)                       # [n, m], from 0 to 1
 
-Outcomes are those of `core.outcomes`: the predicate that decides, the instant, the shape of the
+Outcomes are those of `core.clauses`: the predicate that decides, the instant, the shape of the
 trace.
 """
 

@@ -17,7 +17,7 @@ Space = Any
 
 
 class Misfit(ValueError):
-    """A value that is none of a space; the message says why, and where in it."""
+    """A value outside of a space; the message says why, and which part."""
 
 
 class Fitted(NamedTuple):
@@ -131,7 +131,7 @@ def fit(space: Space, action: object, clip: bool = True) -> Fitted:
 
 
 def check_observation(space: Space, observation: object) -> None:
-    """Refuse an observation that is none of its space; beyond the bounds of a Box it may lie.
+    """Refuse an observation outside of its space; it may exceed the bounds of a Box.
 
     **Raises:** `Misfit`.
     """

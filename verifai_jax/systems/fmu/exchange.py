@@ -57,7 +57,7 @@ class ExchangeInstance(Instance):
         self._inputs, self._time, self._longest = dict(values), 0.0, duration / MIN_STEPS
         if not self._sized:
             self._prepare(*self._sizes())
-        self._solver = self._integrator() if self._size else None
+        self._solver: Any = self._integrator() if self._size else None
         self._settle()
 
     def _prepare(self, size: int, count: int) -> None:

@@ -229,7 +229,7 @@ class Client:
         return (bool(self.out) and not self._sends_after_reading) or self.reads_after_sending
 
     def receive(self) -> bytes | None:
-        """Return bytes that have come; empty at the end of the connection, None if there are none.
+        """Return received bytes; empty at the end of the connection, None if nothing has come.
 
         **Raises:** `OSError` if it has vanished.
         """
@@ -282,14 +282,14 @@ REMINDER = 10.0
 
 
 class Absence:
-    """The time since the last client left, of which the log reminds."""
+    """The time since the last client left; the log reports it now and then."""
 
     def __init__(self) -> None:
         self.since: float | None = None
         self._next = REMINDER
 
     def end(self) -> None:
-        """Note that there is a client, or that none is needed."""
+        """Note that a client is connected, or that no client is needed."""
         self.since, self._next = None, REMINDER
 
     def seconds(self, now: float) -> float:
