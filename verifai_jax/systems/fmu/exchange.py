@@ -47,7 +47,6 @@ class ExchangeInstance(Instance):
     """An instance of an FMU for model exchange; arguments and errors are those of `Instance`."""
 
     _running = _sized = False
-    _solver: Any = None
 
     def begin(self, values: Mapping[str, float], duration: float) -> None:
         """Set start values, and initialize; after an earlier simulation the instance is reset."""
