@@ -14,16 +14,8 @@ import math
 from collections.abc import Iterable, Sequence
 from decimal import Decimal
 from fractions import Fraction
-from typing import (
-    Any,
-    ClassVar,
-    Literal,
-    NamedTuple,
-    Protocol,
-    TypeAlias,
-    TypeVar,
-    runtime_checkable,
-)
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import runtime_checkable as checkable
 
 import jax
 import jax.numpy as jnp
@@ -48,7 +40,7 @@ Numbers: TypeAlias = float | Sequence | np.generic | np.ndarray | jax.Array
 Value = TypeVar("Value")
 
 
-@runtime_checkable
+@checkable
 class Row(Protocol):
     """A row of a table: a mapping, or a row of pandas."""
 
