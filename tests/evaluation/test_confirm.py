@@ -461,6 +461,7 @@ def test_a_row_worse_than_all_before_is_examined_whatever_the_limit():
     assert verdicts([0.7, 0.95], None) == ["confirmed"] * 2
 
 
+@pytest.mark.thorough
 def test_the_worst_row_of_a_long_run_has_a_verdict():
     smooth = plain(lambda f, key: f["x"], "always x <= 0.2")
     run = vj.falsify(smooth, budget=4096, batch=256, seed=1, progress=False)
@@ -513,7 +514,7 @@ def test_another_simulator_has_to_agree(circles):
 
 def test_errors_say_what_to_do(circles, tmp_path):
     safe = int(circles.table.safe.index[0])
-    with pytest.raises(ValueError, match=f"row {safe} is no counterexample: it keeps the property"):
+    with pytest.raises(ValueError, match=f"row {safe} is not a counterexample: it keeps"):
         confirm(circles, safe)
     with pytest.raises(IndexError, match="row 999 is not in the table of 256 simulations"):
         confirm(circles, 999)

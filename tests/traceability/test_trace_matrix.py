@@ -140,7 +140,7 @@ def test_a_whole_chain_and_every_change_of_it(project):
     assert "the report of reports/rate.claims.json is not there" in str(traced())
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_command_is_a_gate(project):
     ask = lambda *more: CliRunner().invoke(main, ["trace", "specs/brake.py", *more])  # noqa: E731
     done = ask("--fail-on", "incomplete", "--report", "out/trace.html", "--json")
@@ -264,10 +264,10 @@ def test_reqif_of_other_tools(tmp_path):
             "DOCTYPE a>",
         ),
         ('<!DOCTYPE REQ-IF SYSTEM "http://x/y.dtd"><REQ-IF/>', "which is refused"),
-        ("<REQ-IF>&x;</REQ-IF>", "is no XML: undefined entity"),
+        ("<REQ-IF>&x;</REQ-IF>", "is not XML: undefined entity"),
         ("<other/>", "its first element is other, not REQ-IF"),
         ("<REQ-IF/>", "has no requirement"),
-        ("", "is no XML"),
+        ("", "is not XML"),
     ],
 )
 def test_xml_that_is_refused(tmp_path, text, match):
@@ -280,7 +280,7 @@ def test_xml_that_is_refused(tmp_path, text, match):
 def test_yaml_runs_nothing(tmp_path):
     path = tmp_path / "some.yaml"
     path.write_text("requirements: !!python/object/apply:os.getcwd []")
-    with pytest.raises(ValueError, match=r"some.yaml is no YAML"):
+    with pytest.raises(ValueError, match=r"some.yaml is not YAML"):
         read_requirements(path)
     path.write_text("- id: A")
     with pytest.raises(ValueError, match="must have a list `requirements`; got list"):

@@ -14,9 +14,8 @@ from click.core import ParameterSource
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 
 if TYPE_CHECKING:
+    from verifai_jax import Problem, Run
     from verifai_jax.core.executors import Executor
-    from verifai_jax.falsification.run import Run
-    from verifai_jax.problem import Problem
 
 Command = TypeVar("Command", bound=Callable[..., object])
 
@@ -105,9 +104,9 @@ BACKEND = click.option(
 ENGINE = click.option(
     "--engine",
     type=click.Choice(["auto", "xla", "native"]),
-    default="xla",
+    default="auto",
     show_default=True,
-    help="native: code by this machine's C++ compiler, for many simulations.",
+    help="native: code by this machine's C++ compiler, auto: for many simulations.",
 )
 """What a traced system is compiled by."""
 
@@ -223,7 +222,7 @@ NAMES = all_of(
 def read_names(
     constants: tuple[str, ...], definitions: tuple[str, ...]
 ) -> tuple[dict[str, float], dict[str, str]]:
-    """Return the constants and the definitions of `NAMES`; a usage error names what is none."""
+    """Return the constants and the definitions of `NAMES`; a usage error names a wrong one."""
     numbers = {}
     for name, value in split_pairs("--const", constants):
         try:
@@ -252,8 +251,8 @@ def on_cluster(address: str | None) -> "Iterator[Executor | None]":
 
 def load_problem(target: str, only: str | None = None) -> "Problem":
     """Load the problem FILE.py:NAME, with only some of its features varied."""
+    from verifai_jax import Problem
     from verifai_jax.core.targets import load_target
-    from verifai_jax.problem import Problem
 
     problem = load_target(target, Problem)
     return problem if only is None else problem.only(*split_names(only))
@@ -278,8 +277,8 @@ def load_run(folder: Path, target: str | None) -> "Run":
 
 def read_run(folder: Path, problem: "Problem | None" = None) -> "Run":
     """Read the run in a folder; say what the folder is where it holds none."""
+    from verifai_jax import load
     from verifai_jax.core.text import printable
-    from verifai_jax.falsification.run_folder import load
 
     read_record(folder)
     run = load(folder, problem)
@@ -343,7 +342,7 @@ def split_names(text: str) -> list[str]:
 
 
 def split_pairs(option: str, texts: tuple[str, ...]) -> list[tuple[str, str]]:
-    """Split each NAME=VALUE of a repeated option; a usage error says which one is none."""
+    """Split each NAME=VALUE of a repeated option; a usage error says which one is wrong."""
     pairs = []
     for text in texts:
         name, equals, value = text.partition("=")

@@ -12,9 +12,9 @@ from verifai_jax.cli.json_output import command, draw, give_result
 
 @command()
 @arguments.TARGET
-@click.option("--rounds", type=int, default=4, show_default=True, help="Attacks, at most.")
+@click.option("--rounds", type=int, default=8, show_default=True, help="Attacks, at most.")
 @click.option("--steps", type=int, help="Environment steps of the first training.")
-@click.option("--further-steps", type=int, help="Of each round  [default: a quarter of --steps]")
+@click.option("--further-steps", type=int, help="Of each round  [default: an eighth of --steps]")
 @click.option("--samples", type=int, default=512, show_default=True, help="Of each certificate.")
 @click.option("--attack", default="cross_entropy", show_default=True, help="Search that attacks.")
 @click.option("--attack-simulations", type=int, default=512, show_default=True)
@@ -35,11 +35,11 @@ def harden(
     target: str, folder: Path | None, plot: Path | None, fail_on: Gate | None, **options: Any
 ) -> None:
     """Train a policy of the study TARGET (FILE.py:NAME), go on where it fails, certify it."""
+    from verifai_jax import Study
+    from verifai_jax import harden as run
     from verifai_jax.core.targets import load_target
     from verifai_jax.core.text import printable
-    from verifai_jax.hardening import harden as run
     from verifai_jax.statistics.confidence_sequences import safe_at
-    from verifai_jax.sweeps.study import Study
 
     study = load_target(target, Study)
     into = folder or Path("runs") / f"harden-{target.rpartition(':')[2]}"

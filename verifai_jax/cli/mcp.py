@@ -129,11 +129,11 @@ class Server:
             try:
                 request = json.loads(line)
             except ValueError:
-                yield _line(None, error={"code": -32700, "message": "the message is no JSON"})
+                yield _line(None, error={"code": -32700, "message": "the message is not JSON"})
                 continue
             valid = isinstance(request, dict) and isinstance(request.get("method"), str)
             if not valid or not isinstance(request.get("params", {}), dict):
-                yield _line(None, error={"code": -32600, "message": "this is no request"})
+                yield _line(None, error={"code": -32600, "message": "this is not a request"})
             elif "id" in request:  # Nothing is answered to a notification.
                 yield self._answer(request["id"], request["method"], request.get("params", {}))
 
@@ -216,7 +216,7 @@ class Server:
             raise Refused(text) from None
 
     def _fence(self, key: str, value: str) -> None:
-        """Refuse a path outside of the folder, and a problem that is no file in it."""
+        """Refuse a path outside of the folder, and a problem that is not in a file of it."""
         path = value.rpartition(":")[0] if key == "problem" and ":" in value else value
         whole = (self.folder / path).resolve() if "\0" not in path else Path("/")
         if not whole.is_relative_to(self.folder) or not whole.exists() or path.startswith("-"):

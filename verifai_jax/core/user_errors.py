@@ -187,7 +187,7 @@ def source_line(traceback: object) -> str | None:
 def explain_user_error(
     error: BaseException, features: object = None, *, system: bool = True, native: bool = False
 ) -> str:
-    """Write what a user's code did, where, and what to do about it, in one line.
+    """Write what failed in a user's code, at which line, and the remedy, in one line.
 
     **Arguments:**
 
@@ -237,7 +237,7 @@ def _sentence(error: BaseException, step: TracebackType, features: object) -> st
 
 
 def _advice_on_tracing(error: BaseException) -> str:
-    """Write what to do about an error that comes of tracing; empty for others."""
+    """Write what to do about an error caused by tracing; empty for others."""
     # NumPy raises an error of its own from that of JAX.
     for each in (error, error.__cause__):
         for kind, advice in TRACING:
@@ -321,7 +321,7 @@ def _same_names(one: Mapping[Any, Any], other: object) -> bool:
 
 
 def raised_in_callback(error: BaseException) -> str | None:
-    """Return what a function raised that JAX calls on the host, and its line; None elsewhere.
+    """Return the error of a function that JAX calls on the host, and its line, or None.
 
     JAX has the whole traceback as the text of an error of its own.
     """

@@ -4,7 +4,7 @@
     replay_counterexamples(problem, "counterexamples")  # all in one batch: failing, fixed, invalid
 
 A file holds the features of one simulation, the formulas, what it was worth, how it was found and
-how to see it again. Nothing in it is executed: the problem comes from whoever replays it.
+how to see it again. Nothing in it is executed: the problem is given again to replay it.
 """
 
 import hashlib
@@ -104,7 +104,7 @@ class SavedCounterexample:
         form = content.get("format") if isinstance(content, dict) else None
         if form != FORMAT:
             raise CorpusError(
-                f"{path} is no counterexample of format {FORMAT}; its format is {form!r}"
+                f"{path} is not a counterexample of format {FORMAT}; its format is {form!r}"
             )
         missing = [field.name for field in fields(cls) if field.name not in content]
         if missing:
@@ -184,7 +184,7 @@ def save_counterexamples(
     **Arguments:**
 
     - `run`: with its problem.
-    - `folder`: it is made where there is none; files that are there already stay.
+    - `folder`: made if missing; existing files stay.
     - `max_count`: counterexamples at most.
     - `shrink`: whether each is first shrunk towards the nominal features, where these are known.
     - `budget`: simulations to shrink one with, at most.

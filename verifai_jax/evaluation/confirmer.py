@@ -128,7 +128,7 @@ class Confirmer:
         in_precision(precision)
         self.problem, self.precision, self.seed, self.max_rows = problem, precision, seed, max_rows
         self.executor, self.target = executor, target
-        self.others = engines_for(problem, engines)
+        self.others = {} if engines is None else engines_for(problem, engines)
         self.examined, self.band, self.worst = 0, 0.0, np.inf
         self.wavers = self.flips = self._came_again = False
         self.check_names: tuple[str, ...] = ()
@@ -352,11 +352,13 @@ class Confirmer:
         features: dict[str, Any] = {}
         together: dict[tuple[int, int], list[str]] = {}
         for name, (replays, factor) in self._checks.items():
-            replays.begin_compiling(factor, len(numbers))
             if replays.precision not in features:
                 features[replays.precision] = space.features_of(rows, replays.precision)
             # What one program replays at one step fills its lanes.
             together.setdefault((id(replays), factor), []).append(name)
+        for names in together.values():
+            replays, factor = self._checks[names[0]]
+            replays.begin_compiling(factor, len(numbers), len(names))
         replayed: dict[str, Verdicts] = {}
         for names in together.values():
             replays, factor = self._checks[names[0]]

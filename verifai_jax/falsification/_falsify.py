@@ -35,7 +35,6 @@ from verifai_jax.falsification.validation import (
     as_wanted,
     batch_size,
     can_be_slow,
-    check_engine,
     check_first,
     check_gradient,
     check_guide,
@@ -95,7 +94,7 @@ def falsify(
     target: str | None = None,
     executor: "Executor | None" = None,
     keep_going: bool = False,
-    engine: str = "xla",
+    engine: str = "auto",
     cheap: Problem | None = None,
     proved: "Verification | str | Path | None" = None,
 ) -> Run:
@@ -148,10 +147,10 @@ def falsify(
       this machine alone, bit for bit, on workers with its kind of processor.
     - `keep_going`: whether to simulate on if all of the first simulations raise. Otherwise the run
       ends with an error after 16 that raise the same, or after a first round of many at once.
-    - `engine`: `"xla"`, or `"native"`: rows from the 513th on are simulated by vector code that
-      the machine's own C++ compiler makes of the problem, two to five times as fast where no
-      large network is in the loop. It agrees with XLA up to rounding; XLA decides what is near to
-      zero, and simulates what cannot be translated. `"auto"` takes it if the budget is worth it.
+    - `engine`: `"xla"`, or `"native"`: rows from the 513th on are simulated by vector code of the
+      machine's own C++ compiler, two to five times as fast where no large network is in the loop,
+      and equal up to rounding; XLA decides what is near to zero, and simulates what cannot be
+      translated. `"auto"` is native for a budget that is worth it, unless the search learns.
     - `cheap`: a cheap model of the same features, searched first with 20 times the budget. At
       most a quarter of the budget is spent on what it found. Only `problem` decides what fails.
     - `proved`: what `verify` found of this problem, or its file. The run is of the rest, and is
@@ -170,7 +169,8 @@ def falsify(
     """
     started = time.perf_counter()
     check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
-    check_engine(engine)
+    as_wanted(engine)
+    ends_early = stop_after is not None or stop_when is not None
     of_rest: tuple[str, ...] = ()
     if proved is not None:
         from verifai_jax.verification.result import as_verification
@@ -201,10 +201,9 @@ def falsify(
     callbacks = check_callbacks(callbacks)
     earlier = earlier_rows(warm_start, problem)
     in_precision(precision)
-    whole = stop_after is None and stop_when is None and max_seconds is None
 
     def batch_for(search: Search) -> int:
-        alone = whole and not problem.black_box
+        alone = not (ends_early or max_seconds is not None or problem.black_box)
         small = 16 if diverse else 64 if search.wants.likelihood else None
         return batch_size(batch, search, budget, stop_after, alone, small)
 
@@ -227,7 +226,8 @@ def falsify(
         table = ErrorTable(tuple(problem.space.columns), path)
         rounds = Rounds(
             problem, search, size, seed, table, precision, path, confirm, executor, target, given,
-            suggests=asking is not None, engine=as_wanted(engine), budget=budget,
+            suggests=asking is not None, budget=budget,
+            engine=as_wanted(engine, ends_early or search.learns),
         )  # fmt: skip
         if asking is not None:
             rounds.ask(replace(asking, search=search))

@@ -146,7 +146,7 @@ class Items:
 
     - `values`: stacked along a leading axis as in an `Array` of the greatest length, so that every
       simulation has the same shapes. Entries after the length hold the middle of the item's domain.
-    - `length`: the number of items that there are.
+    - `length`: the number of valid items.
 
     `features["cars"]["x"]` are the `x` of all entries; multiply by `mask`, or use `jnp.where`.
     """
@@ -179,8 +179,8 @@ class VariableArray(Domain):
     """From `shortest` to `longest` values of one domain: `Array(domain, length=(1, 3))`.
 
     A value is an `Items`; a person may write a list of as many items as there are. The first
-    coordinate is the length, each equally likely (none if `shortest == longest`). In a table the
-    column `cars.length` holds the length; the entries of absent items are empty (NaN or None).
+    coordinate is the length, all equally likely (without it if `shortest == longest`). In a table
+    the column `cars.length` holds the length; the entries of absent items are empty (NaN or None).
     """
 
     domain: Domain

@@ -42,10 +42,10 @@ Cells = Mapping[str, tuple[float, float, int]]
 """For each signal the low and the high end of its cells, and their number."""
 
 CELLS_OF_A_RANGE = 4
-"""Cells into which a signal with a range is cut where nobody says how many."""
+"""Default number of cells of a signal with a range."""
 
 MAX_CUT = 4
-"""Signals with ranges that are cut at most where nobody says which."""
+"""Signals with ranges that are divided into cells by default, at most."""
 
 
 class CheckedSystem(System):
@@ -54,8 +54,8 @@ class CheckedSystem(System):
     **Arguments:**
 
     - `system`: the system.
-    - `ranges`: the ranges of signals; what is not finite is replaced by the middle, as it is
-      reported anyway.
+    - `ranges`: the ranges of signals; numbers that are not finite are replaced by the middle, as
+      they are reported anyway.
     - `verdicts`: whether a simulation that raises, hangs or is not finite gets a trace that breaks
       a property, instead of a status without a verdict.
     - `cells`: the cells of signals, as given to `fuzz`; they are for the record of the run.

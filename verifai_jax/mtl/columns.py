@@ -1,4 +1,4 @@
-"""Columns of a recording as numbers: what a cell may be, and how one that is none is refused.
+"""Columns of a recording as numbers: valid cells, and errors for the others.
 
 numbers_of("flight.csv", "x", column)               # [time], or [time, k] of a column of lists
 seconds_of("flight.csv", "time", column)            # from the first, and when that was
@@ -104,7 +104,7 @@ def _vectors(source: str, name: str, column: Any) -> np.ndarray:
         for entry in cell:
             if entry is not None and not isinstance(entry, bool | int | float):
                 raise ValueError(
-                    f"column {name!r} of {source} holds lists that are no vectors of numbers; in "
+                    f"column {name!r} of {source} holds lists that are not vectors of numbers; in "
                     f"row {row} there is {_brief(entry)}"
                 )
     truths = any(isinstance(entry, bool) for cell in rows for entry in cell)
@@ -172,7 +172,7 @@ def epoch_unit(values: np.ndarray) -> str:
 def moment_of(text: str) -> datetime.datetime:
     """Return the moment of an ISO 8601 text, which may be a time of day alone.
 
-    **Raises:** `ValueError` for a text that is none.
+    **Raises:** `ValueError` for any other text.
     """
     try:
         return datetime.datetime.fromisoformat(text)

@@ -112,9 +112,7 @@ class Policy:
             save_policy(self, path)
             return Path(path)
         graph, arrays, start = self.as_graph()
-        return lazy_import("verifai_jax.policies.writing", "write")(
-            graph, arrays, start, Path(path)
-        )
+        return lazy_import("verifai_jax.policies.base", "write")(graph, arrays, start, Path(path))
 
     def as_graph(self, observation: object = None) -> tuple[Any, Any, Any]:
         """Return the policy as a graph of ONNX operators, as policies of other frameworks do."""
@@ -359,7 +357,7 @@ def _read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             arrays = {name: file[name] for name in file.files}
         about = json.loads(str(arrays.pop("about")))
         if not isinstance(about, dict):
-            raise ValueError("what it says about itself is no object")
+            raise ValueError("its description of itself is not an object")
         return arrays, about
     except FileNotFoundError:
         raise

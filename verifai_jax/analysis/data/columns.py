@@ -43,7 +43,7 @@ class Column:
     def codes(self, entries: pd.Series | pd.DataFrame) -> Int[np.ndarray, " n"]:
         """Return the indices of entries in `choices`; -1 for an absent one.
 
-        **Raises:** `ValueError` for an entry that is none of the choices.
+        **Raises:** `ValueError` for an entry that is not one of the choices.
         """
         kinds, values = pd.factorize(entries)
         indices = _indices(self.choices)
@@ -52,7 +52,7 @@ class Column:
         if (codes == -2).any():
             stray = as_scalar(entries.iloc[int(np.argmax(codes == -2))])
             raise ValueError(
-                f"column {self.name!r} holds {stray!r}, which is none of its choices "
+                f"column {self.name!r} holds {stray!r}, which is not one of its choices "
                 f"{', '.join(map(repr, self.choices))}"
             )
         return codes
