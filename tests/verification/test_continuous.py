@@ -64,11 +64,12 @@ def escapes(name, boxes, seed=0):
     worst, wide = -np.inf, []
     for u, lowest, highest in zip(point, *rho, strict=True):
         found = solve_ivp(rates, (0.0, duration), ends[0] + u * (ends[1] - ends[0]), "DOP853",
-                          rtol=1e-12, atol=1e-12, max_step=dt / 8)  # fmt: skip
+                          rtol=1e-12, atol=1e-12, max_step=dt / 2,
+                          t_eval=np.linspace(0, duration, 20_001))  # fmt: skip
         seen = np.stack([found.y.min(1), -found.y.max(1)], 1).ravel()
         if np.isfinite(lowest).all():
-            # The least value over the steps of the reference is above the true one.
-            worst = max(worst, np.max(lowest - seen), np.max(seen - highest - 10 * dt * dt))
+            # Between two times of the reference, 3e-4 apart at most, it may be some 1e-6 lower.
+            worst = max(worst, np.max(lowest - seen), np.max(seen - highest - 1e-6))
             wide.append(np.max(highest - lowest))
     return worst, np.array(wide)
 
@@ -76,7 +77,7 @@ def escapes(name, boxes, seed=0):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_solutions_stay_within_their_bounds(name):
-    """Against an integration at a tolerance of 1e-12 from points, corners and faces of boxes."""
+    """Against DOP853 at a tolerance of 1e-12 from middles, corners and faces of boxes."""
     worst, wide = escapes(name, 24)
     assert len(wide) > 8
     assert worst < 1e-9

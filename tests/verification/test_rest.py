@@ -113,7 +113,7 @@ def test_a_run_simulates_nothing_that_is_proved(proved, tmp_path):
 
 @pytest.mark.thorough
 def test_a_search_begins_where_bounds_are_loosest():
-    """A needle of a share of 3e-6: its box has the lowest bound of all that are left."""
+    """A needle of a share of 3e-6: its box has the lowest bound, and a search of it takes long."""
 
     def system(f, key):
         far = ((f["x"] - 0.3127) ** 2 + (f["y"] - 0.6841) ** 2) / 1e-6
@@ -122,7 +122,7 @@ def test_a_search_begins_where_bounds_are_loosest():
 
     space = {"x": vj.Box(0, 1), "y": vj.Box(0, 1)}
     problem = vj.Problem("needle", space, system, "always m >= -0.02")
-    found = vj.verify(problem, boxes=1500, samples=0, progress=False)
+    found = vj.verify(problem, boxes=20, samples=0, progress=False)
     assert 0.5 < found.proved.mass < 1
     counts = []
     for options in ({"proved": found}, {}):
@@ -130,8 +130,7 @@ def test_a_search_begins_where_bounds_are_loosest():
         run = vj.falsify(one, "cross_entropy", 8192, batch=64, stop_after=1, seed=0,
                          progress=False, **options)  # fmt: skip
         counts.append(len(run.table) if run.table.all["violated"].any() else 10**9)
-    assert counts[0] < counts[1]
-    assert counts[0] <= 1024
+    assert counts[0] <= 64 < 1024 < counts[1]
 
 
 def test_a_proof_of_another_problem_proves_nothing(proved):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from operator import methodcaller
 
 from verifai_jax.core.errors import unknown_name
-from verifai_jax.mtl.formula import Formula, Predicate, Term, formula
+from verifai_jax.mtl.formula import Formula, Next, Predicate, Prev, Term, Witness, formula
 from verifai_jax.mtl.tree import Node, postorder
 from verifai_jax.mtl.words import FUNCTIONS, NUMBERS, name_text, number_text
 
@@ -266,6 +266,12 @@ def durations_in(*formulas: Formula) -> tuple[Duration, ...]:
     leaves = (leaf for f in formulas for leaf in f.subformulas())
     parts = (part for leaf in leaves for term in leaf.terms() for part in postorder(term))
     return tuple(dict.fromkeys(part for part in parts if isinstance(part, Duration)))
+
+
+def about_single_samples(*formulas: Formula) -> list[Formula]:
+    """Return the parts that a coarser or a longer sample would change: they count or order them."""
+    parts = (part for f in formulas for part in f.subformulas(valued=True))
+    return [f for f in parts if isinstance(f, Next | Prev | Witness) or durations_in(f)]
 
 
 def with_counted(*formulas: Formula) -> list[Formula]:

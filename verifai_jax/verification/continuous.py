@@ -14,8 +14,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from verifai_jax.mtl.expression import durations_in
-from verifai_jax.mtl.formula import Next, Prev, Witness
+from verifai_jax.mtl.expression import about_single_samples
 from verifai_jax.problem.problem import Problem, ProblemError
 from verifai_jax.sets import flow
 from verifai_jax.systems.ode.closed_loop import Ode, substep
@@ -43,13 +42,11 @@ def between_samples(problem: Problem) -> Problem:
                 f"continuous=True needs a plant that moves continuously for the whole duration; "
                 f"the system of problem {problem.name!r} has {name}=. Leave one of both out"
             )
-    for formula in problem.formulas.values():
-        for part in formula.subformulas(valued=True):
-            if isinstance(part, Next | Prev | Witness) or durations_in(part):
-                raise ProblemError(
-                    f"continuous=True knows formulas of comparisons, not, and, or, always, "
-                    f"eventually, historically and once; {part} is about single samples"
-                )
+    for part in about_single_samples(*problem.formulas.values()):
+        raise ProblemError(
+            f"continuous=True knows formulas of comparisons, not, and, or, always, eventually, "
+            f"historically and once; {part} is about single samples"
+        )
 
     def during(time: Any, state: PyTree, control: Any, features: Any) -> Any:
         left = jnp.where(time < (loop.steps - 0.5) * loop.dt, loop.dt, 0.0)

@@ -89,7 +89,7 @@ class Verification(Drawn, InNotebook):
 
     @property
     def subject(self) -> str:
-        """What was verified, the steps of simulations or the differential equation."""
+        """The subject of all proofs: the steps of simulations, or the differential equation."""
         return CONTINUOUS if self.continuous else DISCRETE.format(precision=self.precision)
 
     def _part(self, rows: Bool[np.ndarray, " n"]) -> Part:
