@@ -20,6 +20,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.experimental.jet import jet
 from jax.extend.core import Primitive
 from jaxtyping import Array, PyTree
@@ -136,18 +137,18 @@ def _evaluated_once(program: Program, constants: Sequence[Any], *inputs: Array) 
             inner, consts = getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
             return run_through(inner, consts, operands, lambda one: one.val, step)
         key = each.primitive, str(each.params), *(
-            id(one) if isinstance(one, jax.core.Tracer) or np.ndim(one)
+            id(one) if isinstance(one, Tracer) or np.ndim(one)
             else (str(one), type(one), getattr(one, "dtype", None))
             for one in operands
         )  # fmt: skip
         if key not in known:
             with contextlib.ExitStack() as stack:
-                if not any(isinstance(one, jax.core.Tracer) for one in operands):
+                if not any(isinstance(one, Tracer) for one in operands):
                     stack.enter_context(jax.ensure_compile_time_eval())
                 found = each.primitive.bind(*operands, **each.params)
                 found = found if each.primitive.multiple_results else [found]
                 # As numbers of the program's text they are the same wherever it is traced.
-                if not any(isinstance(one, jax.core.Tracer) for one in found):
+                if not any(isinstance(one, Tracer) for one in found):
                     found = [np.asarray(one) for one in found]
             # The operands live on, so that no other number gets the same identity.
             known[key] = operands, found
@@ -268,15 +269,15 @@ class _Step:
         terms, count = self.terms(self.shared, begin, state), len(state)
         during, after = list[Form](), list(state)
         for k in range(ORDER):
-            share = np.float64(length ** (k + 1) / math.factorial(k + 1))
+            share = np.array(length ** (k + 1) / math.factorial(k + 1))
             for i, term in enumerate(terms[k * count : (k + 1) * count]):
                 after[i] = add(after[i], scaled(term, share))
-        share = np.float64(length ** (ORDER + 1) / math.factorial(ORDER + 1))
+        share = np.array(length ** (ORDER + 1) / math.factorial(ORDER + 1))
         bends = self.bounded(self.apart, span, box)
         for i, (bend, last) in enumerate(zip(bends[:count], bends[count:], strict=True)):
             after[i] = add(after[i], scaled(_hull(last), share))
             # Between its ends a solution is a chord and at most an eighth of its second derivative.
-            low, high = scaled(_hull(bend), np.float64(-(length**2) / 8)).bounds()
+            low, high = scaled(_hull(bend), np.array(-(length**2) / 8)).bounds()
             arc = _between(np.minimum(low, 0), np.maximum(high, 0), span)
             during.append(add(joined(state[i], after[i]), arc))
         return during, after
