@@ -151,3 +151,58 @@ def smooth(t, s, u, f):
 def test_what_an_equation_does_not_say_is_refused(problem, message):
     with pytest.raises((vj.ProblemError, MissingRule), match=message):
         Enclosure(between_samples(problem), "float64")
+
+
+@pytest.mark.slow
+def test_windows_within_windows_a_jump_and_a_held_network_are_those_of_solutions():
+    """Against DOP853 from sample to sample, at 200 times each; `v` turns around at one second."""
+    inner, outer = np.random.default_rng(0).normal(size=(2, 8, 2)) / 2
+
+    def held(x, v, n=jnp):
+        return n.clip(outer[:, 0] @ n.tanh(inner @ n.stack([x, v])), -1.0, 1.0)
+
+    def turned(t, s, f):
+        return {"x": s["x"], "v": jnp.where(jnp.abs(t - 1) < 0.01, -s["v"], s["v"])}
+
+    system = vj.ode(
+        lambda t, s, u, f: {"x": s["v"], "v": u - f["k"] * jnp.sin(s["x"]) + jnp.cos(3 * t) / 9},
+        lambda f, key: {"x": f["x"], "v": f["v"]}, dt=0.1, duration=2.0, control_period=0.2,
+        controller=lambda t, s, f: held(s["x"], s["v"]), signals=lambda t, s, u, f: s,
+        update=turned,
+    ).refined(2)  # fmt: skip
+    space = {"x": vj.Box(-1, 1), "v": vj.Box(-1, 1), "k": vj.Box(0.5, 2)}
+    problem = vj.Problem("held", space, system, {
+        "low": "always x >= 0", "slow": "always[0.5, 1] v >= 0",
+        "fast": "eventually[1, 1.5] v >= 0",
+        "soon": "always[0, 1] eventually[0.2, 0.5] x >= 0",
+        "once": "always[1, 2] once[0.2, 0.5] x >= 0",
+    })  # fmt: skip
+    enclosure, random = Enclosure(between_samples(problem), "float64"), np.random.default_rng(3)
+    width = 2.0 ** -random.integers(4, 9, (20, 1)) * np.ones((1, 3))
+    low = np.floor(random.random((20, 3)) / width) * width
+    rho = enclosure._evaluated(enclosure._verdict, enclosure._leaves(low, low + width), 20)
+    for u, lowest, highest in zip(low + width / 2, *rho[0].bounds(), strict=True):
+        state, k, parts = 2 * u[:2] - 1, 0.5 + 1.5 * u[2], []
+        for j in range(20):
+            control = held(*state, np) if j % 2 == 0 else control
+            times = np.linspace(j / 10, (j + 1) / 10, 201)
+            part = solve_ivp(
+                lambda t, y, u=control, k=k: [y[1], u - k * np.sin(y[0]) + np.cos(3 * t) / 9],
+                times[[0, -1]], state, "DOP853", t_eval=times, rtol=1e-12, atol=1e-12,
+            )  # fmt: skip
+            state = part.y[:, -1] * [1, -1 if j == 9 else 1]
+            parts.append([part.t[:-1], *part.y[:, :-1]])
+        t, x, v = np.concatenate([*parts, [[2.0], *state[:, None]]], 1)
+
+        def most(a, b, t=t, x=x):
+            return x[(a - 1e-9 <= t) & (t <= b + 1e-9)].max()
+
+        seen = np.array([
+            x.min(), v[(t > 0.5 - 1e-9) & (t < 1 + 1e-9)].min(),
+            v[(t > 1 - 1e-9) & (t < 1.5 + 1e-9)].max(),
+            min(most(a + 0.2, a + 0.5) for a in np.linspace(0, 1, 401)),
+            min(most(a - 0.5, a - 0.2) for a in np.linspace(1, 2, 401)),
+        ])  # fmt: skip
+        assert np.all(lowest - 1e-6 <= seen)
+        assert np.all(seen <= highest + 1e-6)
+        assert np.max(highest - lowest) < 0.4
