@@ -64,9 +64,27 @@ CASES: dict[str, tuple[Callable, int, int]] = {
 
 
 def matern(x, z, lengths):
-    """Correlations by Matern 5/2."""
+    """Correlations by Matern 5/2, and -2 times their slopes along the squared scaled distance."""
     r = np.sqrt(5) * np.linalg.norm((x[:, None] - z[None]) / lengths, axis=2)
-    return (1 + r + r**2 / 3) * np.exp(-r)
+    decay = np.exp(-r)
+    return (1 + r + r**2 / 3) * decay, 5 / 3 * (1 + r) * decay
+
+
+def surprise(theta, x, z):
+    """Minus the log evidence of a plain process, at its best variance, and its slope."""
+    d, n = x.shape[1], len(z)
+    k, bend = matern(x, x, np.exp(theta[:d]))
+    k[np.diag_indices(n)] += np.exp(theta[d])
+    try:
+        factor = cho_factor(k, lower=True)
+    except np.linalg.LinAlgError:
+        return 1e9, np.zeros(d + 1)
+    weights, inverse = cho_solve(factor, z), cho_solve(factor, np.eye(n))
+    outer = 0.5 * (inverse - n * np.outer(weights, weights) / (z @ weights))
+    square = ((x[:, None] - x[None]) / np.exp(theta[:d])) ** 2
+    slope = np.append(np.einsum("ij,ijd->d", outer * bend, square), np.trace(outer))
+    slope[d] *= np.exp(theta[d])
+    return 0.5 * n * np.log(z @ weights / n) + np.sum(np.log(np.diag(factor[0]))), slope
 
 
 def plain(function: Callable, d: int, budget: int, seed: int) -> np.ndarray:
@@ -74,46 +92,41 @@ def plain(function: Callable, d: int, budget: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     x = qmc.Sobol(d, seed=seed).random(16)[:12]
     y = function(x, np)
-    theta = np.concatenate([np.full(d, np.log(0.5)), [-9.0]])
+    theta = np.append(np.full(d, np.log(0.5)), -9.0)
+    bounds, box = [(-4, 3)] * d + [(-14, -2)], [(0, 1)] * d
     while len(y) < budget:
         known = np.where(np.isnan(y), np.nanmax(y), y)
         z = (known - known.mean()) / known.std()
-
-        def cost(t, x=x, z=z):
-            k = matern(x, x, np.exp(t[:d])) + np.exp(t[d]) * np.eye(len(x))
-            try:
-                factor = cho_factor(k, lower=True)
-            except np.linalg.LinAlgError:
-                return 1e9
-            scale = z @ cho_solve(factor, z) / len(z)
-            return 0.5 * len(z) * np.log(scale) + np.sum(np.log(np.diag(factor[0])))
-
         if len(y) % 5 == 2 or len(y) < 30:
             starts = [theta, *(np.append(rng.uniform(-2.5, 1, d), -9.0) for _ in range(2))]
-            bounds = [(-4, 3)] * d + [(-14, -2)]
-            fits = [minimize(cost, s, bounds=bounds, options={"maxiter": 30}) for s in starts]
+            fits = [
+                minimize(surprise, s, (x, z), jac=True, bounds=bounds, options={"maxiter": 30})
+                for s in starts
+            ]
             theta = min(fits, key=lambda fit: fit.fun).x
         lengths = np.exp(theta[:d])
-        k = matern(x, x, lengths) + np.exp(theta[d]) * np.eye(len(x))
+        k = matern(x, x, lengths)[0] + np.exp(theta[d]) * np.eye(len(x))
         factor = cho_factor(k, lower=True)
         weights = cho_solve(factor, z)
         scale = z @ weights / len(z)
 
         def gain(u, lengths=lengths, factor=factor, weights=weights, scale=scale, x=x, z=z):
-            c = matern(np.atleast_2d(u), x, lengths)
-            variance = scale * (1 - np.sum(c * cho_solve(factor, c.T).T, axis=1))
-            std = np.sqrt(np.maximum(variance, 1e-14))
+            c, bend = matern(np.atleast_2d(u), x, lengths)
+            solved = cho_solve(factor, c.T).T
+            std = np.sqrt(np.maximum(scale * (1 - np.sum(c * solved, axis=1)), 1e-14))
             t = (z.min() - c @ weights) / std
-            return -np.log(np.maximum(std * (t * norm.cdf(t) + norm.pdf(t)), 1e-30))
+            worth = np.maximum(std * (t * norm.cdf(t) + norm.pdf(t)), 1e-30)
+            if u.ndim == 2:
+                return worth
+            turn = -bend[0][:, None] * (u - x) / lengths**2
+            slope = -norm.cdf(t[0]) * (weights @ turn)
+            slope -= norm.pdf(t[0]) * scale * (solved[0] @ turn) / std[0]
+            return -np.log(worth[0]), -slope / worth[0]
 
         near = np.clip(x[z.argmin()] + 0.05 * rng.normal(size=(500, d)), 0, 1)
         candidates = np.concatenate([rng.random((1500, d)), near])
-        order = np.argsort(gain(candidates))[:4]
-        box = [(0, 1)] * d
-        tops = [
-            minimize(lambda u: float(gain(u)[0]), candidates[i], bounds=box, method="L-BFGS-B")
-            for i in order
-        ]
+        order = np.argsort(-gain(candidates))[:4]
+        tops = [minimize(gain, candidates[i], jac=True, bounds=box) for i in order]
         best = min(tops, key=lambda found: found.fun).x
         x, y = np.vstack([x, best]), np.append(y, function(best, np))
     return y

@@ -2,7 +2,7 @@
 
     PYTHONPATH=OTHER python benchmarks/paired_searches.py --save FOLDER
     PYTHONPATH=. python benchmarks/paired_searches.py --beside FOLDER
-    PYTHONPATH=. python benchmarks/paired_searches.py mixed --searches portfolio plain cross_entropy
+    python benchmarks/paired_searches.py mixed fresh --searches portfolio plain cross_entropy
 
 Rows of the ARCH competition one simulation a round, Rosenbrock's function in ten dimensions, spaces
 of choices and numbers (`mixed_spaces`), and landscapes. Of each search the seeds that found a
@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from arch import BUDGETS, ratio, requirements
 from landscapes import LANDSCAPES
-from mixed_spaces import PROBLEMS, SHARES
+from mixed_spaces import FRESH, PROBLEMS, SHARES
 
 import verifai_jax as vj
 
@@ -75,6 +75,8 @@ def rows(groups: list[str]) -> list[tuple[str, vj.Problem, int, int]]:
         found += [(f"{name}/{b}", valley(name), 1500, b) for name in VALLEYS for b in (1, 16)]
     if "mixed" in groups:
         found += [(name, problem, 1500, 16) for name, problem in PROBLEMS.items()]
+    if "fresh" in groups:
+        found += [(name, problem, 1500, 16) for name, problem in FRESH.items()]
     if "landscapes" in groups:
         found += [(f"landscape {name}", landscape(name), 1500, 16) for name in FEW]
     return found
@@ -83,7 +85,9 @@ def rows(groups: list[str]) -> list[tuple[str, vj.Problem, int, int]]:
 def main() -> None:
     """Measure and print one line a row."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("groups", nargs="*", default=["arch", "valleys", "mixed", "landscapes"])
+    parser.add_argument(
+        "groups", nargs="*", default=["arch", "valleys", "mixed", "fresh", "landscapes"]
+    )
     parser.add_argument("--searches", nargs="+", default=["portfolio"], choices=list(SEARCHES))
     parser.add_argument("--only", nargs="+", help="names of rows")
     parser.add_argument("--first", type=int, default=1000, help="the first seed")
