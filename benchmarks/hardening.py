@@ -1,6 +1,6 @@
 """Hardening against plain domain randomisation at equal environment steps; see RESULTS.md.
 
-    python benchmarks/hardening.py cartpole [--seeds 5] [--folder hardenings]
+    python benchmarks/hardening.py cartpole [--first 100] [--seeds 5] [--folder hardenings]
 
 Of each seed both arms are one training up to the first round, and take the same steps afterwards.
 Failure probabilities are those of the last certificate, from samples that decided nothing. What is
@@ -16,9 +16,12 @@ import numpy as np
 
 import verifai_jax as vj
 from envs.cartpole import CartPoleTask
+from envs.lane_keeping import LaneKeepingTask, lane_keeping, neural
 from envs.mountain_car import MountainCarTask
 from envs.train_cartpole import HYPER_PARAMETERS
+from envs.train_lane_keeping import HYPER_PARAMETERS as LANE_PPO
 from specs.cartpole import balance_with
+from specs.lane_keeping import learned
 from specs.mountain_car import climb_with, safe_training
 from verifai_jax.statistics.paired import paired_difference
 
@@ -36,15 +39,33 @@ def wide_with(policy):
     return dataclasses.replace(balance_with(policy), space=vj.FeatureSpace(WIDE))
 
 
+WEAK = {"power": vj.Box(0.00085, 0.0012), "velocity_bias": vj.Box(-0.006, 0.006)}
+"""Engines and sensors of which a policy that was trained on MountainCar-v0 keeps not all."""
+
+
+def weak_with(policy):
+    """Return `climb` under a policy, with these engines and sensors."""
+    climb = climb_with(policy)
+    return dataclasses.replace(climb, space=vj.FeatureSpace({**climb.space.domains, **WEAK}))
+
+
+def lane_with(policy):
+    """Return `learned` under another policy."""
+    return dataclasses.replace(learned, system=lane_keeping(neural(policy)))
+
+
 CASES = {
     "cartpole": (
         CartPoleTask(masspole_range=0.0, length_range=0.0), wide_with, HYPER_PARAMETERS,
         {"steps": 300_000, "p": 0.001},
     ),
+    "lane_keeping": (
+        LaneKeepingTask(varied=True), lane_with, LANE_PPO, {"steps": 400_000, "p": 0.001},
+    ),
     "mountain_car": (
         vj.Trainer(MountainCarTask(potential=10.0), safe_training.trainer.by_name["ppo"],
-                   steps=500_000, nominal=MountainCarTask()),
-        climb_with, None, {"p": 0.001},
+                   steps=131_072, nominal=MountainCarTask()),
+        weak_with, None, {"p": 0.001},
     ),
 }  # fmt: skip
 
@@ -57,12 +78,13 @@ def odds(certificate):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("case", choices=CASES)
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--folder", type=Path)
     args = parser.parse_args()
     task, problem, algorithm, options = CASES[args.case]
     logs, seconds = [], 0.0
-    for seed in range(args.seeds):
+    for seed in range(args.first, args.first + args.seeds):
         folder = None if args.folder is None else args.folder / args.case / str(seed)
         result = vj.harden(
             task, problem, algorithm=algorithm, seed=seed, baseline=True, folder=folder,

@@ -198,7 +198,7 @@ def decoy(features, key):
 
 
 def yard(features, key):
-    """A place on a lattice of 40 by 40, whose robustness is capped, and a heading."""
+    """A point on a lattice of 40 by 40, whose robustness is capped, and a heading."""
     x, y = features["x"] / 40.0, features["y"] / 40.0
     far = jnp.hypot(x - 0.7, y - 0.2) + 0.2 * jnp.abs(features["heading"] - 0.3)
     return _steps(YARD - jnp.clip(far, 0.0, 0.3))

@@ -1,8 +1,10 @@
 """The language of the package: first words, typed arguments, one name for one thing."""
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+
+import pytest
 
 PACKAGE = Path(__file__).parents[1] / "verifai_jax"
 FILES = sorted(PACKAGE.rglob("*.py"))
@@ -29,11 +31,23 @@ USUAL = {
 """Names with such a word that are plain English."""
 
 Documented = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+Nodes = Sequence[ast.AST]
 
 
-def documented(tree: ast.Module) -> Iterator[Documented | ast.Module]:
-    yield tree
-    for node in ast.walk(tree):
+def nodes_of(source: str) -> Nodes:
+    return list(ast.walk(ast.parse(source)))
+
+
+@pytest.fixture(scope="module")
+def package() -> dict[str, Nodes]:
+    """Return the nodes of each file of the package, which several tests read."""
+    return {str(file.relative_to(PACKAGE)): nodes_of(file.read_text()) for file in FILES}
+
+
+def documented(nodes: Nodes) -> Iterator[Documented | ast.Module]:
+    for node in nodes:
+        if isinstance(node, ast.Module):
+            yield node
         if isinstance(node, Documented) and not node.name.startswith("_"):
             yield node
 
@@ -42,16 +56,16 @@ def first_word(docstring: str) -> str:
     return docstring.split()[0].rstrip(",:;.").split("'")[0].split("-")[0]
 
 
-def questioning(tree: ast.Module) -> Iterator[tuple[int, str]]:
+def questioning(nodes: Nodes) -> Iterator[tuple[int, str]]:
     """Yield lines of public docstrings that begin as a question does."""
-    for node in documented(tree):
+    for node in documented(nodes):
         text = ast.get_docstring(node)
         if text and first_word(text) in QUESTIONS:
             yield getattr(node, "lineno", 1), text.splitlines()[0]
 
 
-def argument_annotations(tree: ast.Module) -> Iterator[str]:
-    for node in ast.walk(tree):
+def argument_annotations(nodes: Nodes) -> Iterator[str]:
+    for node in nodes:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             arguments = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
             for argument in arguments:
@@ -75,11 +89,11 @@ def shadowed(package: Path) -> Iterator[tuple[str, str]]:
             yield from [(f"{here}.{node.name}", here)] * exists
 
 
-def test_first_words():
+def test_first_words(package):
     wrong = [
-        f"{file.relative_to(PACKAGE)}:{line} {text}"
-        for file in FILES
-        for line, text in questioning(ast.parse(file.read_text()))
+        f"{file}:{line} {text}"
+        for file, nodes in package.items()
+        for line, text in questioning(nodes)
     ]
     assert not wrong, "\n".join(wrong)
 
@@ -89,13 +103,11 @@ def test_first_words_are_noticed():
         '"""Whether it holds."""\ndef f():\n    """How."""\n'
         'def _g():\n    """What."""\nclass A:\n    """Something."""\n'
     )
-    assert list(questioning(ast.parse(source))) == [(1, "Whether it holds."), (2, "How.")]
+    assert list(questioning(nodes_of(source))) == [(1, "Whether it holds."), (2, "How.")]
 
 
-def test_arguments_have_types():
-    annotations = [
-        text for file in FILES for text in argument_annotations(ast.parse(file.read_text()))
-    ]
+def test_arguments_have_types(package):
+    annotations = [text for nodes in package.values() for text in argument_annotations(nodes)]
     share = sum(text in ("Any", "typing.Any") for text in annotations) / len(annotations)
     assert share <= SHARE_OF_ANY, f"{share:.1%} of {len(annotations)} annotations are Any"
 
@@ -113,9 +125,9 @@ def test_modules_hidden_by_a_function_of_their_name():
     assert not by_others, by_others
 
 
-def signed_zeros(tree: ast.Module) -> Iterator[tuple[int, str]]:
+def signed_zeros(nodes: Nodes) -> Iterator[tuple[int, str]]:
     """Yield lines of format specifications of real numbers that would write `-0`."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.FormattedValue) and isinstance(node.format_spec, ast.JoinedStr):
             parts = [
                 p.value if isinstance(p, ast.Constant) else "1" for p in node.format_spec.values
@@ -125,28 +137,28 @@ def signed_zeros(tree: ast.Module) -> Iterator[tuple[int, str]]:
                 yield node.lineno, spec
 
 
-def test_no_zero_is_printed_with_a_sign():
+def test_no_zero_is_printed_with_a_sign(package):
     # `z` makes a zero of what rounds to it: f"{-0.0:zg}" is 0.
     wrong = [
-        f"{file.relative_to(PACKAGE)}:{line} {spec}"
-        for file in FILES
+        f"{file}:{line} {spec}"
+        for file, nodes in package.items()
         # A client is copied to where Python is older.
-        if file.name != "remote_client.py"
-        for line, spec in signed_zeros(ast.parse(file.read_text()))
+        if file != "remote_client.py"
+        for line, spec in signed_zeros(nodes)
     ]
     assert not wrong, "\n".join(wrong)
 
 
 def test_signs_of_zeros_are_noticed():
-    assert list(signed_zeros(ast.parse('f"{a:.3g} {b:z.3g} {c:>3} {d:.{n}f}"'))) == [
+    assert list(signed_zeros(nodes_of('f"{a:.3g} {b:z.3g} {c:>3} {d:.{n}f}"'))) == [
         (1, ".3g"),
         (1, ".1f"),
     ]
 
 
-def bound_names(tree: ast.Module) -> Iterator[tuple[int, str]]:
+def bound_names(nodes: Nodes) -> Iterator[tuple[int, str]]:
     """Yield the names that a file gives to arguments, variables, attributes and functions."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, Documented):
             yield node.lineno, node.name
         elif isinstance(node, ast.arg):
@@ -161,12 +173,12 @@ def is_dialect(name: str) -> bool:
     return name not in USUAL and bool(DIALECT & set(name.lower().split("_")))
 
 
-def test_names_are_plain_english():
+def test_names_are_plain_english(package):
     wrong = [str(file) for file in FILES if is_dialect(file.stem)]
     wrong += [
-        f"{file.relative_to(PACKAGE)}:{line} {name}"
-        for file in FILES
-        for line, name in bound_names(ast.parse(file.read_text()))
+        f"{file}:{line} {name}"
+        for file, nodes in package.items()
+        for line, name in bound_names(nodes)
         if is_dialect(name)
     ]
     assert not wrong, "\n".join(wrong)
@@ -174,5 +186,5 @@ def test_names_are_plain_english():
 
 def test_names_that_are_dialect_are_noticed():
     source = "def f(most):\n    self.last_place = 1\nclass Placed:\n    least_x: int = 0\n"
-    names = [name for _, name in bound_names(ast.parse(source)) if is_dialect(name)]
+    names = [name for _, name in bound_names(nodes_of(source)) if is_dialect(name)]
     assert sorted(names) == ["last_place", "least_x", "most"]

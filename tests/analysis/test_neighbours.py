@@ -4,7 +4,7 @@ import pandas as pd
 import pytest
 from checked_types import unchecked
 
-from verifai_jax.analysis import tightest as module
+from verifai_jax.analysis import neighbours as module
 from verifai_jax.analysis.data.samples import Samples
 from verifai_jax.analysis.neighbours import k_closest, nearest, random_rows
 from verifai_jax.core.errors import UnknownNameError

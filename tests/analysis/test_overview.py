@@ -54,7 +54,7 @@ def test_names_of_others_do_not_write_the_report(tmp_path):
     assert "\x1b" not in text
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_report_on_disk(found, tmp_path):
     report = found.save(tmp_path / "report")
     text = report.read_text()

@@ -249,6 +249,7 @@ def test_what_cannot_work_is_refused_with_the_reason():
         rules(table.iloc[:0])
 
 
+@pytest.mark.thorough
 def test_pictures_are_drawn_and_written(tmp_path):
     from PIL import Image
 

@@ -40,6 +40,7 @@ def whole(tmp_path_factory):
     return vj.augment(TASK, "all", seeds=2, folder=folder, **SMALL), folder
 
 
+@pytest.mark.slow
 def test_every_arm_adds_what_it_says(whole):
     result, _ = whole
     table = result.table.set_index(["arm", "seed"])

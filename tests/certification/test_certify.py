@@ -133,6 +133,7 @@ def test_a_memo_holds_all_that_is_needed(certificates, memo):
     assert again.table.equals(certificates.table)
 
 
+@pytest.mark.thorough
 def test_order_company_and_devices_change_nothing(certificates):
     order = [2, 0, 4, 3, 1]
     other = certify(

@@ -55,6 +55,7 @@ def sha(text):
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+@pytest.mark.thorough
 def test_resume_is_refused_and_may_be_meant(call, folder):
     call("falsify --resume run --budget 40 --no-pictures")
     Path("spec.py").write_text(OTHER)
@@ -70,6 +71,7 @@ def test_resume_is_refused_and_may_be_meant(call, folder):
     ]
 
 
+@pytest.mark.thorough
 def test_a_replay_says_so_and_ends_with_a_code_of_its_own(call, folder):
     assert CHANGED not in call("replay run --no-pictures")
     Path("spec.py").write_text(OTHER)

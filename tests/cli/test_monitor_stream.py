@@ -6,7 +6,7 @@ from click.testing import CliRunner
 
 from verifai_jax.cli.exit_codes import CommandError
 from verifai_jax.cli.main import main
-from verifai_jax.cli.monitor_stream import monitor_stream
+from verifai_jax.cli.monitor import monitor_stream
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import parse, robustness, satisfied
 

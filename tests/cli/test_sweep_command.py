@@ -168,6 +168,7 @@ def test_another_sweep_in_the_same_folder_is_refused(call):
     assert "kept/sweep.cache holds a different sweep: options.seed is 9, in the cache 0" in output
 
 
+@pytest.mark.thorough
 def test_a_folder_from_elsewhere_names_no_code(call, tmp_path):
     call("specs/drift.py:safe", *SMALL, "--folder", "kept")
     elsewhere = tmp_path / "elsewhere"

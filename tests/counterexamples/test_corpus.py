@@ -50,7 +50,7 @@ def states(result):
     return [one.state for one in result.replayed]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_files_say_what_fails_and_how_it_was_found(run, corpus):
     for path in corpus.iterdir():
         content = json.loads(path.read_text())

@@ -109,6 +109,7 @@ def test_what_cannot_work_is_refused_with_the_reason(driven):
         explain(driven, nominal={"mas": 1.0})
 
 
+@pytest.mark.thorough
 def test_pictures_are_drawn_and_written(explained, tmp_path):
     figure = explained.plot(tmp_path / "why.png")
     assert (tmp_path / "why.png").stat().st_size > 10_000

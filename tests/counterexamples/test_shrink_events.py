@@ -61,7 +61,7 @@ def test_events_go_first_and_pairs_of_them_together():
     assert nominal.items(least[None]) == [3]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_many_items_are_removed_in_runs():
     wanted = {3, 11}
 

@@ -170,6 +170,7 @@ def plain(throttle, brake):
     return np.array(rows)
 
 
+@pytest.mark.thorough
 def test_shifting_up_and_down_is_that_of_a_plain_program(simulate):
     throttle = [80.0, 5.0, 0.0, 95.0, 2.0, 60.0]
     brake = [10.0, 300.0, 320.0, 0.0, 310.0, 5.0]

@@ -146,7 +146,7 @@ def test_single_precision_keeps_the_gaps():
         np.testing.assert_allclose(gap, double[ahead] - double[behind], rtol=0, atol=0.02)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_derivatives_go_through_transitions(located):
     def outcome(x):
         features = {"throttle": Waveform(x[:2], "constant"), "brake": Waveform(x[2:], "constant")}

@@ -171,7 +171,7 @@ def test_a_policy_that_did_not_learn_is_not_written(earned, status, tmp_path, ca
         }
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_row_is_the_same_simulation_in_any_batch():
     """Falls differ visibly by the last digit of a network's output."""
     problem = specs.upright.on_backend("native")

@@ -200,6 +200,7 @@ def test_most_collisions_happen_between_cars_that_hide_each_other():
     assert run.notes == ()
 
 
+@pytest.mark.thorough
 def test_a_picture_shows_both_cars_and_the_stopped_traffic():
     signals = {name: jnp.zeros(2) for name in ("turning_x", "turning_heading", "ego_x")}
     signals |= {"gap": jnp.array([3.0, -1.0]), "visible": jnp.array([-1.0, 1.0])}

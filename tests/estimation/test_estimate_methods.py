@@ -241,6 +241,7 @@ def test_an_interval_holds_what_splitting_gave_where_they_cannot_both_be_right(
     assert not widened or answer.low <= splitting <= answer.high
 
 
+@pytest.mark.thorough
 def test_many_simulations_need_little_memory():
     """All starts, and all ends, are compared with one another: so there is a limit to them."""
     limit_state = Cells(6, 3, 2).limit_state(2_000_000)

@@ -99,6 +99,7 @@ def test_composed_probabilities_lie_in_the_intervals_of_the_whole():
     assert min(held.values()) >= 18, held
 
 
+@pytest.mark.thorough
 def test_what_begins_outside_of_a_space_has_no_verdict():
     def simulate(features, seed):
         return vj.Trace({"x": features["x0"] + np.array([0.0, 1.0])}, dt=1.0)

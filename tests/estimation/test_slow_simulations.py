@@ -132,7 +132,7 @@ def test_workers_have_the_next_round_while_one_is_simulated():
     assert (answer.probability, answer.low) == (same.probability, same.low)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_few_simulations_of_a_half_space():
     _, answer = answer_of(lambda z: 2.5 - z[:, 0], 0, budget=120)
     assert answer.low < 6.21e-3 < answer.high < 3 * answer.low

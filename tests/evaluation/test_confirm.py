@@ -461,6 +461,7 @@ def test_a_row_worse_than_all_before_is_examined_whatever_the_limit():
     assert verdicts([0.7, 0.95], None) == ["confirmed"] * 2
 
 
+@pytest.mark.thorough
 def test_the_worst_row_of_a_long_run_has_a_verdict():
     smooth = plain(lambda f, key: f["x"], "always x <= 0.2")
     run = vj.falsify(smooth, budget=4096, batch=256, seed=1, progress=False)

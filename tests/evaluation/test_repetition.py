@@ -234,6 +234,7 @@ def test_fuzz_claims_what_came_again():
     assert "memory or chance of its own" in str(run).splitlines()[1]
 
 
+@pytest.mark.thorough
 def test_certificates_show_what_came_again():
     systems = {0.0: failing_at(7), 1.0: Counter(lambda a, count: a - 0.3)}
     certificates = vj.certify(

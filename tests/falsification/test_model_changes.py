@@ -208,7 +208,7 @@ def test_state_in_a_file_is_no_part_of_the_model_and_data_are(project):
         vj.resume(run, budget=12, progress=False)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_studies_of_a_row_begin_with_it(folder):
     run = vj.load(folder, slope(STEEPER))
     assert len(run.table.counterexamples)

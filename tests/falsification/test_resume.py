@@ -77,6 +77,21 @@ def test_a_budget_in_the_middle_of_a_round_that_was_reached_is_spent(problem):
     assert any(note.startswith("resumed in batches of 16: a run of 2000") for note in resumed.notes)
 
 
+@pytest.mark.thorough
+def test_rounds_simulated_ahead_are_those_in_turn(problem):
+    """Only where the budget alone ends a run are rounds simulated before the last one is stored."""
+    ahead = vj.falsify(problem, "uniform", 70, batch=16)
+    assert same(ahead, vj.falsify(problem, "uniform", 70, batch=16, max_seconds=3600.0))
+
+    def interrupts(simulations, numbers):
+        if simulations == 32:
+            raise KeyboardInterrupt
+
+    part = vj.falsify(problem, "uniform", 70, batch=16, callbacks=[interrupts])
+    assert (part.stopped, len(part.table)) == ("interrupted", 32)
+    assert same(vj.resume(part), ahead)
+
+
 def test_passive_searches_go_on_within_a_batch(problem):
     whole = vj.falsify(problem, "halton", 64, batch=16)
     part = vj.falsify(problem, "halton", 25, batch=16)

@@ -22,6 +22,7 @@ def problem(level):
     return vj.Problem("bowl", space, system, f"always height > {level}")
 
 
+@pytest.mark.thorough
 def test_no_row_is_differentiated_while_failures_come(monkeypatch):
     monkeypatch.setattr(Engine, "_lower_gradient", None)  # Nothing is traced for it, either.
     run = vj.falsify(problem(0.2), budget=8 * BATCH, batch=BATCH, confirm=False)
@@ -57,6 +58,7 @@ FIRST_DESCENTS = BATCH // 4
 """Rows of the first round that is differentiated."""
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("last", [-BATCH, 0, FIRST_DESCENTS])
 def test_a_resumed_run_has_the_same_stages(last, safe, tmp_path):
     rows = PATIENT * BATCH + last

@@ -135,7 +135,7 @@ contype="0" conaffinity="0"/><site name="tip" pos="0 0 0.5"/></body></worldbody>
 """
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["mjx", "native"])
 def test_mujoco(backend):
     def controller(time, state, features):

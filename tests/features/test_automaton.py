@@ -67,7 +67,7 @@ def taken_by(points):
 POINTS = np.asarray(jax.random.uniform(jax.random.key(2), (4096, SPACE.dim)))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "automaton",
     [

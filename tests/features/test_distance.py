@@ -125,7 +125,7 @@ def test_is_a_metric(a, b, c):
     assert ac <= ab + bc + 1e-5
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @given(points, st.integers(0, SPACE.dim - 1))
 @settings(max_examples=40, deadline=None)
 def test_is_zero_only_between_the_same(u, i):
@@ -136,7 +136,7 @@ def test_is_zero_only_between_the_same(u, i):
     assert (float(SPACE.distance(a, b)) == 0) == same
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_derivatives_are_finite_between_the_same():
     u = jnp.full(SPACE.dim, 0.3)
     slope = jax.grad(lambda v: SPACE.distance(SPACE.unflatten(u), SPACE.unflatten(v)))

@@ -126,7 +126,7 @@ def test_an_unbounded_distribution_of_a_person_is_not_simulated_at_its_limits():
 class TestEmpirical:
     DATA = np.random.default_rng(3).gamma(2.0, 1.0, 400)
 
-    @pytest.mark.thorough
+    @pytest.mark.slow
     def test_is_the_data(self):
         domain = Empirical(self.DATA)
         check_domain(domain)

@@ -77,7 +77,7 @@ def whole():
         return harden(TASK, staying_below(1.5), baseline=True, seed=3, **SMALL), certificates
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_result_agrees_with_its_table(whole):
     result, _ = whole
     table = result.table

@@ -12,7 +12,7 @@ import verifai_jax as vj
 from verifai_jax.core import machine_code
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.core.keys import run_keys
-from verifai_jax.evaluation import native_engine
+from verifai_jax.evaluation import native_engine, native_program
 from verifai_jax.evaluation.engine import engine_for
 from verifai_jax.evaluation.native_engine import FIRST, NativeEngine
 
@@ -158,6 +158,17 @@ def test_auto_is_native_where_the_budget_is_worth_it(ending):
     assert not NativeEngine(engine, "auto", enough - 2)._is_worth
 
 
+def test_by_default_it_is_native_unless_few_simulations_may_do(ending, monkeypatch):
+    monkeypatch.setattr(native_engine, "WORTH", 1)
+    options = {"batch": 700, "confirm": False, "progress": False}
+    run = vj.falsify(ending, "uniform", 700, **options)
+    assert run.engine == "native"
+    natively = vj.falsify(ending, "uniform", 700, engine="native", **options)
+    assert run.table.all.equals(natively.table.all)
+    assert vj.falsify(ending, "uniform", 700, stop_after=10**6, **options).engine == "xla"
+    assert vj.falsify(ending, "uniform", 300, **options).engine == "xla"
+
+
 def test_given_features_are_simulated_natively(ending):
     rows = vj.falsify(ending, "uniform", 800, confirm=False, progress=False).table.all
     run = vj.simulate(ending, rows, engine="native", progress=False)
@@ -256,13 +267,13 @@ def test_a_damaged_library_is_made_anew(ending, monkeypatch, tmp_path):
 def test_a_program_that_computes_something_else_is_not_used(ending, monkeypatch, tmp_path):
     monkeypatch.setenv("VERIFAI_JAX_CACHE", str(tmp_path))
     ending.programs.clear()
-    honest = native_engine.translate
+    honest = native_program.translate
     wrong = lambda program: honest(program).replace("= sine(", "= cosine(")  # noqa: E731
-    monkeypatch.setattr(native_engine, "translate", wrong)
+    monkeypatch.setattr(native_program, "translate", wrong)
     assert "differ from those of XLA" in fallback_note(ending)
     # Another process would know: it is neither compiled nor compared again.
     ending.programs.clear()
-    monkeypatch.setattr(native_engine, "translate", None)
+    monkeypatch.setattr(native_program, "translate", None)
     assert "differ from those of XLA" in fallback_note(ending)
     ending.programs.clear()
 

@@ -288,6 +288,45 @@ def test_loops_and_branches():
     assert np.allclose(a, b, rtol=1e-4, atol=1e-4)
 
 
+def test_a_branch_keeps_what_is_used_after_it():
+    """A branch changes the memory of its loop as it lies, where nothing else needs the old one."""
+
+    def pushed(line, new):
+        return jnp.concatenate([new[None], line[:-1]])
+
+    def function(row, words, number, temperature, numbers):
+        def push(needed, line, new):
+            moved, _ = changed_if_needed(lambda v, _: (pushed(v[0], new), v[1]), needed,
+                                         (line, new), new)  # fmt: skip
+            return jnp.where(needed, moved, line) if needed is not True else moved
+
+        def once(needed, line, new):
+            return changed_if_needed(lambda v, x: jnp.where(needed, pushed(v, x), v), needed,
+                                     line, new)  # fmt: skip
+
+        def step(carry, x):
+            alone, twice, kept, shared, inner, chosen, large = carry
+            needed, value = row[0] > x, row[1] + x
+            alone = once(needed, alone, value)
+            twice = once(row[2] > x, once(needed, twice, value), 2 * value)
+            before, kept = kept, once(needed, kept, value)
+            shared = once(needed, shared, value), once(row[2] > x, shared, -value)
+            inner, _ = lax.scan(lambda c, y: (once(needed, c, y + inner[1]), y), inner,
+                                jnp.arange(3.0))  # fmt: skip
+            chosen = lax.cond(row[3] > x, lambda v: v + 1, lambda v: once(needed, v, value), chosen)
+            large = once(needed, large, value)
+            after = (alone, twice, kept, jnp.maximum(*shared), inner, chosen, large)
+            return after, (before.sum() + push(needed, before, x).sum(), large[-1])
+
+        start = tuple(row[0] * jnp.ones(n) for n in (3, 3, 3, 3, 3, 3, 40))
+        return lax.scan(step, start, jnp.arange(-16.0, 17.0) / 8)
+
+    # Of few binary digits, so that nothing is rounded.
+    rows = np.round(64 * np.clip(np.nan_to_num(rows_of(4)), -3, 3)) / 64
+    ours, theirs, _ = both(function, 4, "kept", rows)
+    assert np.array_equal(ours.view(np.float32), theirs.view(np.float32))
+
+
 def test_random_numbers_are_those_of_jax():
     def function(row, words, number, *_):
         key = jax.random.fold_in(jax.random.wrap_key_data(words, impl="threefry2x32"), number)

@@ -195,7 +195,7 @@ def views():
     return seen
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*EYES, "far"])
 def test_depth_is_that_of_a_ray_caster(views, name):
     scene, camera, depth, _ = views[name]

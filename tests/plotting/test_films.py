@@ -13,8 +13,7 @@ from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.evaluation.replay import replay
 from verifai_jax.plotting.film import HEADER, film_samples, labelled
 from verifai_jax.plotting.mujoco_motion import record
-from verifai_jax.plotting.mujoco_scene import NoRenderer, canvas, frames
-from verifai_jax.plotting.mujoco_view import best_view
+from verifai_jax.plotting.mujoco_scene import NoRenderer, best_view, canvas, frames
 
 # A red ball that rolls along x, far from the cameras of the model: one looks at a wall, one away.
 HIDDEN = """

@@ -137,6 +137,7 @@ def test_film_and_strip(motion, gl, tmp_path):
         assert image.size == (3 * 100 + 2 * 4, 90 + films.HEADER)
 
 
+@pytest.mark.thorough
 def test_a_push_is_an_arrow(motion, gl):
     pushes = motion.pushes.copy()
     pushes[0, 1, 0] = 5.0
@@ -189,7 +190,7 @@ def test_without_a_renderer_one_line_says_what_to_do(seen, tmp_path, monkeypatch
     assert "Cannot initialize a EGL device display.; without a screen set" in message
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("setting", ["disable", "glfw", "egl", None])
 def test_real_settings_draw_or_explain(setting):
     code = f"""

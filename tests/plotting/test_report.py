@@ -202,6 +202,7 @@ def test_the_bounds_of_all_formulas_are_solved_for_their_signals(tmp_path):
         replay.plot(signals="y")
 
 
+@pytest.mark.thorough
 def test_many_monitored_signals_leave_room_for_the_inputs():
     space = {"air": vj.Struct({"wind": vj.Signal(vj.Box(1, 2), knots=2, duration=1.0)})}
     spec = "always (s0 + s1 + s2 + s3 + s4 + s5 + s6 < 900)"

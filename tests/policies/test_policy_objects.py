@@ -175,7 +175,7 @@ def test_own_policies_and_refusals():
         policy(lambda x: x, stack=2)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_checkpoint_of_brax_with_its_normaliser(tmp_path):
     checkpoint = pytest.importorskip("brax.training.agents.ppo.checkpoint")
     from brax.training.acme import running_statistics, specs

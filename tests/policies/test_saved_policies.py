@@ -82,7 +82,7 @@ class Image(linen.Module):
         return linen.softmax(linen.Dense(3)(linen.gelu(x)))[0]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_model_of_flax_is_saved(tmp_path):
     module = Image()
     image = jax.random.normal(jax.random.key(0), (8, 8, 2))

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from verifai_jax.qualification import qualify
-from verifai_jax.qualification.hazards import HAZARDS
 from verifai_jax.qualification.oracles import ORACLES
+from verifai_jax.qualification.result import HAZARDS
 
 ROOT = Path(__file__).parents[2]
 

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 import verifai_jax as vj
 from verifai_jax.cli.main import main
-from verifai_jax.reports.claims_tree import claims_tree
+from verifai_jax.reports.assessment import claims_tree
 
 SPEC = """
 import numpy as np

@@ -2,7 +2,7 @@ import jax
 import numpy as np
 import pytest
 
-from verifai_jax.rl.shuffling import permutation
+from verifai_jax.rl.on_policy import permutation
 
 
 @pytest.mark.slow

@@ -79,7 +79,7 @@ def test_learns_continuous_actions_from_observations_of_another_scale():
     assert returns.mean() > -0.6
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_same_seed_same_policy_and_other_values_reuse_the_program(compiled):
     calls = []
     first = train(Recall(), SMALL, seed=1, steps=8_000)

@@ -17,7 +17,7 @@ from verifai_jax.testing import check_search
 KEY = jax.random.key(0)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_single_points():
     _, (value,) = play(CMAES(), ("ball",), 1, 256, 15)
     assert gain("ball", value) > 4
@@ -193,7 +193,7 @@ def test_a_warm_start_begins_at_the_best_point():
     assert near.sum() == 3  # the other one explores
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "cube",
     [

@@ -47,8 +47,8 @@ REFUSED = {
 
 
 # These take seconds to compile for each cube; what is continuous alone is so in the wide one.
-LARGE = ("Bayes", "CMAES", "TuRBO", "TraceSurrogate")
-QUICK = ("empty", "mixed")
+LARGE = ("Bayes", "CMAES", "Portfolio", "TuRBO", "TraceSurrogate")
+QUICK = ("mixed",)
 EACH = [
     pytest.param(
         search,

@@ -62,7 +62,7 @@ def rosenbrock(u):
     return jnp.sum(100 * (x[1:] - x[:-1] ** 2) ** 2 + (1 - x[:-1]) ** 2) - 1
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_rows_without_a_verdict_leave_the_other_descents_alone():
     cube, search = Cube((0,) * D), Descent()
     tell = jax.jit(search.tell, static_argnums=1)

@@ -9,8 +9,8 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
+from verifai_jax.core.clauses import OUTCOME, SEGMENTS
 from verifai_jax.core.cube import Cube
-from verifai_jax.core.outcomes import OUTCOME, SEGMENTS
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.guidance import Guidance, outcome_of
 from verifai_jax.mtl import explain, parse
@@ -82,7 +82,7 @@ def test_an_outcome_by_hand():
     assert (few[1], few[2], few[2 + SEGMENTS - 1]) == (1, 0, 3)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_how_unlike_outcomes_are():
     one = np.zeros(OUTCOME, np.float32)
     other_predicate, later, steeper, unknown = (one.copy() for _ in range(4))
@@ -101,7 +101,7 @@ def test_how_unlike_outcomes_are():
     np.testing.assert_allclose(known, [1, 0, 0.5, 0, 0], atol=1e-6)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_contract_and_record():
     search = Diverse(CrossEntropy(), capacity=8, by="behaviour")
     check_search(search, Cube((0, 3)))
@@ -175,7 +175,7 @@ def test_what_is_new_leads_on_where_the_robustness_says_nothing():
     assert vj.falsify(problem, "cross_entropy", diverse="behaviour", **options).simulations < 3000
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_black_box_tells_what_happens_too():
     @vj.blackbox
     def box(f):

@@ -17,7 +17,7 @@ from verifai_jax.testing import check_search
 MIXED = Cube((0, 4, 0, 3), ordered=(True, True, True, False))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("search", "cube"),
     [

@@ -77,7 +77,7 @@ def test_codes_count_by_whether_they_are_the_same():
             np.testing.assert_allclose(got[i, j], expected, rtol=1e-9)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_evidence_is_the_density_of_the_targets():
     with jax.enable_x64(True):
         seen, x, y = data(rows=12, padding=3, dtype=jnp.float64)
@@ -169,7 +169,7 @@ def test_degenerate_observations(x, y, mask):
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(all_of_it(seen)))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_singular_covariance_is_made_regular():
     # Twice the same points without any noise: the plain factor does not exist.
     seen, _, _ = data(rows=40, padding=0)
@@ -180,7 +180,7 @@ def test_a_singular_covariance_is_made_regular():
     assert np.all(np.isfinite(std))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_no_coordinates():
     empty = GaussianProcess(())
     seen = TrainingData(jnp.zeros((4, 0)), jnp.full(4, 2.0), jnp.ones(4, bool))

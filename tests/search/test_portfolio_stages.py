@@ -98,7 +98,7 @@ def test_a_stage_proposes_what_the_whole_proposes():
     assert int(whole.barren) == int(stage.barren) > 0
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_without_descents_it_is_the_portfolio_without_gradients():
     without = Portfolio(gradients=False)
     other = without.init(jax.random.key(0), CUBE, 64)
@@ -122,7 +122,7 @@ def test_a_failure_ends_the_count_of_barren_rounds():
     assert int(state.barren) == 128
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_suggested_starts_are_descended_from_at_once():
     state, batch = begin(4), MANY + 1
     told = portfolio.Observations(jnp.full((4, 3), 0.25), jnp.full(4, 0.5), jnp.ones(4, bool))

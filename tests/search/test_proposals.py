@@ -97,6 +97,7 @@ def test_sequences_do_not_depend_on_the_batch():
         np.testing.assert_array_equal(parts, np.asarray(large.next(32)))
 
 
+@pytest.mark.thorough
 def test_a_grid_ends():
     proposals = Proposals(Grid(5), SPACE.cube, 16, KEY, SPACE.constraint)
     assert proposals.total == 75

@@ -113,7 +113,7 @@ def test_never_stops_exploring(search):
     assert np.all(late.max(axis=1) > 0.85)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_cross_entropy_explores_evenly():
     # The last two of sixteen rows.
     u, _ = played(CrossEntropy(), "corner")

@@ -45,7 +45,7 @@ def test_equals_scipy_bit_for_bit():
     np.testing.assert_array_equal(points(Sobol(scramble=False), 250, 1024), reference)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_large_indices():
     cube, search = Cube((0,) * 12), Sobol(scramble=False)
     state = search.init(jax.random.key(0), cube, 16)

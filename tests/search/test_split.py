@@ -52,7 +52,7 @@ def test_parts_are_what_they_are_alone():
     assert len(np.unique(np.asarray(u[:, 0]))) == 8
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_parts_learn_from_their_own_coordinates():
     search = Split({"x": Gradient()}, Uniform())
     ask, tell = jax.jit(search.ask, static_argnums=(1, 2)), jax.jit(search.tell, static_argnums=1)

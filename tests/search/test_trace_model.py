@@ -161,7 +161,7 @@ def test_components_give_back_the_traces():
     assert models.principal_components(traces[:2])[1].shape == (models.COMPONENTS, 200)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_wider_draw_is_as_much_farther_from_the_mean(data):
     x, coefficients, mask = data
     hyper = models.first_hyper(WIDTH)

@@ -71,7 +71,7 @@ def test_closes_in_on_the_best_point():
     # A uniform point is about 0.9 away.
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_begins_with_the_prior_and_stays_there_while_nothing_differs():
     u, _ = asked(TINY, Cube((0, 3)), lambda u: np.ones(8), 3)
     expected = halton_points(jnp.arange(1, 25, dtype=jnp.uint32), 2, KEY)

@@ -179,7 +179,7 @@ def test_a_wrapper_keeps_the_contract():
     check_search(Rounded(CrossEntropy()), CUBE)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_diverse_portfolio_does_without_gradients_of_a_black_box():
     space = vj.FeatureSpace({"x": vj.Box(-1, 1)})
 

@@ -205,7 +205,7 @@ def test_a_full_disk_is_named(tmp_path):
         Log(path).put({"a": {"x": np.zeros(3)}})
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_log_in_a_cycle_is_closed_before_its_file_is_collected(tmp_path):
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always")

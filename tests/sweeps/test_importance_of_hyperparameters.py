@@ -7,8 +7,7 @@ from sklearn.ensemble import ExtraTreesRegressor
 
 import verifai_jax as vj
 from verifai_jax.sweeps.fanova import Boxes, leaf_boxes, variance_shares
-from verifai_jax.sweeps.importance import hyperparameter_importance
-from verifai_jax.sweeps.trends import trends
+from verifai_jax.sweeps.importance import hyperparameter_importance, trends
 
 SPACE = vj.FeatureSpace(
     {
@@ -78,7 +77,7 @@ def test_what_was_planted_is_found(planted):
     assert "return depends on discount" in text
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_components_of_the_unsafe_and_the_safe(planted):
     # The learning rate is confined to one half of its range in both, so others vary more.
     for components in (planted.unsafe, planted.safe):

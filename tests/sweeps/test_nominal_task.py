@@ -22,7 +22,7 @@ def returns(nominal):
     return table["nominal_return"].to_numpy()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_nominal_task_is_measured_on():
     usual, doubled = returns(None), returns(Point(reward_scale=3.0))
     assert np.all(usual != 0)

@@ -131,6 +131,7 @@ def test_nominal_returns_are_those_of_the_task_itself():
         assert found.record.columns["nominal_return"][row] == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.thorough
 def test_returns_do_not_depend_on_company(whole):
     policies = whole.record.policies
     together = mean_returns(Point(), policies, episodes=4)

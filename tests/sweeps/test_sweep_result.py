@@ -375,7 +375,7 @@ def test_the_picture_is_written(small, tmp_path):
     assert "wanted: below 1 %" in values_of_features
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_large_sweep_shows_what_matters(large):
     figure = large.plot()
     assert figure.axes[2].get_title() == "Importance"

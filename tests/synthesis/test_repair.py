@@ -90,6 +90,7 @@ def test_rare_failures_are_compared_by_estimates():
     assert "too rare for the check to compare: see .estimate()" in str(result)
 
 
+@pytest.mark.thorough
 def test_the_repaired_problem_is_ready(mended):
     assert mended.problem.nominal["k"] == mended.parameters["k"]
     assert mended.problem.space.dim == 2

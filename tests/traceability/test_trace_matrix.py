@@ -140,7 +140,7 @@ def test_a_whole_chain_and_every_change_of_it(project):
     assert "the report of reports/rate.claims.json is not there" in str(traced())
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_command_is_a_gate(project):
     ask = lambda *more: CliRunner().invoke(main, ["trace", "specs/brake.py", *more])  # noqa: E731
     done = ask("--fail-on", "incomplete", "--report", "out/trace.html", "--json")

@@ -41,7 +41,7 @@ class Diverse(Drawn, InNotebook):
     `radius`: how far the row is that is farthest from all chosen ones.
     """
 
-    _picture = "diverse", "plot_diverse"
+    _picture = "clusters", "plot_diverse"
     """The rows among all, in their order, and the distances."""
 
     samples: Samples

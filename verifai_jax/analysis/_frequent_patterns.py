@@ -184,7 +184,7 @@ def frequent_patterns(
     - `size`: values that a combination has at most.
     - `minimum`: least share of the rows that a combination must have.
     - `bins`: takes ordered columns too, in so many equally wide cells of their range; whole
-      numbers that have no more values are taken as they are.
+      numbers with fewer values are used directly.
     - `against`: what a share is compared with: that among all rows with a verdict, or the prior
       probability. By default the table where it has rows with the other verdict, else the prior
       where it is known. After an active search both depend on where it went.

@@ -2,7 +2,7 @@
 
 found = importance(run)
 found.table                 drop of the score when a feature is shuffled
-found.is_reliable("failing")    whether the model behind it can predict at all
+found.is_reliable("failing")    whether its model can predict at all
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ MAX_ONE_HOT = 30
 MAX_ENTRIES = 4_000_000
 TREES = 60
 MIN_SCORE = {"failing": 0.65, "rho": 0.2}
-"""Scores on held-out rows below which the importances mean nothing."""
+"""Scores on held-out rows; with lower ones, importances are unreliable."""
 NAMES = {"failing": "failing", "rho": "robustness"}
 """Targets of the models, as a person calls them."""
 SCORES = {"failing": "AUC", "rho": "R^2"}
@@ -48,7 +48,7 @@ class Importance(Drawn, InNotebook):
     not trained on; `missing`: why there is no model of the one or the other; `name` of the run.
     """
 
-    _picture = "bars", "plot_importance"
+    _picture = "overview", "plot_importance"
     """The losses as bars."""
 
     table: pd.DataFrame

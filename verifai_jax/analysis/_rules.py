@@ -52,7 +52,7 @@ DOUBT_OF_KEY = 1e-6
 class Rule:
     """One box in the feature space, and how well it describes the failures.
 
-    **Fields:** `conditions`, all of which must be fulfilled; `coverage`: share of the measured
+    **Fields:** `conditions`, which must all be fulfilled; `coverage`: share of the measured
     failures inside; `precision`: how many of the measured rows inside fail, with its 95 %
     Clopper-Pearson interval.
     """
@@ -187,10 +187,10 @@ def rules(
       `seed` among failing and safe rows alike.
     - `seed`: the seed of the rows kept aside.
 
-    **Returns:** `Rules`; with fewer than 10 failing or safe rows there is none, and the result says
-    so. Nor does it have a box in which fewer than 3 of the failing rows kept aside lie, or failures
-    are not clearly denser (by the interval of its precision) than everywhere. A condition is left
-    out where failures are not clearly denser inside than beyond it, on the rows kept aside
+    **Returns:** `Rules`; with fewer than 10 failing or safe rows there are no rules, and the result
+    says so. Nor does it have a box in which fewer than 3 of the failing rows kept aside lie, or
+    failures are not clearly denser (by the interval of its precision) than everywhere. A condition
+    is left out where failures are not clearly denser inside than beyond it, on the rows kept aside
     (Fisher's exact test at 0.3 %; at one in a million for whole numbers with 65 536 values or more,
     which may be a random key).
 

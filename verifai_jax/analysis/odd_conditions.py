@@ -44,7 +44,7 @@ UNITS: dict[str, tuple[str, float]] = {
 }  # fmt: skip
 """What a unit measures, and how many of the first unit of that kind it is."""
 UNIT_OF = {"duration": "s"} | {kind: unit for unit, (kind, size) in UNITS.items() if size == 1}
-"""The unit of an attribute for which nobody says one, by what it measures."""
+"""The default unit of an attribute, by what it measures."""
 
 
 Conversions: TypeAlias = Mapping[tuple[str, str], tuple[float, float]]
@@ -77,7 +77,7 @@ class Attribute:
     - `literals`: its possible values, where they are listed.
     - `groups`: of these, by names that conditions may use for them.
     - `feature`: that stands for it; empty for none.
-    - `unit`: of the feature; the SI unit of what it measures when nobody says.
+    - `unit`: of the feature; by default the SI unit of what it measures.
     - `reason`, `source`: why it is so, and who says so.
     """
 
@@ -117,7 +117,7 @@ class Test:
 
 @dataclass(frozen=True)
 class Group:
-    """Conditions of which `every` one holds, or any."""
+    """Conditions that must hold: `every` one, or any."""
 
     every: bool
     parts: "tuple[Condition, ...]"
@@ -244,7 +244,7 @@ def read_group(
 ) -> Group:
     """Read a section of conditions: a mapping from names to expressions.
 
-    **Raises:** `ValueError` that says where, for what is no condition.
+    **Raises:** `ValueError` for text that is not a condition, with the position.
     """
     if not isinstance(section, Mapping) or not section:
         raise ValueError(f"{where} maps attributes to expressions; got {section!r}")

@@ -24,8 +24,8 @@ from verifai_jax.analysis.odd_conditions import (
 )
 from verifai_jax.analysis.operational_domain import OperationalDomain
 from verifai_jax.core.errors import check_names, unknown_name
+from verifai_jax.core.foreign_files import read_yaml
 from verifai_jax.core.reads import documents
-from verifai_jax.core.yaml import read_yaml
 from verifai_jax.features import FeatureSpace
 
 ABOUT = ("attribute", "unit", "reason", "source")
@@ -35,7 +35,7 @@ SECTIONS = ("TAXONOMY", "ODD", "MODULES", "IMPORT", "conversion")
 OF_MODULE = ("TITLE", "DESCRIPTION", "ACTIVE", "LABEL", "LABELS")
 """Entries of a module, conditions apart."""
 KINDS = {"number": "float", "real": "float", "int": "integer", "bool": "boolean"}
-"""Other words for kinds; an attribute of a kind that is none of these has no values here."""
+"""Other words for kinds; an attribute of any other kind has no values here."""
 
 
 def read_odd(path: str | Path) -> OperationalDomain:
@@ -49,7 +49,7 @@ def read_odd(path: str | Path) -> OperationalDomain:
 
     - `path`: the file. Without `features` each attribute is a feature of its last name.
 
-    **Raises:** `FileNotFoundError`; `ValueError` that names the entry, for what is no such file.
+    **Raises:** `FileNotFoundError`; `ValueError` naming the entry, for any other file.
     """
     path = Path(path)
     whole = _mapping(path)
@@ -74,7 +74,8 @@ def odd_of(
 ) -> OperationalDomain:
     """Return the domain that a space of features spans, for `write`.
 
-    **Raises:** `ValueError` for a feature that is no range and no choice, and for a constraint.
+    **Raises:** `ValueError` for a feature that is neither a range nor a choice, and for a
+    constraint.
     """
     taxonomy: dict[str, Any] = {}
     include: dict[str, Any] = {}

@@ -37,8 +37,8 @@ from verifai_jax.analysis.odd_conditions import (
     written,
 )
 from verifai_jax.core.atomic_files import replacing
+from verifai_jax.core.foreign_files import write_yaml
 from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.yaml import write_yaml
 from verifai_jax.features import Box, Categorical, DiscreteBox, Domain, FeatureSpace
 
 

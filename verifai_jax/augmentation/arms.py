@@ -192,7 +192,7 @@ Generator = Callable[[Key[Array, ""], int], pd.DataFrame]
 
 
 def _pca_generator(base: Base) -> Generator | str:
-    """Return a generator of features; or the reason why there is none."""
+    """Return a generator of features, or the reason why it is missing."""
     if not len(base.counterexamples):
         return _few(base)
     try:

@@ -1,12 +1,15 @@
 """The work of an augmentation: seeds, their networks and what is kept of them.
 
-study = Study(task, plan, cache, bar)
-study.run(0, ("none", "counterexamples"))               # one seed; what is finished is read
-study.result(arms, 0.95, complete=True)
+    study = Study(task, plan, cache, bar)
+    study.run(0, ("none", "counterexamples"))               # one seed; what is finished is read
+    study.result(arms, 0.95, complete=True)
+
+A cache keeps tables and weights as arrays of numbers and texts.
 """
 
+import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -33,18 +36,13 @@ from verifai_jax.augmentation.keys import (
 from verifai_jax.augmentation.outcome import BASE, NOT_FINITE, TRAINED
 from verifai_jax.augmentation.result import Augmentation
 from verifai_jax.augmentation.searched import searched_problem
-from verifai_jax.augmentation.storage import (
-    decode_frame,
-    decode_weights,
-    encode_frame,
-    encode_weights,
-)
 from verifai_jax.augmentation.task import SupervisedTask, TaskError, Weights
 from verifai_jax.core.progress import ProgressBar
 from verifai_jax.core.user_errors import explain_user_error
 from verifai_jax.falsification import falsify
 from verifai_jax.search import Search
 from verifai_jax.store.cache import Cache
+from verifai_jax.store.files import plain
 from verifai_jax.store.log import Arrays
 
 _PER_HARD = 40
@@ -317,3 +315,76 @@ def _hard_rows(seed: Seed, count: int) -> pd.DataFrame:
             break
     parts = [part for part in parts if len(part)] or parts[:1]
     return pd.concat(parts, ignore_index=True).iloc[:count]
+
+
+_ORDER = "columns"
+"""Array with the names of a table's columns, in their order."""
+_STRUCTURE = "structure"
+"""Array with the structure of weights, as JSON."""
+
+
+def encode_frame(frame: pd.DataFrame) -> Arrays:
+    """Encode a table; choices of several types become JSON."""
+    arrays: Arrays = {_ORDER: np.array([str(name) for name in frame.columns], np.str_)}
+    for name in frame.columns:
+        values = frame[name].to_numpy()
+        if values.dtype.kind in "biuf":
+            arrays[f"plain/{name}"] = values
+        else:
+            arrays[f"json/{name}"] = np.array([json.dumps(plain(v)) for v in values], np.str_)
+    return arrays
+
+
+def decode_frame(arrays: Mapping[str, np.ndarray]) -> pd.DataFrame:
+    """Decode a table."""
+    columns: dict[str, Any] = {}
+    for name in arrays[_ORDER].tolist():
+        if f"plain/{name}" in arrays:
+            columns[name] = arrays[f"plain/{name}"]
+        else:
+            entries = [json.loads(text) for text in arrays[f"json/{name}"].tolist()]
+            columns[name] = pd.Series(entries, dtype=object)
+    return pd.DataFrame(columns)
+
+
+def encode_weights(weights: Weights) -> Arrays | None:
+    """Encode weights; None unless they are arrays in dictionaries, lists and tuples."""
+    leaves: list[np.ndarray] = []
+    try:
+        structure = json.dumps(_structure(weights, leaves))
+    except TypeError:
+        return None
+    return {_STRUCTURE: np.array(structure), **{str(i): leaf for i, leaf in enumerate(leaves)}}
+
+
+def decode_weights(arrays: Mapping[str, np.ndarray]) -> Weights:
+    """Decode weights; arrays become arrays of JAX."""
+    return _restored(json.loads(str(arrays[_STRUCTURE])), arrays)
+
+
+def _structure(tree: Any, leaves: list[np.ndarray]) -> Any:
+    if type(tree) is dict:
+        if not all(isinstance(name, str) for name in tree):
+            raise TypeError("names of weights must be texts")
+        return {"dict": {name: _structure(tree[name], leaves) for name in tree}}
+    if type(tree) in (list, tuple):
+        return {type(tree).__name__: [_structure(part, leaves) for part in tree]}
+    if tree is None:
+        return {"none": None}
+    if isinstance(tree, jax.Array | np.ndarray | np.generic):
+        leaf = np.asarray(tree)
+        if leaf.dtype.kind not in "biuf":
+            raise TypeError(f"weights of type {leaf.dtype}")
+        leaves.append(leaf)
+        return {"leaf": len(leaves) - 1}
+    raise TypeError(f"weights in a {type(tree).__name__}")
+
+
+def _restored(structure: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    ((kind, value),) = structure.items()
+    if kind == "dict":
+        return {name: _restored(part, arrays) for name, part in value.items()}
+    if kind in ("list", "tuple"):
+        parts = [_restored(part, arrays) for part in value]
+        return parts if kind == "list" else tuple(parts)
+    return None if kind == "none" else jax.numpy.asarray(arrays[str(value)])

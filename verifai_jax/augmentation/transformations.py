@@ -4,7 +4,7 @@
     SupervisedTask(..., transform=transform)
 
 Images have shape `[n, height, width, channels]` or `[n, height, width]`, with values from 0 to 1.
-Labels pass as they are: where a label says where something is, a transformation of one's own must
+Labels pass unchanged: if a label is a position, your transformation must
 move it along.
 
 Source: Shorten and Khoshgoftaar, A survey on image data augmentation for deep learning, Journal of
@@ -132,7 +132,7 @@ def _scaled(max_change: float, middle: Callable[[Array], Array]) -> Transformati
 def _images(inputs: Inputs) -> Float[Array, "n height width *channels"]:
     """Return inputs as an array of images.
 
-    **Raises:** `ValueError` where they are none.
+    **Raises:** `ValueError` for anything else.
     """
     shape = getattr(inputs, "shape", None)
     if shape is None or len(shape) not in (3, 4):

@@ -3,6 +3,11 @@
 certificates = certify(problem_of, policies, p=0.01)
 print(certificates)
 certificates.safest, certificates[3].verdict, certificates.counterexamples(3)
+
+Failures of policies on the host are simulated once more before a certificate shows them. One that
+does not fail again was caused by state that earlier simulations left, or by random numbers that do
+not come from the key. It counts in the failure rate, which is that of the system as simulated, and
+is not shown as a counterexample.
 """
 
 import time
@@ -12,11 +17,11 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float
 
 from verifai_jax.certification.allocation import Allocation, find_leader
 from verifai_jax.certification.attack import PolicyRecord, attack_policies, check_attack
 from verifai_jax.certification.blocks import Blocks, Remember
-from verifai_jax.certification.repetition import repeat_failures
 from verifai_jax.certification.result import Certificate, Certificates
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.devices import enable_compile_cache
@@ -24,7 +29,8 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.programs import power_of_two
 from verifai_jax.core.progress import say_done, shows_progress
-from verifai_jax.evaluation.confirmations import Repetitions
+from verifai_jax.evaluation.confirmations import Repetitions, came_otherwise
+from verifai_jax.evaluation.confirmer import LIMIT, MORE, REPEATED, SHARE_REPEATED
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
@@ -320,3 +326,72 @@ def _check(
             f"{minimum}; got {budget!r}"
         )
     return budget
+
+
+def repeat_failures(
+    blocks: Blocks, policy: int, sampled: PolicyRecord, attacked: PolicyRecord
+) -> Repetitions:
+    """Simulate the worst failures of a policy again, and take out what does not fail again.
+
+    One for 25 simulations or 32 of them, and up to 1024 where one has not come again.
+
+    **Arguments:**
+
+    - `blocks`: that simulate the policies.
+    - `policy`: its number.
+    - `sampled`, `attacked`: its simulations, whose verdicts are replaced.
+
+    **Returns:** the counts, which as text say what that means of the system.
+    """
+    rows = [
+        (float(verdicts.lowest[index]), record, block, index)
+        for record in (sampled, attacked)
+        for block, verdicts in enumerate(record.verdicts)
+        for index in np.flatnonzero(verdicts.violated).tolist()
+    ]
+    rows.sort(key=lambda row: row[0])
+    found = Repetitions()
+    maximum = max(REPEATED, (sampled.simulations + attacked.simulations) // SHARE_REPEATED)
+    begin = 0
+    while begin < min(len(rows), maximum):
+        part = rows[begin : min(begin + REPEATED, maximum)]
+        begin += len(part)
+        rho = np.array([row[0] for row in part])
+        again, failing = _again(blocks, policy, attacked, part, 0)
+        for attempt in range(1, 1 + MORE):
+            left = np.flatnonzero(failing)
+            wavers = found.moved or not failing.all() or came_otherwise(rho, again).any()
+            if not (wavers and len(left)):
+                break
+            some = [part[i] for i in left.tolist()]
+            more, failing[left] = _again(blocks, policy, attacked, some, attempt)
+            again[left] = np.where(failing[left], np.maximum(again[left], more), more)
+        lost = ~failing
+        verdicts = np.where(lost, "fragile", "confirmed").astype(object)
+        found = found.joined(Repetitions.count(rho, again, verdicts))
+        for i in np.flatnonzero(lost).tolist():
+            _, record, block, index = part[i]
+            record.take_out(block, index)
+            attacked.failures -= record is attacked
+        if found.moved:
+            maximum = LIMIT
+    return found
+
+
+def _again(
+    blocks: Blocks,
+    policy: int,
+    attacked: PolicyRecord,
+    rows: Sequence[tuple[float, PolicyRecord, int, int]],
+    attempt: int,
+) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Return the robustness of these rows when they are simulated again, and which fail."""
+    again, failing = np.full(len(rows), np.nan), np.zeros(len(rows), bool)
+    for of_attack in (False, True):
+        own = [i for i, row in enumerate(rows) if (row[1] is attacked) == of_attack]
+        if own:
+            taken = [rows[i][1:] for i in own]
+            points = np.stack([record.points[block][index] for record, block, index in taken])
+            numbers = np.array([record.first[block] + index for record, block, index in taken])
+            again[own], failing[own] = blocks.again(policy, points, numbers, of_attack, attempt)
+    return again, failing

@@ -8,14 +8,16 @@ def test_balance_is_rarely_lost(run):
 assert run.best["rho"] > -0.5                    # further demands on the run
 """
 
+import contextlib
 import functools
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextvars import ContextVar
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from verifai_jax.checking.check import BUDGET, Check, CheckOutcome, CounterexampleFound
-from verifai_jax.checking.session import current_session
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.targets import definitions, load_target
 from verifai_jax.problem.problem import Problem
@@ -139,3 +141,54 @@ def load(target: str) -> Problem:
     if not colon and len(problems) == 1:
         return next(iter(problems.values()))
     return load_target(target, Problem)
+
+
+CORPUS = "counterexamples"
+"""Usual folder of the corpus, below the root of the project."""
+
+
+@dataclass(frozen=True)
+class Session:
+    """The settings of one test, given by the test runner.
+
+    - `root`: folder that the corpus lies in.
+    - `corpus`: folder of the corpus, as a path from there.
+    - `budget`, `seed`: in place of those of the test, where they are given.
+    - `outcomes`: what came of it, in order.
+    """
+
+    root: Path = field(default_factory=Path)
+    corpus: str = CORPUS
+    budget: int | None = None
+    seed: int | None = None
+    outcomes: list[CheckOutcome] = field(default_factory=list)
+
+    def settings(self, check: Check) -> Check:
+        """Return the settings of a test, with what is given for all in their place."""
+        budget = check.budget if self.budget is None else self.budget
+        seed = check.seed if self.seed is None else self.seed
+        return replace(check, budget=budget, seed=seed)
+
+    def corpus_folder(self, corpus: str | Path | None) -> Path:
+        """Return the folder of a corpus: that of the test, or the usual one."""
+        path = self.root / (self.corpus if corpus is None else corpus)
+        # What is printed and typed again is the path from where one stands.
+        return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+
+
+_SESSION: ContextVar[Session | None] = ContextVar("verifai_jax_session", default=None)
+
+
+@contextlib.contextmanager
+def session(settings: Session) -> Iterator[Session]:
+    """Let checks inside take their settings from this session."""
+    token = _SESSION.set(settings)
+    try:
+        yield settings
+    finally:
+        _SESSION.reset(token)
+
+
+def current_session() -> Session:
+    """Return the session, or default settings when a test is called as a plain function."""
+    return _SESSION.get() or Session()

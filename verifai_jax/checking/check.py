@@ -130,7 +130,7 @@ class CheckOutcome(InNotebook):
     - `problem`: its name.
     - `check`: the settings.
     - `target`: the command line's name of the problem, where it is known.
-    - `replayed`: the corpus; None if there is none.
+    - `replayed`: the replayed corpus; None without one.
     - `run`: what the budget was spent on; None if the corpus failed already.
     - `saved`: files that were added to the corpus.
     - `unsaved`: why a counterexample could not be added; empty if none was to be.

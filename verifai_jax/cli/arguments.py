@@ -105,9 +105,9 @@ BACKEND = click.option(
 ENGINE = click.option(
     "--engine",
     type=click.Choice(["auto", "xla", "native"]),
-    default="xla",
+    default="auto",
     show_default=True,
-    help="native: code by this machine's C++ compiler, for many simulations.",
+    help="native: code by this machine's C++ compiler, auto: for many simulations.",
 )
 """What a traced system is compiled by."""
 
@@ -223,7 +223,7 @@ NAMES = all_of(
 def read_names(
     constants: tuple[str, ...], definitions: tuple[str, ...]
 ) -> tuple[dict[str, float], dict[str, str]]:
-    """Return the constants and the definitions of `NAMES`; a usage error names what is none."""
+    """Return the constants and the definitions of `NAMES`; a usage error names a wrong one."""
     numbers = {}
     for name, value in split_pairs("--const", constants):
         try:
@@ -343,7 +343,7 @@ def split_names(text: str) -> list[str]:
 
 
 def split_pairs(option: str, texts: tuple[str, ...]) -> list[tuple[str, str]]:
-    """Split each NAME=VALUE of a repeated option; a usage error says which one is none."""
+    """Split each NAME=VALUE of a repeated option; a usage error says which one is wrong."""
     pairs = []
     for text in texts:
         name, equals, value = text.partition("=")

@@ -239,8 +239,8 @@ def print_run(
 
     **Arguments:**
 
-    - `options`: the options of the command, which the record does not hold and whoever resumes it
-      gives again.
+    - `options`: the options of the command that the record does not hold, to be given again on
+      resuming.
 
     **Raises:** `CommandError` where no simulation has a verdict.
     """

@@ -50,7 +50,7 @@ class GateType(click.ParamType):
         return f"[{'|'.join(self._forms())}]"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Gate:
-        """Read a gate; anything else is a usage error with those that there are."""
+        """Read a gate; anything else is a usage error that lists the gates."""
         if isinstance(value, Gate):
             return value
         name, sign, bound = str(value).replace(" ", "").partition(">")

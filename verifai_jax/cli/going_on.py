@@ -41,7 +41,7 @@ class Kept:
         self._work = work
 
     def stopped(self, why: str | None) -> None:
-        """Take note that there is a result, and what ended the work.
+        """Note that the result exists, and what ended the work.
 
         **Arguments:**
 

@@ -12,9 +12,9 @@ from verifai_jax.cli.json_output import command, draw, give_result
 
 @command()
 @arguments.TARGET
-@click.option("--rounds", type=int, default=4, show_default=True, help="Attacks, at most.")
+@click.option("--rounds", type=int, default=8, show_default=True, help="Attacks, at most.")
 @click.option("--steps", type=int, help="Environment steps of the first training.")
-@click.option("--further-steps", type=int, help="Of each round  [default: a quarter of --steps]")
+@click.option("--further-steps", type=int, help="Of each round  [default: an eighth of --steps]")
 @click.option("--samples", type=int, default=512, show_default=True, help="Of each certificate.")
 @click.option("--attack", default="cross_entropy", show_default=True, help="Search that attacks.")
 @click.option("--attack-simulations", type=int, default=512, show_default=True)

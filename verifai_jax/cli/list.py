@@ -88,7 +88,7 @@ def _print_target(target: "Problem | Study") -> None:
 
 
 def _no_specs() -> str:
-    """Say that there is no folder of problems here, and what there is."""
+    """Say that this folder has no problems, and what it has."""
     files = sorted(file.name for file in Path().glob("[!_]*.py"))
     others = f". Python files here: {', '.join(files)}" if files else ""
     return (

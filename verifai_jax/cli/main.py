@@ -118,7 +118,7 @@ def _signals_interrupt() -> Iterator[list[int]]:
 
 
 def _closed_pipe() -> click.exceptions.Exit:
-    """Return what ends a command whose output nobody reads any more; that is no mistake."""
+    """Return the exit of a command whose reader has closed the pipe, which is not an error."""
     # Python's own last flush must not fail either.
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

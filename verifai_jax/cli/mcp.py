@@ -216,7 +216,7 @@ class Server:
             raise Refused(text) from None
 
     def _fence(self, key: str, value: str) -> None:
-        """Refuse a path outside of the folder, and a problem that is no file in it."""
+        """Refuse a path outside of the folder, and a problem that is not in a file of it."""
         path = value.rpartition(":")[0] if key == "problem" and ":" in value else value
         whole = (self.folder / path).resolve() if "\0" not in path else Path("/")
         if not whole.is_relative_to(self.folder) or not whole.exists() or path.startswith("-"):

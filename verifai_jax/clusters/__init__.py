@@ -1,7 +1,7 @@
 """Executors of clusters: `connect` by an address, and an adapter for Ray."""
 
+from verifai_jax.clusters.connection import RayExecutor as RayExecutor
 from verifai_jax.clusters.connection import connect as connect
-from verifai_jax.clusters.ray_executor import RayExecutor as RayExecutor
 
 __all__ = ["RayExecutor", "connect"]
 

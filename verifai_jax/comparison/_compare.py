@@ -81,7 +81,7 @@ def compare(
 
     **Returns:** the comparison; after Ctrl-C that of the finished pairs.
 
-    **Raises:** before anything is simulated, `TypeError` for something that is no `Problem`;
+    **Raises:** before anything is simulated, `TypeError` for anything but a `Problem`;
     `ProblemError` for other features that vary; `ValueError` for numbers out of range, and for
     targets that cannot be loaded.
     """

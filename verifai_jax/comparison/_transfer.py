@@ -90,7 +90,7 @@ def transfer(
     **Returns:** a `Transfer` with the table of all pairs.
 
     **Raises:** before anything is simulated, `ProblemError` for problems without a common feature
-    or signal; `TypeError` for something that is no `Problem`; `ValueError` for numbers out of range
+    or signal; `TypeError` for anything but a `Problem`; `ValueError` for numbers out of range
     and a search that needs gradients.
     """
     started = time.perf_counter()

@@ -209,7 +209,7 @@ class Transfer(InNotebook):
 
     @property
     def flips(self) -> "pd.DataFrame":
-        """The pairs that part and of which only one fails."""
+        """The pairs that differ and in which only one simulation fails."""
         table: Any = self.table
         return table[table["differs"] & (table["violated_a"] != table["violated_b"])]
 

@@ -15,26 +15,32 @@ VerifAI: a toolkit for the formal design and analysis of artificial intelligence
 2019.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
+import jax.numpy as jnp
 import pandas as pd
 from jaxtyping import Array
 
 from verifai_jax._version import __version__
-from verifai_jax.compositional.image import DecisiveImage, Frame
 from verifai_jax.compositional.region import UNCERTAIN, Abstraction, AbstractLoop, sample_region
 from verifai_jax.compositional.result import BUDGET, FOUND, INTERRUPTED, NOTHING, Compositional
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.precision import reproducible_settings
 from verifai_jax.core.progress import ProgressBar
+from verifai_jax.core.trace import Trace
 from verifai_jax.falsification import Run, falsify, resume, simulate
 from verifai_jax.falsification.validation import check_search
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import Formula, parse
 from verifai_jax.problem import Problem, ProblemError
 from verifai_jax.search import Search
+from verifai_jax.systems.base import Seed, System
+
+Frame = Callable[[Any, Mapping[str, Array]], Mapping[str, Any]]
+"""`(features, sample of a trace) -> signals` of the network's reading of one rendered image."""
 
 
 @suggests_options
@@ -287,3 +293,27 @@ class _Stages:
 
 CANDIDATE = ("image", "simulated", "rho", "fails", "rendered")
 """Columns of a candidate in addition to its features."""
+
+
+class DecisiveImage(System):
+    """The network's reading of the last image that the loop cannot do without.
+
+    **Arguments:**
+
+    - `loop`: the loop without images.
+    - `frame`: renders one image, and returns the signals of the network's reading.
+    - `lanes`: images that are worked on together.
+    """
+
+    exact_step = True
+
+    def __init__(self, loop: AbstractLoop, frame: Frame, lanes: int) -> None:
+        self.loop, self.frame, self.lanes = loop, frame, lanes
+        self.dt = 1.0
+
+    def __call__(self, features: Any, key: Seed = None) -> Trace:
+        """Render one image; the trace has one sample."""
+        seen = self.frame(features, self.loop.decisive(features).sample)
+        if not isinstance(seen, Mapping):
+            raise TypeError(f"frame must return a dictionary of signals; got {type(seen).__name__}")
+        return Trace({name: jnp.asarray(value)[None] for name, value in seen.items()}, dt=1.0)

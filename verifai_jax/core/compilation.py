@@ -248,7 +248,7 @@ def _wanted_options(
 
 @cache
 def options_of(effort: XlaOptimization) -> dict[str, Any] | None:
-    """Return XLA's options for this effort, as far as XLA knows them; None if there are none."""
+    """Return the options for this effort that XLA knows; None without any."""
     return known_options(_wanted_options(effort)) or None
 
 

@@ -1,8 +1,8 @@
 """The preparation of JAX, as soon as it is there and before its backend starts or compiles.
 
-It gets one device for each core of the processor, whose number it fixes when its backend starts,
+JAX gets one device for each core of the processor, a number that its backend fixes when it starts,
 and batches of factorizations that do not hang (`core.factorizations`). Importing `verifai_jax` does
-not import JAX, so both wait for whoever imports it first.
+not import JAX, so both happen when JAX is first imported.
 """
 
 import importlib.abc

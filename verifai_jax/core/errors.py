@@ -27,7 +27,7 @@ def nearest_names(name: object, known: Iterable[str]) -> str:
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> UnknownNameError:
-    """Make the error for `name`, which is none of the `known` names of this `kind`."""
+    """Make the error for a `name` that is not among the `known` names of this `kind`."""
     known = [str(k) for k in known]
     hint = nearest_names(name, known) or "."
     listing = f" Known: {', '.join(known)}." if known else f" There is no {kind} at all."

@@ -30,8 +30,8 @@ ABSENT = -1
 class Events:
     """Events in the order in which they happen; slots after the last one are absent.
 
-    - `kinds`: `[slots]`, the index of each event's name in `names`; -1 where there is none.
-    - `waits`: `[slots]`, seconds since the event before, or the start; 0 where there is none.
+    - `kinds`: `[slots]`, the index of each event's name in `names`; -1 in an empty slot.
+    - `waits`: `[slots]`, seconds since the event before, or the start; 0 in an empty slot.
     - `parameters`: `[slots, ...]` by name; the middle of a domain where an event has none.
     - `names`: the names of the kinds of events.
     """
@@ -56,7 +56,7 @@ class Events:
 
     @property
     def times(self) -> Float[Array | np.ndarray, " slots"]:
-        """Seconds from the start to each event; infinite where there is none."""
+        """Seconds from the start to each event; infinite in an empty slot."""
         xp = _library(self.waits)
         return xp.where(self.mask, xp.cumsum(self.waits, axis=-1), np.inf)
 

@@ -1,4 +1,4 @@
-"""Work on other machines through `concurrent.futures`' `submit`, whoever's executor it is.
+"""Work on other machines through the `submit` of any executor like those of `concurrent.futures`.
 
     check_executor(executor)
     shipment = ship(problem, executor, target="specs/cartpole.py:balance")
@@ -177,7 +177,7 @@ def _explained(error: Exception) -> Exception:
 
 
 class Shipment(Generic[T]):
-    """An object on its way to workers, each of which keeps it, with what it compiles for it.
+    """An object that is sent to workers; each worker keeps it with the programs compiled for it.
 
     **Arguments:**
 

@@ -43,7 +43,7 @@ _ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")
 
 
 class _Unknown(Exception):
-    """Something of which it cannot be said what it does."""
+    """A value whose behaviour cannot be identified."""
 
 
 def fingerprint(program: Any, derivatives: bool = True) -> str | None:
@@ -95,7 +95,7 @@ class _Reader:
     def read(self, value: Any) -> None:
         """Read any value.
 
-        **Raises:** `_Unknown` for one of which it cannot be said what it does.
+        **Raises:** `_Unknown` for one whose behaviour cannot be identified.
         """
         add = self._texts.append
         if value is None or isinstance(value, (bool, int, float, complex, str, bytes)):

@@ -1,4 +1,4 @@
-"""Masked and missing samples as gaps: NaN, of which no verdict is made.
+"""Masked and missing samples as gaps: NaN, which gets no verdict.
 
 with_gaps("x", np.ma.masked_array([0.0, 9e9], mask=[False, True]))      # [0, nan]
 """
@@ -94,7 +94,7 @@ def known_times(times: Any) -> Any:
     Integers of 8 and 16 bits become floats, since their differences would wrap.
 
     **Raises:** `ValueError` that names the first one that is masked or missing; `TypeError` for
-    what is no array of numbers.
+    anything but an array of numbers.
     """
     if isinstance(times, jax.Array | jax.ShapeDtypeStruct):
         return times

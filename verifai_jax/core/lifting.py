@@ -41,7 +41,7 @@ class LiftedNumbers:
             _current.reset(token)
 
     def vector(self, precision: str) -> Float[np.ndarray, " numbers"]:
-        """Return the argument: the numbers in this precision, and zeros behind them."""
+        """Return the argument: the numbers in this precision, then zeros."""
         vector = np.zeros(CAPACITY, precision)
         vector[: len(self._values)] = self._values
         return vector

@@ -42,7 +42,7 @@ class ProgramCache:
         return cast(V, values[key])
 
     def peek(self, slot: Slot[K, V], key: K) -> V | None:
-        """Return the value of this key, or None if there is none yet."""
+        """Return the value of this key, or None before it is made."""
         return cast("V | None", self._slots.get(slot.name, {}).get(key))
 
     def clear(self) -> None:

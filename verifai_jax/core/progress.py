@@ -143,7 +143,7 @@ class ProgressBar:
                 return super().render(task)
 
         class Time(TimeRemainingColumn):
-            """The time that is left, or that has passed where nobody knows how much is to do."""
+            """The time left, or the time so far if the total is unknown."""
 
             def render(self, task: "Task") -> "Text":
                 if task.total is None:
@@ -170,7 +170,7 @@ class ProgressBar:
                 stream.flush()
 
     def begin(self, name: str, total: float | None, unit: str) -> None:
-        """Begin a stage of `total` units of work, None if nobody knows; it may lie in another."""
+        """Begin a stage of `total` units of work, None if unknown; a stage may lie in another."""
         self._own += 1
         bar = self._shared or self
         stage = _Stage(name, total, unit, time.perf_counter())
@@ -356,7 +356,7 @@ def has_viewer() -> bool:
 
 @contextlib.contextmanager
 def goes_on_with(command: str, kept: Callable[[], bool]) -> Iterator[None]:
-    """Say after a moment by which command one goes on with what is killed: then nobody can.
+    """Say after a moment which command resumes the work, since a killed process cannot say it.
 
     **Arguments:**
 

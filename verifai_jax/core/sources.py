@@ -44,7 +44,7 @@ SHOWN = 12
 MAX_SHOWN = 3
 """Changes that a sentence lists."""
 tree_commits: dict[Path, str] = {}
-"""Folders with the project's files as they are at commits of git, while they are there."""
+"""Folders with the project's files at commits of git, while they exist."""
 
 
 class Source(NamedTuple):

@@ -237,7 +237,7 @@ def _sentence(error: BaseException, step: TracebackType, features: object) -> st
 
 
 def _advice_on_tracing(error: BaseException) -> str:
-    """Write what to do about an error that comes of tracing; empty for others."""
+    """Write what to do about an error caused by tracing; empty for others."""
     # NumPy raises an error of its own from that of JAX.
     for each in (error, error.__cause__):
         for kind, advice in TRACING:

@@ -4,7 +4,7 @@
     replay_counterexamples(problem, "counterexamples")  # all in one batch: failing, fixed, invalid
 
 A file holds the features of one simulation, the formulas, what it was worth, how it was found and
-how to see it again. Nothing in it is executed: the problem comes from whoever replays it.
+how to see it again. Nothing in it is executed: the problem is given again to replay it.
 """
 
 import hashlib
@@ -184,7 +184,7 @@ def save_counterexamples(
     **Arguments:**
 
     - `run`: with its problem.
-    - `folder`: it is made where there is none; files that are there already stay.
+    - `folder`: made if missing; existing files stay.
     - `max_count`: counterexamples at most.
     - `shrink`: whether each is first shrunk towards the nominal features, where these are known.
     - `budget`: simulations to shrink one with, at most.

@@ -23,7 +23,7 @@ PARENTS = 6
 TRIED = 256
 """Pairs of changes at a time: a failure that is found among them ends the round."""
 SINGLES = 400
-"""Single changes at most, of which pairs are made."""
+"""Single changes at most that are combined into pairs."""
 ELITE, MANY, SAMPLES = 24, 200, 96
 """Likeliest failures whose spread is that of samples, few and many; samples of a round."""
 SIZES = (1.3, 0.5, 0.2, 0.07)

@@ -120,7 +120,7 @@ class Nominal:
 
     @staticmethod
     def _compiled(function: Callable[..., Any], points: Float[np.ndarray, "n d"]) -> np.ndarray:
-        """Return a compiled function of points; of powers of two, so that there are few shapes."""
+        """Return a compiled function of points, padded to powers of two to keep shapes few."""
         return np.asarray(function(pad_rows(points)))[: len(points)]
 
     @cached_property
@@ -178,7 +178,7 @@ class Nominal:
 
     @cached_property
     def scale(self) -> Float[np.ndarray, " d"]:
-        """The size of a step in each coordinate, as a departure, of which many are tried."""
+        """Step sizes in each coordinate, as departures, that are tried."""
         return np.ones(len(self.u))
 
     def count(self, points: Float[np.ndarray, "n d"]) -> Int[np.ndarray, " n"]:

@@ -42,7 +42,7 @@ BATCH = 512
 RARE = 30
 """Failures expected among the pairs below which two estimates are compared instead."""
 RADII = (0.01, 0.1, 1.0)
-"""Divergences in nats of which the worst probability is shown."""
+"""Divergences in nats for which the worst probability is shown."""
 FINEST = 4
 """The step is divided by that; an error of first order or better shrinks by as much at least."""
 

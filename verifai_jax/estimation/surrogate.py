@@ -55,6 +55,10 @@ SETTLED = 0.01
 all learning is spent on looking for others."""
 SETTLED_BY_CHEAP = 0.15
 """The same with a cheap model, at which learning ends."""
+ATTEMPTS, LEARNED, GOOD = 3, 40, 1.2
+"""Attempts to estimate with a cheap model, simulations that learn for each but the last one, and
+the width, as a share of the wanted one, above which an attempt is given up after its first look:
+its samples teach the surrogate more than they tell."""
 EXPLORED = 3
 """One of so many simulations of a round goes where the surrogate knows least, whatever it says
 there: it is wrong about failures that its points gave no hint of."""
@@ -87,10 +91,16 @@ def estimate_by_surrogate(limit_state: LimitState, rng: np.random.Generator, pla
     counts = Counts(0, 0, 0)
     try:
         counts = _first_design(limit_state, rng)
-        _learn(limit_state, rng, surrogate)
-        proposal = _proposal(limit_state, rng, surrogate)
-        control = Control(limit_state, rng, surrogate, proposal)
-        samples, mean = _sample(limit_state, rng, proposal, plan, control)
+        attempts = 1 if plan.cheap is None or plan.within is None else ATTEMPTS
+        for left in reversed(range(attempts)):
+            _learn(limit_state, rng, surrogate, LEARNED if left else None)
+            proposal = _proposal(limit_state, rng, surrogate)
+            control = Control(limit_state, rng, surrogate, proposal)
+            found = _sample(limit_state, rng, proposal, plan, control, left > 0)
+            if found is not None:
+                break
+        assert found is not None
+        samples, mean = found
     except Ended:
         return bound_from_pilot(limit_state, plan)
     return _answer(limit_state, rng, plan, counts, samples, control, mean)
@@ -124,18 +134,25 @@ def _known(limit_state: LimitState) -> tuple[Float[np.ndarray, "n d"], Float[np.
     return z[known], rho[known]
 
 
-def _learn(limit_state: LimitState, rng: np.random.Generator, surrogate: Surrogate) -> None:
+def _learn(
+    limit_state: LimitState,
+    rng: np.random.Generator,
+    surrogate: Surrogate,
+    count: int | None = None,
+) -> None:
     """Simulate where the surrogate is least sure of the sign, and where it knows least at all.
 
     Workers of an executor are given a round while the one before it is simulated: it is chosen by
     the results of those before that one, and by the points of that one. So it depends on the
     numbers of the simulations, and not on when they end. A cheap model settles so much that few
-    rounds are better, each of which knows all of them.
+    rounds are better, each of which knows all of them; if a `count` is given, it takes no more.
     """
     from scipy.special import ndtr
 
     learning = min(LEARNING * limit_state.budget, MAX_LEARNING)
     until = limit_state.budget - learning
+    if count is not None:
+        until = max(until, limit_state.left - count)
     knows_all = surrogate.cheap is not None
     rounds = ROUNDS_BY_CHEAP if knows_all else ROUNDS
     size = max(1, int(learning / rounds))
@@ -273,16 +290,20 @@ def _sample(
     proposal: Mixture,
     plan: Plan,
     control: Control,
-) -> tuple[ImportanceSamples, ControlledMean]:
+    again: bool = False,
+) -> tuple[ImportanceSamples, ControlledMean] | None:
     """Simulate fresh samples until the interval is as short as wanted, or the budget is spent.
 
-    Nearly no failures among the first ones end it, too: the rest is worth more elsewhere.
+    Nearly no failures among the first ones end it, too: the rest is worth more elsewhere. None
+    where the first look says that it is better to learn `again`.
     """
     left, confidence = max(limit_state.left, 1), plan.confidence
     looks, size = 2, max(1, round(FIRST_LOOK * left))
     if plan.within is not None:
-        # Each look has an equal part of the error, so that their intervals hold together.
-        looks, size, confidence = LOOKS, FIRST_SIZE, 1 - (1 - confidence) / LOOKS
+        # Each look has an equal part of the error, so that their intervals hold together, also
+        # those of attempts that were given up.
+        shares = LOOKS + (ATTEMPTS - 1 if plan.cheap is not None else 0)
+        looks, size, confidence = LOOKS, FIRST_SIZE, 1 - (1 - confidence) / shares
     found: ImportanceSamples | None = None
     mean = ControlledMean(0.0, np.inf, 0.0, 1.0)
     for look in range(looks):
@@ -293,6 +314,8 @@ def _sample(
         found = new if found is None else found.join(new)
         mean = control.estimate(found, confidence)
         few = found.failing.sum() < MIN_FAILING
+        if again and few and not limit_state.ended:
+            return None
         if limit_state.ended or (few and len(found.x) >= min(MIN_LOOK, FIRST_LOOK * left)):
             break
         if plan.within is not None:
@@ -300,6 +323,8 @@ def _sample(
             width *= UNDERSTATED
             if width <= 1 and not few:
                 break
+            if again and look == 0 and width > GOOD:
+                return None
             # The width falls with the root of the samples; this is how many are still needed.
             size = round(len(found.x) * min(CAUTIOUS * width**2 - 1, 1)) if not few else FIRST_SIZE
     assert found is not None

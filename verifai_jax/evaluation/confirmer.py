@@ -352,11 +352,13 @@ class Confirmer:
         features: dict[str, Any] = {}
         together: dict[tuple[int, int], list[str]] = {}
         for name, (replays, factor) in self._checks.items():
-            replays.begin_compiling(factor, len(numbers))
             if replays.precision not in features:
                 features[replays.precision] = space.features_of(rows, replays.precision)
             # What one program replays at one step fills its lanes.
             together.setdefault((id(replays), factor), []).append(name)
+        for names in together.values():
+            replays, factor = self._checks[names[0]]
+            replays.begin_compiling(factor, len(numbers), len(names))
         replayed: dict[str, Verdicts] = {}
         for names in together.values():
             replays, factor = self._checks[names[0]]

@@ -36,6 +36,9 @@ from verifai_jax.problem.problem import Problem
 Wanted = Literal["auto", "xla", "native"]
 """What compiles the simulations of a run, as a person asks for it; see `NativeEngine`."""
 WANTED: tuple[Wanted, ...] = ("auto", "xla", "native")
+FIRST = 512
+"""Rows of a run that XLA simulates in any case, so that the first result waits for no second
+compiler; and rows that it simulates at a time where it only decides what is near to zero."""
 
 
 class Engine:

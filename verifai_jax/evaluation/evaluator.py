@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Key
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.programs import power_of_two
 from verifai_jax.core.progress import count_done
-from verifai_jax.evaluation.engine import Engine, Wanted, engine_for
+from verifai_jax.evaluation.engine import FIRST, Engine, Wanted, engine_for
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.kept_work import present_part
 from verifai_jax.evaluation.raising import ALIKE, Raising
@@ -114,7 +114,8 @@ class Evaluator:
             self.engine = compiled = engine_for(
                 problem, batch, gradient, precision, clauses, guidance, self.given
             )
-            if engine != "xla" and precision == "float32" and keep_traces is False:
+            wanted = engine == "native" or (engine == "auto" and budget > FIRST)
+            if wanted and precision == "float32" and keep_traces is False:
                 from verifai_jax.evaluation import native_engine
 
                 self.engine = self._native = native_engine.NativeEngine(compiled, engine, budget)

@@ -11,51 +11,31 @@ native program is used once it agreed with XLA on the rows that it met first.
 
 import math
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cache, cached_property
-from typing import Any, TypeAlias
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from verifai_jax.core.keys import IMPLEMENTATION, simulation_key
-from verifai_jax.core.machine_code import Unavailable
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.machine_code import Unavailable, compiler
 from verifai_jax.core.programs import Slot
-from verifai_jax.core.trace import Status
-from verifai_jax.evaluation.engine import Engine, Wanted
-from verifai_jax.evaluation.verdicts import Verdicts, violations
+from verifai_jax.evaluation.engine import FIRST, Engine, Wanted
+from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.mtl.expression import durations_in
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.tree import Term, postorder
-from verifai_jax.native_code.library import (
-    Library,
-    approve,
-    is_approved,
-    library_name,
-    load,
-)
-from verifai_jax.native_code.source import translate
-from verifai_jax.native_code.values import Untranslatable
 
-Rows: TypeAlias = Float[np.ndarray, "n row"]
-RunKey: TypeAlias = Key[Array, ""]
-Temperature: TypeAlias = Float[np.ndarray, " n"] | float
-"""Temperatures of the smooth robustness, or one for all."""
+if TYPE_CHECKING:
+    from verifai_jax.evaluation.native_program import NativeProgram, Rows, RunKey, Temperature
+
 WORTH = 3e9
 """Operations of a run from which on a native program is worth it by default. XLA's programs do 1.3
 to 4.5e10 a second on two cores (seven problems), and translator and compiler take 1.3 s, once for
 all runs of a machine: a dozen such runs, of a tenth of a second each, pay for it."""
-FIRST = 512
-"""Rows of a run that XLA simulates, so that the first result waits for no second compiler; and rows
-that it simulates at a time where it only decides what is near to zero."""
 SLACK = 4e-7
 """Robustness below which rounding may decide a verdict, relative to the greatest number of the
 formula, its reach in seconds included: three units in the last place of single precision."""
-AGREES = 1e-3
-"""Relative difference of two robustness values from which on they differ by more than rounding."""
 
 
 class NativeEngine:
@@ -94,7 +74,9 @@ class NativeEngine:
     @property
     def compile_seconds(self) -> float:
         """Seconds spent compiling."""
-        return self._begun.compile_seconds + self._waited
+        few = self._begun
+        whole = 0.0 if few is self.engine else self.engine.compile_seconds
+        return few.compile_seconds + whole + self._waited
 
     @property
     def _begun(self) -> Engine:
@@ -111,6 +93,9 @@ class NativeEngine:
     def begin_compiling(self) -> None:
         """Trace now and compile in the background."""
         self._xla.begin_compiling()
+        if self._is_worth and self.engine.batch > FIRST:
+            # The first round needs it; it is made of what was traced just now.
+            self._program.begin()
 
     def compile(self) -> None:
         """Compile now what the first rows need."""
@@ -141,13 +126,18 @@ class NativeEngine:
 
     @cached_property
     def _is_worth(self) -> bool:
-        """True where the work of the run is worth a native program."""
+        """True where the work of the run is worth a native program, and there may be one."""
+        asked = self._wanted == "native"
         if jax.default_backend() != "cpu":
-            self._why = f"runs on the {jax.default_backend()}"
+            self._why = f"runs on the {jax.default_backend()}" if asked else ""
             return False
-        if self._wanted == "native":
-            return True
-        return self._budget * self.engine.program.work >= WORTH
+        if not asked and self._budget * self.engine.program.work < WORTH:
+            return False
+        try:
+            compiler()
+        except Unavailable as error:
+            self._why = str(error)
+        return not self._why
 
     @cached_property
     def _xla(self) -> Engine:
@@ -160,12 +150,16 @@ class NativeEngine:
         return self.engine.with_batch(FIRST)
 
     @cached_property
-    def _program(self) -> "_Program":
+    def _program(self) -> "NativeProgram":
+        from verifai_jax.evaluation.native_program import NativeProgram
+
         return self.engine.problem.programs.get(
-            PROGRAMS, self.engine, lambda: _Program(self.engine)
+            PROGRAMS, self.engine, lambda: NativeProgram(self.engine)
         )
 
-    def _by_xla(self, rows: Rows, key: RunKey, first: int, temperature: Temperature) -> Verdicts:
+    def _by_xla(
+        self, rows: "Rows", key: "RunKey", first: int, temperature: "Temperature"
+    ) -> Verdicts:
         size, parts = self._xla.batch, []
         for begin in range(0, len(rows), size):
             some = slice(begin, begin + size)
@@ -173,7 +167,9 @@ class NativeEngine:
             parts.append(self._xla.evaluate(rows[some], key, first + begin, warm))
         return Verdicts.concatenate(parts)
 
-    def _by_native(self, rows: Rows, key: RunKey, first: int, temperature: Temperature) -> Verdicts:
+    def _by_native(
+        self, rows: "Rows", key: "RunKey", first: int, temperature: "Temperature"
+    ) -> Verdicts:
         started = time.perf_counter()
         try:
             self._program.ready()
@@ -189,7 +185,7 @@ class NativeEngine:
             self._program.compare(ours, theirs, self._slack)
             self._why, self._met = self._program.refused, []
         if self._why:
-            return self._by_xla(rows, key, first, temperature)
+            return self.engine.evaluate(rows, key, first, temperature)
         result = self._program(rows, key, first, temperature)
         near = np.any(np.abs(result.rho) <= self._slack, axis=1)
         if not np.any(near):
@@ -226,132 +222,12 @@ def _greatest(formula: Formula) -> float:
     return max([1.0, *map(abs, numbers), *reach])
 
 
-def _cut(temperature: Temperature, which: slice | np.ndarray) -> Temperature:
+def _cut(temperature: "Temperature", which: slice | np.ndarray) -> "Temperature":
     """Return the temperatures of some rows, or the one of all."""
     return temperature[which] if isinstance(temperature, np.ndarray) else temperature
 
 
-def _alike(ours: np.ndarray, theirs: np.ndarray) -> bool:
-    """Return whether derivatives agree, except in a few chaotic simulations."""
-    ours, theirs = ours.reshape(len(ours), -1), theirs.reshape(len(theirs), -1)
-    size = np.max(np.abs(theirs), axis=1, keepdims=True) + 1e-6
-    same = np.isclose(ours, theirs, rtol=0, atol=10 * AGREES * size, equal_nan=True)
-    return bool(np.mean(np.all(same, axis=1)) >= 0.98)
-
-
-class _Program:
-    """The native program of an engine, which is compiled once for the problem."""
-
-    def __init__(self, engine: Engine) -> None:
-        self.engine = engine
-        self.approved = False
-        self.refused = ""
-        self._future: Future[tuple[str, Library]] | None = None
-
-    @cached_property
-    def draws(self) -> bool:
-        """True where the system uses its random key, or may do so."""
-        return self.engine.gradient or self.engine.program.draws()
-
-    @cached_property
-    def traced(self) -> tuple[Any, str | None]:
-        """The program of a row, its random key by its number; and its identity."""
-        function = self.engine.program.traced_row()
-        *_, numbers = self.engine.program.forms
-
-        def of_row(
-            row: Array, words: Array, number: Array, temperature: Array, numbers: Array
-        ) -> Array:
-            key = simulation_key(jax.random.wrap_key_data(words, impl=IMPLEMENTATION), number)
-            packed = function(row, key, temperature, (), numbers)
-            if set(packed) != {"uint32"}:
-                raise Unavailable("it returns numbers of eight bytes")
-            return packed["uint32"]
-
-        with in_precision(self.engine.precision):
-            forms = (
-                self.engine.inputs.row_form,
-                jax.ShapeDtypeStruct((2,), jnp.uint32),
-                jax.ShapeDtypeStruct((), jnp.int32),
-                jax.ShapeDtypeStruct((), jnp.float32),
-                numbers,
-            )
-            program = self.engine.program.differentiable(lambda: jax.make_jaxpr(of_row)(*forms))
-            return program, self.engine.program.identity
-
-    def begin(self) -> None:
-        """Begin to compile, where that has not begun."""
-        if self._future is None:
-            self._future = _pool().submit(self._load)
-
-    def ready(self) -> Library:
-        """Return the library, once it is compiled.
-
-        **Raises:** `Unavailable` where there is none.
-        """
-        if self.refused:
-            raise Unavailable(self.refused)
-        self.begin()
-        assert self._future is not None
-        return self._future.result()[1]
-
-    def _load(self) -> tuple[str, Library]:
-        try:
-            program, computes = self.traced
-            name = library_name(computes)
-            agrees = is_approved(name)
-            if agrees is False:
-                raise Unavailable("its results differ from those of XLA by more than rounding")
-            (form,) = program.out_avals
-            with in_precision(self.engine.precision):
-                source = lambda: translate(program)  # noqa: E731
-                library = load(name, form.shape[0], source, quickly=self.engine.gradient)
-            self.approved = bool(agrees)
-            return name, library
-        except Untranslatable as error:
-            raise Unavailable(f"it has {error}, which is not translated") from error
-
-    def __call__(self, rows: Rows, key: RunKey, first: int, temperature: Temperature) -> Verdicts:
-        """Simulate rows."""
-        library = self.ready()
-        temperatures = np.broadcast_to(np.asarray(temperature, np.float32), (len(rows),))
-        words = np.asarray(jax.random.key_data(key))
-        threads = len(self.engine.layout.devices)
-        packed = library(rows, words, first, temperatures, self.engine.program.numbers(), threads)
-        unpacked: Any = self.engine.program.unpack("evaluate", {"uint32": packed}, len(rows))
-        rho, status, features, more = unpacked
-        # What is exactly zero is decided by XLA.
-        broken = violations(rho, status, lambda: np.ones(rho.shape, bool))
-        return Verdicts(rho, status, broken, features, **more)
-
-    def compare(self, ours: Verdicts, theirs: Verdicts, slack: np.ndarray) -> None:
-        """Compare rows with those of XLA, and note whether they agree."""
-        assert self._future is not None
-        name, _ = self._future.result()
-        mine = ours.rho
-        proper = np.repeat((theirs.status == Status.OK)[:, None], mine.shape[1], axis=1)
-        clear = proper & (np.abs(theirs.rho) > slack)
-        far = np.abs(mine - theirs.rho) > AGREES * (1 + np.abs(theirs.rho))
-        pairs = ((ours.gradient, theirs.gradient), (ours.clause_gradients, theirs.clause_gradients))
-        agrees = bool(
-            np.array_equal(ours.status, theirs.status)
-            and all(_alike(a, b) for a, b in pairs if a is not None and b is not None)
-            and np.array_equal((mine < 0) & clear, (theirs.rho < 0) & clear)
-            # A simulation may be chaotic, and a few of them go their own ways.
-            and np.sum(far & proper & (theirs.rho >= 0)) <= 0.02 * max(np.sum(proper), 1)
-        )
-        approve(name, agrees)
-        self.approved = agrees
-        if not agrees:
-            self.refused = "its results differ from those of XLA by more than rounding"
-
-
-PROGRAMS: Slot[Engine, _Program] = Slot("native programs")
+PROGRAMS: Slot[Engine, "NativeProgram"] = Slot("native programs")
 """Native programs by the engine of XLA that they stand for."""
 SMALL: Slot[Engine, Engine] = Slot("engines of few rows")
 """Engines that decide what is near to zero, by the engine of whole batches."""
-
-
-@cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(1, "native compiler")

@@ -118,7 +118,7 @@ class Replays:
 
         **Returns:** the verdicts of the rows, once for each.
         """
-        together = self._together(len(numbers))
+        together = self._together(len(numbers), len(each))
         features = jax.tree.map(
             lambda form, *leaves: np.concatenate(leaves).astype(form.dtype), self._form, *each
         )
@@ -139,9 +139,9 @@ class Replays:
         verdicts = Verdicts.concatenate([part._replace(features=None) for part in parts])
         return verdicts.split(len(each))
 
-    def begin_compiling(self, factor: int, count: int) -> None:
-        """Compile what replays so many rows, in the background."""
-        engine = self._engine(factor, self._together(count))
+    def begin_compiling(self, factor: int, count: int, times: int) -> None:
+        """Compile what replays so many rows so many times, in the background."""
+        engine = self._engine(factor, self._together(count, times))
         compiled = engine.compile_seconds
         # An error in it is reported when rows are replayed.
         with suppress(Exception):
@@ -149,12 +149,12 @@ class Replays:
         self.compile_seconds += engine.compile_seconds - compiled
 
     @staticmethod
-    def _together(count: int) -> int:
-        """Return how many of so many rows are replayed in one call."""
+    def _together(count: int, times: int) -> int:
+        """Return how many replays are made in one call, of so many rows so many times."""
         if count <= ONE_BY_ONE:
             return 1
         some, many = (lanes * len(jax.local_devices()) for lanes in LANES)
-        return many if count > 2 * some else some
+        return many if count * times > 2 * some else some
 
     def _keys(self, numbers: Int[np.ndarray, " n"], together: int) -> Key[Array, " together"]:
         if not self.draws:
@@ -236,7 +236,7 @@ class HostReplays:
                 lambda: ship(problem, executor, target, identity),
             )
 
-    def begin_compiling(self, factor: int, count: int) -> None:
+    def begin_compiling(self, factor: int, count: int, times: int) -> None:
         """Do nothing: a black box is not compiled."""
 
     def __call__(

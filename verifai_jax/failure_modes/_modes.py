@@ -266,7 +266,7 @@ def _divide(
     more: Float[np.ndarray, "n d"] | None,
     black_box: bool,
 ) -> Divided | None:
-    """Divide the weighted failures into regions; return None if there are none, or time ends."""
+    """Divide the weighted failures into regions; return None without any, or when time ends."""
     if answer.samples is None or not answer.samples.x.any():
         return None
     samples = answer.samples

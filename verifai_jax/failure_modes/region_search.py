@@ -46,7 +46,7 @@ def find_regions(
     share: Float[np.ndarray, " n"],
     nearest: Float[np.ndarray, "m d"],
 ) -> Regions:
-    """Find the failing regions behind weighted failures.
+    """Find the failing regions that weighted failures lie in.
 
     **Arguments:**
 
@@ -108,7 +108,7 @@ def _scaled(limit_state: LimitState, maximum: int) -> int:
 
 
 def _left(limit_state: LimitState) -> int:
-    """Return the simulations that are left but for those that share_explained takes."""
+    """Return the simulations left after reserving those of `share_explained`."""
     return limit_state.left - min(A_LOOK * LOOKED_AT, limit_state.left // 4)
 
 

@@ -35,7 +35,6 @@ from verifai_jax.falsification.validation import (
     as_wanted,
     batch_size,
     can_be_slow,
-    check_engine,
     check_first,
     check_gradient,
     check_guide,
@@ -92,7 +91,7 @@ def falsify(
     target: str | None = None,
     executor: "Executor | None" = None,
     keep_going: bool = False,
-    engine: str = "xla",
+    engine: str = "auto",
     cheap: Problem | None = None,
     proved: "Verification | str | Path | None" = None,
 ) -> Run:
@@ -148,7 +147,8 @@ def falsify(
     - `engine`: `"xla"`, or `"native"`: rows from the 513th on are simulated by vector code that
       the machine's own C++ compiler makes of the problem, two to five times as fast where no
       large network is in the loop. It agrees with XLA up to rounding; XLA decides what is near to
-      zero, and simulates what cannot be translated. `"auto"` takes it if the budget is worth it.
+      zero, and simulates what cannot be translated. `"auto"` takes it if the budget is worth it,
+      without `stop_after` and `stop_when`.
     - `cheap`: a cheap model of the same features, searched first with 20 times the budget. At
       most a quarter of the budget is spent on what it found. Only `problem` decides what fails.
     - `proved`: what `verify` found of this problem, or its file. The run is of the rest, and is
@@ -166,7 +166,8 @@ def falsify(
     """
     started = time.perf_counter()
     check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
-    check_engine(engine)
+    ends_early = stop_after is not None or stop_when is not None
+    wanted = as_wanted(engine, ends_early)
     of_rest: tuple[str, ...] = ()
     if proved is not None:
         from verifai_jax.verification.result import as_verification
@@ -194,10 +195,9 @@ def falsify(
     callbacks = check_callbacks(callbacks)
     earlier = earlier_rows(warm_start, problem)
     in_precision(precision)
-    whole = stop_after is None and stop_when is None and max_seconds is None
 
     def batch_for(search: Search) -> int:
-        alone = whole and not problem.black_box
+        alone = not (ends_early or max_seconds is not None or problem.black_box)
         small = 16 if diverse else 64 if search.wants.likelihood else None
         return batch_size(batch, search, budget, stop_after, alone, small)
 
@@ -220,7 +220,7 @@ def falsify(
         table = ErrorTable(tuple(problem.space.columns), path)
         rounds = Rounds(
             problem, search, size, seed, table, precision, path, confirm, executor, target, given,
-            suggests=asking is not None, engine=as_wanted(engine), budget=budget,
+            suggests=asking is not None, engine=wanted, budget=budget,
         )  # fmt: skip
         if asking is not None:
             rounds.ask(replace(asking, search=search))

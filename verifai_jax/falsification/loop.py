@@ -24,6 +24,7 @@ from verifai_jax.core.stopwatch import Stopwatch
 from verifai_jax.evaluation.confirmer import Confirmer
 from verifai_jax.evaluation.engine import Wanted
 from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.evaluation.kept_work import present
 from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.columns import import_tables
@@ -54,11 +55,11 @@ class Rounds:
 
     `first` are rows of given features (`given_rows`) that are simulated before the search proposes
     any; `suggestions` are those that somebody gives on the way, None if nobody is asked.
-    `record_checksum` is that of the run's record, for the checkpoints.
-    `checks` names the closer replays that were made. `watch` has the seconds of all: to
-    `COMPILE`; to `SEARCH`, which the search took for its proposals and to learn, and whoever
-    suggests points to think of them; to `SIMULATE`, and to put the rows into the table; to
-    `CONFIRM`. The rest is whoever advances the rounds.
+    `record_checksum` is that of the run's record, for the checkpoints. `only_budget_ends` is
+    whether only the budget is to end the run. `checks` names the closer replays that were made.
+    `watch` has the seconds of all: to `COMPILE`; to `SEARCH`, which the search took for its
+    proposals and to learn, and whoever suggests points to think of them; to `SIMULATE`, and to put
+    the rows into the table; to `CONFIRM`. The rest is whoever advances the rounds.
     """
 
     def __init__(
@@ -90,20 +91,12 @@ class Rounds:
             self._journal = Journal(folder)
         self._journal_without_traces()
         self._simulations = Simulations(
-            problem,
-            search,
-            batch,
-            seed,
-            precision=precision,
-            journal=self._journal,
-            executor=executor,
-            target=target,
-            guidance=self.learning.guidance,
+            problem, search, batch, seed, precision=precision, journal=self._journal,
+            executor=executor, target=target, guidance=self.learning.guidance,
             keep_traces=self.learning.surrogate is not None,
             given=suggests or self.first.shape[1] > problem.space.dim,
-            engine=engine,
-            budget=budget,
-        )
+            engine=engine, budget=budget,
+        )  # fmt: skip
         self._confirmer = None
         if confirm:
             self._confirmer = Confirmer(problem, precision, seed, executor=executor, target=target)
@@ -114,7 +107,7 @@ class Rounds:
         self.checkpoint: dict[str, Any] = {}
         self.record_checksum = 0
         self._pending: Any = None  # Points of the first round that are proposed already.
-        self._prefetches = executor is not None and not search.learns
+        self._has_workers, self.only_budget_ends = executor is not None, False
         self._prefetch: Prefetch | None = None
         self._saved = time.perf_counter()
         self._raising = Raising()
@@ -177,14 +170,12 @@ class Rounds:
             left = maximum if limit is None else max(limit - done, 0)
             if len(given[:left]):
                 return Batch(given[:left], "suggested", limit is not None and len(given) > left)
-        if self._prefetches:
-            if self._prefetch is None:
-                from verifai_jax.falsification.prefetch import Prefetch
-
-                limit = done + maximum if limit is None else limit
-                proposals = self.learning.proposals
-                self._prefetch = Prefetch(proposals, self.evaluate, self.batch, limit, done)
+        if self._prefetch is None:
+            self._prefetch = self._begin_prefetching(done + maximum if limit is None else limit)
+        if self._prefetch is not None:
+            compiled = self._simulations.compile_seconds
             points, verdicts = self._prefetch.next()
+            self.watch.move(self._simulations.compile_seconds - compiled, COMPILE)
             return Batch(points, "search", verdicts=verdicts)
         points, self._pending = self._pending, None
         if points is not None:
@@ -193,6 +184,21 @@ class Rounds:
         with self._searching():
             points = self.learning.proposals.next(maximum)
         return Batch(points, "search", self.learning.proposals.cut)
+
+    def _begin_prefetching(self, limit: int) -> "Prefetch | None":
+        """Begin to simulate rounds ahead, up to so many rows; None where that is not done.
+
+        In this process it is not where the run may end before its budget, nor where simulations are
+        kept for another process, by the thread that began.
+        """
+        done, proposals = len(self.table), self.learning.proposals
+        here = self.only_budget_ends and limit > done + self.batch and present() is None
+        asked = self.problem.black_box or self.suggestions is not None
+        if self.search.learns or not (self._has_workers or (here and not asked)):
+            return None
+        from verifai_jax.falsification.prefetch import Prefetch
+
+        return Prefetch(proposals, self.evaluate, self.batch, limit, done, self._searching)
 
     def _simulate(self, batch: Batch, first: int) -> Verdicts:
         """Simulate the points of a round, of which the first has this number in the run."""
@@ -392,10 +398,8 @@ class Rounds:
     @property
     def exhausted(self) -> bool:
         """True if a finite search has come to its end."""
-        waiting = self._pending is not None or (
-            self._prefetch is not None and not self._prefetch.empty
-        )
-        proposals = self.learning.proposals
+        ahead, proposals = self._prefetch, self.learning.proposals
+        waiting = self._pending is not None or (ahead is not None and not ahead.empty)
         return proposals is not None and proposals.exhausted and not waiting
 
     def close(self) -> None:
@@ -409,10 +413,9 @@ class Rounds:
         **Raises:** `OSError` where it cannot be written.
         """
         now = time.perf_counter()
-        if self.folder is None or (seldom and now - self._saved < 1.0):
+        # Without a checkpoint it was interrupted before there was a search, and begins anew.
+        if self.folder is None or not self.checkpoint or (seldom and now - self._saved < 1.0):
             return
-        if not self.checkpoint:
-            return  # Interrupted before there was a search: it begins where it would have.
         self._saved = now
         rows = self.table.digest(int(self.checkpoint.get("rows", 0)))
         write_checkpoint(self.checkpoint, self.folder, rows, self.record_checksum)

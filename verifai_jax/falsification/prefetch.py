@@ -1,31 +1,40 @@
-"""Rounds on their way to the workers of an executor, for a search that does not learn.
+"""Rounds that are simulated ahead, for a search that does not learn.
 
     ahead = Prefetch(proposals, evaluate, batch=1024, limit=1_000_000, first=0)
     points, verdicts = ahead.next()                     # of one round, in their order
 
-Such a search can be asked for the points of many rounds before the verdicts of the first are there,
-so that no worker waits. The checkpoint is that of the last round that was taken: what is on its way
+Such a search can be asked for the points of many rounds before the verdicts of the first are there:
+no worker of an executor waits, and in this process the next round is simulated while the last one
+is confirmed and stored. The checkpoint is that of the last round that was taken: what is on its way
 when the run ends is as if it had never been proposed.
 """
 
 from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
+from verifai_jax.core.precision import reproducible_settings
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.search.proposals import Proposals
+
+AHEAD = 3
+"""Rounds of this process that are simulated or wait to be, so that one is ready while an earlier
+one is confirmed for longer than another takes."""
 
 
 class _Round(NamedTuple):
     """One round: its points, where it begins among those sent together, the state after it."""
 
     points: Float[Any, "n d"]
-    pending: Pending
+    pending: Pending | Future[Verdicts]
     begin: int
     checkpoint: dict[str, Any]
 
@@ -36,17 +45,26 @@ class Prefetch:
     **Arguments:**
 
     - `proposals`: the proposals of a search that does not learn.
-    - `evaluate`: with an executor.
+    - `evaluate`: with an executor, or of a system that this process compiles.
     - `batch`: rows of a round.
     - `limit`: rows of the whole run.
     - `first`: number of the next row.
+    - `searching`: a context around each proposal.
     """
 
     def __init__(
-        self, proposals: Proposals, evaluate: Evaluator, batch: int, limit: int, first: int
+        self,
+        proposals: Proposals,
+        evaluate: Evaluator,
+        batch: int,
+        limit: int,
+        first: int,
+        searching: Callable[[], AbstractContextManager[object]] = nullcontext,
     ) -> None:
-        assert isinstance(evaluate.engine, ExecutorEngine)
-        self._proposals, self._evaluate, self._engine = proposals, evaluate, evaluate.engine
+        self._proposals, self._evaluate, self._searching = proposals, evaluate, searching
+        engine = evaluate.engine
+        self._workers = engine if isinstance(engine, ExecutorEngine) else None
+        self._thread = None if self._workers else ThreadPoolExecutor(1, "simulations")
         self._batch, self._limit, self._next = batch, limit, first
         self._rounds: deque[_Round] = deque()
         self._failure: Exception | None = None
@@ -81,18 +99,40 @@ class Prefetch:
                 each.pending.cancel()
             self._rounds.clear()
             self._proposals.restore(self.checkpoint)
+        if self._thread is not None:
+            self._thread.shutdown(wait=False)
+
+    @property
+    def _block(self) -> int:
+        """Rows that are sent together."""
+        return self._batch if self._workers is None else self._workers.block
+
+    @property
+    def _ahead(self) -> int:
+        """Rows that are on their way at a time."""
+        return AHEAD * self._batch if self._workers is None else self._workers.ahead
+
+    def _submit(self, points: Float[Any, "n d"], first: int) -> Pending | Future[Verdicts]:
+        if self._thread is None:
+            return self._evaluate.submit(points, first)
+        return self._thread.submit(self._simulated, points, first)
+
+    def _simulated(self, points: Float[Any, "n d"], first: int) -> Verdicts:
+        with reproducible_settings():  # A thread begins with a person's own.
+            return self._evaluate(points, first=first)
 
     def _fill(self) -> None:
         """Propose and send rounds until enough rows are on their way."""
         waiting = sum(len(each.points) for each in self._rounds)
-        while waiting < max(self._engine.ahead, 1) and self._failure is None:
+        while waiting < max(self._ahead, 1) and self._failure is None:
             group: list[tuple[Any, dict[str, Any]]] = []
             count = 0
             # Small rounds go together, in one block.
-            while count < self._engine.block and self._next + count < self._limit:
+            while count < self._block and self._next + count < self._limit:
                 try:
                     maximum = min(self._batch, self._limit - self._next - count)
-                    points = np.asarray(self._proposals.next(maximum))
+                    with self._searching():
+                        points = self._proposals.next(maximum)
                 except Exception as error:
                     self._failure = error  # Raised when the rounds before it are stored.
                     break
@@ -102,7 +142,8 @@ class Prefetch:
                 count += len(points)
             if not group:
                 return
-            pending = self._evaluate.submit(np.concatenate([p for p, _ in group]), self._next)
+            together = group[0][0] if len(group) == 1 else np.concatenate([p for p, _ in group])
+            pending = self._submit(together, self._next)
             begin = 0
             for points, checkpoint in group:
                 self._rounds.append(_Round(points, pending, begin, checkpoint))

@@ -266,10 +266,10 @@ class Run(InNotebook):
             return "what its model was made of is not recorded, so that it may be another one"
         if versions := then.other_versions(self.problem.sources()):
             return f"no file of its model has changed, and versions have: {', '.join(versions)}"
-        return (
-            "no file of its model has changed: the system has memory, chance or state of its own, "
-            "or reads what is not recorded"
-        )
+        why = "the system has memory, chance or state of its own, or reads what is not recorded"
+        if self.engine == "native":
+            why = "native code rounds otherwise, which a chaotic system makes grow"
+        return f"no file of its model has changed: {why}"
 
     def improbability(self, rows: "pd.DataFrame | None" = None) -> "pd.DataFrame":
         """Return how improbable the prior makes rows of the table: a failure that is never met.

@@ -62,6 +62,11 @@ class Ending(NamedTuple):
     """Seconds that an earlier part of the run has taken, by what they were spent on."""
 
     @property
+    def only_budget(self) -> bool:
+        """True where nothing ends the run before its budget."""
+        return self.stop_after is None and self.stop_when is None and self.max_seconds is None
+
+    @property
     def seconds(self) -> float:
         return time.perf_counter() - self.started
 
@@ -126,6 +131,7 @@ class Running:
         **Raises:** `RunError` with what is finished.
         """
         rounds, begun = self.rounds, time.time()
+        rounds.only_budget_ends = self.ends.only_budget
         now = self.sources
         self._models = (rounds.problem.sources().to_json(),) if now is None else tuple(now)
         # Tracing once more is for those who ask which claims a change concerns.

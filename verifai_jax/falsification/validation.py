@@ -87,18 +87,18 @@ def batch_size(
     return min(usual if asked is None else asked, budget)
 
 
-def check_engine(engine: object) -> None:
-    """Refuse an unknown engine.
+def as_wanted(engine: object, ends_early: bool = False) -> Wanted:
+    """Return an engine that was asked for, or that was recorded: a host system has no other.
+
+    - `ends_early`: whether few simulations may end the run, for which `"auto"` is XLA.
 
     **Raises:** `UnknownNameError`.
     """
+    if engine == "host" or (ends_early and engine == "auto"):
+        return "xla"
     if engine not in WANTED:
         raise unknown_name("engine", str(engine), WANTED)
-
-
-def as_wanted(engine: str) -> Wanted:
-    """Return an engine that was checked or recorded, as one to ask for: a host has no other."""
-    return cast(Wanted, "xla" if engine == "host" else engine)
+    return cast(Wanted, engine)
 
 
 def check_search(problem: object, search: object) -> Search:

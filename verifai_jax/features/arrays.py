@@ -146,7 +146,7 @@ class Items:
 
     - `values`: stacked along a leading axis as in an `Array` of the greatest length, so that every
       simulation has the same shapes. Entries after the length hold the middle of the item's domain.
-    - `length`: the number of items that there are.
+    - `length`: the number of valid items.
 
     `features["cars"]["x"]` are the `x` of all entries; multiply by `mask`, or use `jnp.where`.
     """

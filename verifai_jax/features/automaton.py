@@ -14,11 +14,15 @@ from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.events import ABSENT, Events
 from verifai_jax.features.domain import Domain, Row, as_real, cell, centre, dotted, indexed
-from verifai_jax.features.event_descriptions import describe_event, read_event
 from verifai_jax.features.event_tables import EventTables
 from verifai_jax.features.facts import Facts, integer_facts, joined_facts
 from verifai_jax.features.transitions import Graph, Transition, check_states, unfold
-from verifai_jax.features.written_events import WrittenEvents, where_there
+from verifai_jax.features.written_events import (
+    WrittenEvents,
+    describe_event,
+    read_event,
+    where_there,
+)
 
 
 @dataclass(frozen=True, init=False, repr=False)

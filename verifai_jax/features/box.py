@@ -3,8 +3,8 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
@@ -46,8 +46,30 @@ NARROW = 16
 a box of a few roundings can rounding do that, and 16 leave a margin."""
 
 
+class _Between(Domain):
+    """Numbers between two ends, or vectors of them, all equally likely."""
+
+    def columns(self, name: str) -> tuple[str, ...]:
+        low: Any = getattr(self, "low")  # noqa: B009
+        return (name,) if np.ndim(low) == 0 else indexed(name, np.size(low))
+
+    def to_columns(self, values: Array | np.ndarray, name: str) -> dict[str, np.ndarray]:
+        array, columns = np.asarray(values), self.columns(name)
+        if array.ndim == 1:
+            return dict.fromkeys(columns, array)
+        return {column: array[:, i] for i, column in enumerate(columns)}
+
+    @property
+    def monotone(self) -> bool:
+        return True
+
+    @property
+    def uniform(self) -> bool:
+        return True
+
+
 @dataclass(frozen=True, repr=False)
-class Box(Domain):
+class Box(_Between):
     """Real numbers from `low` to `high`, uniform; vectors if the ends are sequences.
 
     `Box(-1, 1)`, `Box([0, 0], [10, 5])`, `Box(0, 1, closed="left")`. A value is a real number, or
@@ -164,14 +186,6 @@ class Box(Domain):
                     f"{short(high.item())}{closing}; got {short(x.item())}{nearest(x, first, last)}"
                 )
 
-    def columns(self, name: str) -> tuple[str, ...]:
-        return _columns(self.low, name)
-
-    def to_columns(
-        self, values: Float[Array, "n *entries"] | Float[np.ndarray, "n *entries"], name: str
-    ) -> dict[str, np.ndarray]:
-        return _to_columns(values, self.columns(name))
-
     def from_columns(self, row: Row, name: str) -> Float[Array, "*entries"]:
         entries = [as_numbers(row[column], column).item() for column in self.columns(name)]
         numbers = np.asarray(entries[0] if np.ndim(self.low) == 0 else entries)
@@ -183,16 +197,8 @@ class Box(Domain):
         ends = (low, high, low + (high - low) / 2, high - low)
         return tuple(np.asarray(end, dtype) for end in ends)  # pyright: ignore[reportReturnType]
 
-    @property
-    def monotone(self) -> bool:
-        return True
-
     def words(self) -> str:
         return f"uniform between {numbers(self.low)} and {numbers(self.high)}"
-
-    @property
-    def uniform(self) -> bool:
-        return True
 
     @property
     def tuning(self) -> Tuning:
@@ -215,7 +221,7 @@ class Box(Domain):
 
 
 @dataclass(frozen=True, repr=False)
-class DiscreteBox(Domain):
+class DiscreteBox(_Between):
     """Integers from `low` to `high`, equally likely; vectors if the ends are sequences.
 
     `DiscreteBox(1, 6)`, `DiscreteBox([0, 0], [3, 5])`. Both ends are included. A value is an
@@ -299,14 +305,6 @@ class DiscreteBox(Domain):
                     f"{short(x.item())}{nearest(np.round(x), low, high)}"
                 )
 
-    def columns(self, name: str) -> tuple[str, ...]:
-        return _columns(self.low, name)
-
-    def to_columns(
-        self, values: Int[Array, "n *entries"] | Int[np.ndarray, "n *entries"], name: str
-    ) -> dict[str, np.ndarray]:
-        return _to_columns(values, self.columns(name))
-
     def from_columns(self, row: Row, name: str) -> Int[Array, "*entries"]:
         entries = []
         for column in self.columns(name):
@@ -323,17 +321,9 @@ class DiscreteBox(Domain):
         low = np.asarray(self.low, np.int32)
         return low, np.asarray(self.levels, np.int32).reshape(low.shape)
 
-    @property
-    def monotone(self) -> bool:
-        return True
-
     def words(self) -> str:
         ends = f"{numbers(self.low)} to {numbers(self.high)}"
         return f"the integers from {ends}, all equally probable"
-
-    @property
-    def uniform(self) -> bool:
-        return True
 
     @property
     def tuning(self) -> Tuning:
@@ -345,9 +335,6 @@ class DiscreteBox(Domain):
             column: integer_facts(low, high)
             for column, (low, high) in zip(self.columns(name), ends, strict=True)
         }
-
-    def __repr__(self) -> str:
-        return f"DiscreteBox({short(self.low)}, {short(self.high)})"
 
 
 def _ends(
@@ -380,14 +367,3 @@ def _in_order(intervals: Sequence[Sequence[float]]) -> list[tuple[float, float]]
 def _check_shape(numbers: np.ndarray, end: Numbers, name: str) -> None:
     if numbers.shape != np.shape(end):
         raise ValueError(f"{name} must have shape {list(np.shape(end))}; got {list(numbers.shape)}")
-
-
-def _columns(end: Numbers, name: str) -> tuple[str, ...]:
-    return (name,) if np.ndim(end) == 0 else indexed(name, np.size(end))
-
-
-def _to_columns(values: np.ndarray | jax.Array, columns: tuple[str, ...]) -> dict[str, np.ndarray]:
-    array = np.asarray(values)
-    if array.ndim == 1:
-        return dict.fromkeys(columns, array)
-    return {column: array[:, i] for i, column in enumerate(columns)}

@@ -45,7 +45,8 @@ class Categorical(Domain):
 
     Where all choices are numbers the value is the number; otherwise JAX cannot hold it and the
     value is its index in `choices`, an `int32`. The table always shows the choice itself. A person
-    writes the choice; an integer that is none is an index only where no choice reads as a number.
+    writes the choice; an integer that is not a choice is an index, but only if no choice reads as a
+    number.
 
     **Arguments:**
 
@@ -407,6 +408,3 @@ class Constant(Domain):
     @property
     def held_at(self) -> PyTree:
         return self.value
-
-    def __repr__(self) -> str:
-        return f"Constant({short(self.value)})"

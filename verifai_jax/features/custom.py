@@ -128,7 +128,7 @@ class Distribution(Continuous):
 
     @property
     def source(self) -> str:
-        """The text of `inverse_cdf` as it is written, in one line; its name where there is none."""
+        """The text of `inverse_cdf` as it is written, in one line; its name without a source."""
         try:
             return " ".join(inspect.getsource(self.inverse_cdf).split())
         except (OSError, TypeError):

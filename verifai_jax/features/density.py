@@ -38,7 +38,7 @@ def log_density(space: FeatureSpace, rows: Mapping[str, Any]) -> Float[np.ndarra
     **Arguments:**
 
     - `space`: the space of the features.
-    - `rows`: columns `[n]` by name; those that are none of features are ignored.
+    - `rows`: columns `[n]` by name; columns of no feature are ignored.
 
     **Raises:** `ValueError` for a row outside the space, and for a domain without a density, such
     as an automaton or one of the user's own.

@@ -88,9 +88,6 @@ class Normal(Continuous):
     def words(self) -> str:
         return f"normal with mean {number(self.mean)} and standard deviation {number(self.std)}"
 
-    def __repr__(self) -> str:
-        return f"Normal({short(self.mean)}, {short(self.std)})"
-
 
 @dataclass(frozen=True, repr=False)
 class TruncatedNormal(Continuous):
@@ -199,10 +196,6 @@ class TruncatedNormal(Continuous):
     def tuning(self) -> Tuning:
         return Tuning("other", self.low, self.high)
 
-    def __repr__(self) -> str:
-        shown = ", ".join(short(x) for x in (self.mean, self.std, self.low, self.high))
-        return f"TruncatedNormal({shown})"
-
 
 @dataclass(frozen=True, repr=False)
 class LogUniform(Continuous):
@@ -268,6 +261,3 @@ class LogUniform(Continuous):
     @property
     def tuning(self) -> Tuning:
         return Tuning("log", self.low, self.high)
-
-    def __repr__(self) -> str:
-        return f"LogUniform({short(self.low)}, {short(self.high)})"

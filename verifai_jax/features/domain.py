@@ -37,10 +37,8 @@ from verifai_jax.features.facts import Facts, drawn_facts
 
 MAX_LEVELS = 2**20
 """Cells of a coordinate at most: narrower ones are not distinct in a float32 coordinate."""
-
 MIN_REAL = float(np.finfo(np.float32).tiny)
 """Smallest normal float32 number: XLA treats smaller ones as zero."""
-
 MAX_REAL = float(np.finfo(np.float32).max)
 """Largest float32 number."""
 
@@ -89,15 +87,19 @@ class Domain(ForUsers, abc.ABC):
     _internal = frozenset((
         "arguments", "check_reachable", "closed", "coerce", "coordinates", "ends", "facts",
         "from_columns", "graph", "held_at", "items", "labels", "lengths", "levels", "monotone",
-        "coverage_id_count",
-        "coverage_ids", "named", "nominal", "numeric", "ordered", "parts", "refine", "refined",
-        "rounded",
-        "sequences", "settled", "signals", "spans", "tail", "tailed", "to_columns", "tuning",
-        "uniform", "used", "weights", "without", "words",
+        "coverage_id_count", "coverage_ids", "named", "nominal", "numeric", "ordered", "parts",
+        "refine", "refined", "rounded", "sequences", "settled", "signals", "spans", "tail",
+        "tailed", "to_columns", "tuning", "uniform", "used", "weights", "without", "words",
     ))  # fmt: skip
 
     arguments: ClassVar[tuple[str, ...] | None] = None
-    """Attributes of which it can be made again, for JSON; None for a domain of a user's own."""
+    """Attributes from which it can be rebuilt; None for a domain defined by a user."""
+
+    def __repr__(self) -> str:
+        if self.arguments is None:
+            return super().__repr__()
+        given = ", ".join(short(getattr(self, name)) for name in self.arguments)
+        return f"{type(self).__name__}({given})"
 
     @property
     @abc.abstractmethod
@@ -215,14 +217,14 @@ class Domain(ForUsers, abc.ABC):
         """Return the numbers of what a value covers, below `coverage_id_count`; -1 for nothing."""
         return jnp.zeros(0, jnp.int32)
 
-    # What other rooms ask. Each has a default, so that a domain defines what is special about it.
+    # Other rooms ask for these. Each has a default, which a domain overrides where it differs.
 
     def words(self) -> str:
         """Return in English what values there are, and how probable they are."""
         return one_line(repr(self))
 
     def parts(self, name: str) -> "tuple[tuple[str, Domain], ...]":
-        """Return the domains of which each value is made, with the names of their columns.
+        """Return the domains of a value's parts, with the names of their columns.
 
         **Arguments:**
 
@@ -293,7 +295,6 @@ class Domain(ForUsers, abc.ABC):
 
         **Raises:** `ValueError` for a value so far in a tail that none does.
         """
-        return
 
     def coordinates(self, name: str) -> tuple[str, ...]:
         """Return the names of the unit coordinates of the feature called `name`."""
@@ -404,7 +405,7 @@ def as_numbers(value: object, name: str) -> Float[np.ndarray, "*shape"]:
 
 
 _NO_NUMBERS = (str, bytes, complex, np.complexfloating, np.datetime64, np.timedelta64)
-"""Types that NumPy converts to a real number, and that are none."""
+"""Types that NumPy converts to real numbers, although they are not numbers here."""
 
 
 def as_scalar(value: Value) -> Value:
@@ -431,9 +432,8 @@ def dotted(name: str, field: str) -> str:
 
 def nearest(number: float, low: float, high: float) -> str:
     """Return the end of a message that names the value nearest to a number; empty without one."""
-    if not math.isfinite(number):
-        return ""
-    return f"; the nearest value is {short(np.clip(number, low, high).item())}"
+    text = f"; the nearest value is {short(np.clip(number, low, high).item())}"
+    return text if math.isfinite(number) else ""
 
 
 def format_choices(choices: Sequence[object]) -> str:

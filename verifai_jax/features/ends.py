@@ -23,7 +23,7 @@ CLOSED = ("both", "left", "right", "neither")
 """Which ends of an interval belong to it, as in pandas."""
 
 End: TypeAlias = float | tuple[float, ...]
-"""An end of an interval, or of several; infinite where there is none."""
+"""An end of an interval, or of several; infinite for an open range."""
 
 Reals = TypeVar("Reals", jax.Array, np.ndarray)
 """Real numbers, of JAX or of NumPy."""
@@ -32,7 +32,7 @@ Reals = TypeVar("Reals", jax.Array, np.ndarray)
 def check_closed(closed: object) -> None:
     """Refuse what does not say which ends belong to an interval.
 
-    **Raises:** `UnknownNameError` for a word that is none of `CLOSED`.
+    **Raises:** `UnknownNameError` for a word that is not in `CLOSED`.
     """
     if closed not in CLOSED:
         raise unknown_name("value of closed", str(closed), CLOSED)
@@ -92,7 +92,8 @@ def round_inwards(
     high: End,
     closed: str = "both",
 ) -> Reals:
-    """Return numbers, of which those at an end that was rounded outwards are at the end within.
+    """Return numbers with those on an end that rounding moved outwards moved to the last number
+    inside.
 
     Others stay as they are, those that are farther outside too.
 
@@ -138,7 +139,7 @@ def _ends(low: End, high: End, dtype: np.dtype, closed: str) -> _Ends:
 
 
 def _single(value: Any, xp: Any) -> Any:
-    """Return numbers as they are in single precision, in their own."""
+    """Return numbers rounded to single precision, in their own precision."""
     with np.errstate(over="ignore"):
         return xp.asarray(value).astype(np.float32).astype(value.dtype)
 

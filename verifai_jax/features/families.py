@@ -2,8 +2,8 @@
 
     FeatureSpace({"load": LogNormal(3.0, 0.5), "wait": Exponential(12.0)})
 
-As of a `Normal`, coordinates reach a probability of 2^-26 (1.5e-8) on either side, and 0 and 1
-stand for the values there.
+As with `Normal`, coordinates reach tails of probability 2^-26 (1.5e-8); 0 and 1 stand for the
+values there.
 """
 
 import math
@@ -27,7 +27,7 @@ from verifai_jax.features.continuous import (
     sides,
 )
 from verifai_jax.features.distributions import HALF_LOG_2PI, Normal
-from verifai_jax.features.domain import MIN_REAL, short
+from verifai_jax.features.domain import MIN_REAL
 from verifai_jax.features.ends import replace_where
 from verifai_jax.features.english import number
 
@@ -105,9 +105,6 @@ class LogNormal(Positive):
             f"{number(self.mean)} and standard deviation {number(self.std)}"
         )
 
-    def __repr__(self) -> str:
-        return f"LogNormal({short(self.mean)}, {short(self.std)})"
-
 
 @dataclass(frozen=True, repr=False)
 class Weibull(Positive):
@@ -151,9 +148,6 @@ class Weibull(Positive):
     def words(self) -> str:
         return f"Weibull with shape {number(self.shape)} and scale {number(self.scale)}"
 
-    def __repr__(self) -> str:
-        return f"Weibull({short(self.shape)}, {short(self.scale)})"
-
 
 @dataclass(frozen=True, repr=False)
 class Exponential(Positive):
@@ -188,9 +182,6 @@ class Exponential(Positive):
 
     def words(self) -> str:
         return f"exponential with mean {number(self.mean)}"
-
-    def __repr__(self) -> str:
-        return f"Exponential({short(self.mean)})"
 
 
 @dataclass(frozen=True, repr=False)
@@ -259,7 +250,3 @@ class Triangular(Continuous):
             f"triangular between {number(self.low)} and {number(self.high)}, most likely "
             f"{number(self.mode)}"
         )
-
-    def __repr__(self) -> str:
-        shown = ", ".join(short(x) for x in (self.low, self.mode, self.high))
-        return f"Triangular({shown})"

@@ -122,7 +122,7 @@ def check_columns(
 
 
 def _column(entries: Any, name: str) -> np.ndarray:
-    """Return a column of a table `[n]`, each entry of which is one value.
+    """Return a column of a table `[n]` with one value in each entry.
 
     **Raises:** `ValueError` for an entry that is several, such as a list.
     """

@@ -219,7 +219,7 @@ class PointMaps:
 
     @cached_property
     def settle(self) -> Callable[[Numbers], Float[Array, "n dim"]]:
-        """Move coordinates of points `[n, dim]` that mean nothing to one value; compiled."""
+        """Move unused coordinates of points `[n, dim]` to one value; compiled."""
         return jax.jit(jax.vmap(self.root.settled))
 
     @cached_property

@@ -84,7 +84,7 @@ def _batch(domain: Domain, columns: Mapping[str, np.ndarray], name: str, precisi
 def nudged(domains: Mapping[str, Domain], features: Mapping[str, PyTree]) -> dict[str, PyTree]:
     """Return the same features `[n, ...]`, their real numbers one rounding of float32 away.
 
-    They stay in their domains; choices, constants and features that are fixed stay as they are.
+    They stay in their domains; choices, constants and fixed features do not move.
     """
     return {name: _nudged(domain, features[name]) for name, domain in domains.items()}
 

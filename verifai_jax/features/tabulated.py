@@ -158,9 +158,6 @@ class Gamma(Positive):
     def words(self) -> str:
         return f"gamma with shape {number(self.shape)} and scale {number(self.scale)}"
 
-    def __repr__(self) -> str:
-        return f"Gamma({short(self.shape)}, {short(self.scale)})"
-
 
 @dataclass(frozen=True, repr=False)
 class Beta(Continuous):

@@ -108,7 +108,7 @@ class Graph:
     - `enabled`: whether it is.
     - `last`: the last transition that is enabled at each node; -1 where none is.
     - `reachable_states`, `transitions`: names and numbers of those that a sequence can contain.
-    - `pairs`: pairs of transitions of which the second can come right after the first.
+    - `pairs`: pairs of transitions that can follow each other directly.
     """
 
     states: tuple[str, ...]

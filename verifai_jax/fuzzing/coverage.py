@@ -16,7 +16,7 @@ from verifai_jax.features import Automaton, Domain
 from verifai_jax.problem.problem import Problem
 
 MAX_NAMED = 4
-"""Names of what is not covered that are written out."""
+"""Uncovered names that are listed at most."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Covered:
 
     - `where`: the feature, or `traces`.
     - `what`: `states`, `transitions`, `pairs`, `cells` or `clauses`.
-    - `names`: all names that there are.
+    - `names`: all names.
     - `hits`: how many simulations had each.
     """
 

@@ -42,10 +42,10 @@ Cells = Mapping[str, tuple[float, float, int]]
 """For each signal the low and the high end of its cells, and their number."""
 
 CELLS_OF_A_RANGE = 4
-"""Cells into which a signal with a range is cut where nobody says how many."""
+"""Default number of cells of a signal with a range."""
 
 MAX_CUT = 4
-"""Signals with ranges that are cut at most where nobody says which."""
+"""Signals with ranges that are divided into cells by default, at most."""
 
 
 class CheckedSystem(System):

@@ -32,7 +32,7 @@ from verifai_jax.core.progress import say_done, shows_progress
 from verifai_jax.features import Categorical
 from verifai_jax.hardening.arms import Arms, FunctionArms, TaskArms
 from verifai_jax.hardening.collecting import Collected, collect, end_if_interrupted
-from verifai_jax.hardening.mixture import HardeningError, Mixture, Start, mixture_of
+from verifai_jax.hardening.mixture import CAPACITY, HardeningError, Mixture, Start, mixture_of
 from verifai_jax.hardening.result import BASELINE, HARDENED, Hardening
 from verifai_jax.problem.problem import Problem
 from verifai_jax.rl import Algorithm, evaluate
@@ -100,7 +100,7 @@ def harden(
     algorithm: Algorithm | None = None,
     start: Start | None = None,
     hyperparameters: Mapping[str, object] | None = None,
-    rounds: int = 4,
+    rounds: int = 8,
     steps: int | None = None,
     further_steps: int | None = None,
     p: float | None = None,
@@ -145,7 +145,7 @@ def harden(
     - `hyperparameters`: values of the trainer's hyper-parameters.
     - `rounds`: the maximum number of rounds of attack and further training.
     - `steps`: environment steps of the first training; those of the trainer when left out.
-    - `further_steps`: the number of further steps in each round; by default a quarter of `steps`.
+    - `further_steps`: the number of further steps in each round; by default an eighth of `steps`.
     - `p`: failure probability below which the policy is safe; that of the study, or 0.01.
     - `confidence`: with which the intervals before and after hold together.
     - `samples`, `attack`, `attack_simulations`: of each certificate, as in `certify`.
@@ -172,7 +172,7 @@ def harden(
     made = _as_study(study, problem, algorithm, p)
     trainer, values = made.trainer, dict(hyperparameters or {})
     first_steps = check_count("steps", trainer.steps if steps is None else steps)
-    further = max(1, first_steps // 4) if further_steps is None else further_steps
+    further = max(1, first_steps // 8) if further_steps is None else further_steps
     plan = Plan(
         rounds, first_steps, further, made.p if p is None else p, confidence, samples, attack,
         attack_simulations, added, own, failing, tolerance, episodes, baseline, seed,
@@ -276,14 +276,14 @@ class Work:
         def compute() -> dict[str, np.ndarray]:
             found = collect(
                 self.study.problem(self.policies[HARDENED, stage]),
-                certificates.counterexamples(0),
+                certificates.counterexamples(0), self.points,
                 seed=plan.seed_for(ATTACK, stage), added=plan.added, table=TABLE, shrunk=SHRUNK,
             )  # fmt: skip
             return {name: np.asarray(value) for name, value in found._asdict().items()}
 
         known = self.cache.remember(f"collected/{stage}", compute)
-        found = Collected(known["points"], known["sources"], int(known["simulations"]))
-        self.points = np.concatenate([self.points, found.points])
+        found = Collected(**{**known, "simulations": int(known["simulations"])})
+        self.points = np.concatenate([self.points[found.kept], found.points])[-CAPACITY:]
         row = self.rows[-len(self.arms_named)]
         row["added"], row["cost"] = len(found.points), row["cost"] + found.simulations
         if len(found.points):
@@ -312,7 +312,8 @@ class Work:
         """Return the stage that fails least of those that keep the return; the first, if none."""
         rows = [row for row in self.rows if row["arm"] == arm]
         kept = [row for row in rows if self._keeps_return(arm, row["round"])]
-        return min(kept, key=lambda row: (row["failure_rate"], -row["return"]))["round"]
+        best = min(kept, key=lambda r: (r["failure_rate"], r["attack_failures"], -r["return"]))
+        return best["round"]
 
     def _result(self, stopped: str, began: float) -> Hardening:
         """Choose, certify before and after from fresh samples, and compare them in pairs."""

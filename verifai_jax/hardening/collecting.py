@@ -1,11 +1,13 @@
 """Failures of a stage's policy, as points around which it is trained next.
 
-found = collect(problem, failing, seed=3, added=64, table=512, shrunk=4)
+found = collect(problem, failing, earlier, seed=3, added=64, table=512, shrunk=4)
 found.points, found.sources                 # [n, d], and for each where it comes from
+found.kept                                  # which earlier points stay
 
-Failures of the certificate and of its attack are simulated again and confirmed beside uniform
-samples; that table has rules, and its worst rows are shrunk. The attack's failures are drawn from
-the search's own proposal, so that their neighbourhoods stand for it.
+Failures of the certificate and of its attack, and earlier points, are simulated together with
+samples of the prior; that table has rules, and failures of it are shrunk. Failing samples come
+first: they fail as often as the policy does, where the attack's are of the worst kind, which may be
+one that no policy can master.
 """
 
 from typing import NamedTuple, Protocol
@@ -13,7 +15,7 @@ from typing import NamedTuple, Protocol
 import jax
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from verifai_jax.analysis import rules
 from verifai_jax.counterexamples import shrink
@@ -30,18 +32,27 @@ PRIOR = 4096
 class Collected(NamedTuple):
     """Points of the unit cube to train around.
 
-    - `points`: `[n, d]`.
-    - `sources`: the origin of each, `"counterexample"`, `"shrunk"` or `"rule"`.
+    - `points`: `[n, d]`, new ones.
+    - `sources`: the origin of each: `"sample"`, `"counterexample"`, `"shrunk"` or `"rule"`.
+    - `kept`: which earlier points stay: those that still fail, and as many others as points fail.
     - `simulations`: spent to confirm and shrink.
     """
 
     points: Float[np.ndarray, "n d"]
     sources: np.ndarray
+    kept: Bool[np.ndarray, " m"]
     simulations: int
 
 
 def collect(
-    problem: Problem, failing: pd.DataFrame, *, seed: int, added: int, table: int, shrunk: int
+    problem: Problem,
+    failing: pd.DataFrame,
+    earlier: Float[np.ndarray, "m d"],
+    *,
+    seed: int,
+    added: int,
+    table: int,
+    shrunk: int,
 ) -> Collected:
     """Confirm failures, and make the points to train around of them.
 
@@ -49,14 +60,15 @@ def collect(
 
     - `problem`: the problem of the policy.
     - `failing`: rows that fail, the worst first.
-    - `seed`: the seed of the uniform samples beside them.
-    - `added`: points at most.
-    - `table`: uniform samples that tell the rules where nothing fails.
+    - `earlier`: points of the rounds before.
+    - `seed`: the seed of the samples of the prior.
+    - `added`: the maximum number of points.
+    - `table`: the number of samples of the prior.
     - `shrunk`: counterexamples that are shrunk, where the problem says what is nominal.
     """
     space, points, sources = problem.space, [np.zeros((0, problem.space.dim), np.float32)], []
     if not len(failing):
-        return Collected(points[0], np.zeros(0, np.str_), 0)
+        return Collected(points[0], np.zeros(0, np.str_), np.ones(len(earlier), bool), 0)
 
     def add(found: Float[np.ndarray, "n d"], source: str) -> None:
         points.append(np.asarray(found, np.float32))
@@ -64,10 +76,9 @@ def collect(
 
     # From the worst to the mildest: the worst ones alone are often of one kind.
     spread = np.unique(np.linspace(0, len(failing) - 1, added).astype(int))
-    known = space.points(failing.iloc[spread])
-    uniform = np.asarray(space.points_at(space.sample(jax.random.key(seed), table)))
-    points_to_run = np.concatenate([known, uniform])
-    run = falsify(problem, PointList(points_to_run), len(points_to_run), seed=seed, progress=False)
+    sampled = np.asarray(space.points_at(space.sample(jax.random.key(seed), table)))
+    tried = np.concatenate([earlier, sampled, space.points(failing.iloc[spread])])
+    run = falsify(problem, PointList(tried), len(tried), seed=seed, progress=False)
     end_if_interrupted(run)
     simulations, confirmed = run.simulations, run.table.counterexamples
     if shrunk and len(confirmed):
@@ -89,9 +100,15 @@ def collect(
             within = prior.iloc[:0]  # Nothing or everything fails, so that there is no rule.
         if len(within):
             add(space.points(within), "rule")
-        kept = confirmed.iloc[: added - len(sources)]
-        add(space.points(kept), "counterexample")
-    return Collected(np.concatenate(points), np.array(sources, np.str_), simulations)
+    rows = np.asarray(confirmed.index, int)
+    fails = np.isin(np.arange(len(tried)), rows)
+    first, last = len(earlier), len(earlier) + table
+    add(tried[rows[(rows >= first) & (rows < last)]][: added // 2], "sample")
+    add(tried[rows[rows >= last]][: max(added - len(sources), 0)], "counterexample")
+    kept = fails[:first]
+    passing = np.flatnonzero(~kept)
+    kept[passing[max(len(passing) - int(kept.sum()) - len(sources), 0) :]] = True
+    return Collected(np.concatenate(points), np.array(sources, np.str_), kept, simulations)
 
 
 class _Stopped(Protocol):

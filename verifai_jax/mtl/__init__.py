@@ -43,6 +43,7 @@ from verifai_jax.mtl.operators import (
     sometime_during,
     until,
 )
+from verifai_jax.mtl.parametric import Template, templates
 from verifai_jax.mtl.plot import draw
 from verifai_jax.mtl.recording import TimeColumnError, read
 from verifai_jax.mtl.requirements import Requirement, read_requirements, write_requirements
@@ -50,7 +51,6 @@ from verifai_jax.mtl.resampling import resample
 from verifai_jax.mtl.rewriting import nnf, simplify
 from verifai_jax.mtl.semantics import Semantics, boolean, hard, smooth
 from verifai_jax.mtl.setting import HorizonError, SamplingError
-from verifai_jax.mtl.templating import Template, templates
 from verifai_jax.mtl.watching import Watch, watch
 
 __all__ = [

@@ -3,16 +3,23 @@
 One LALR grammar covers Boolean and arithmetic expressions, because two would collide on
 parentheses; what may stand where is checked afterwards, on the tree, by `FormulaBuilder`. It reads
 more than it accepts, so that an error can say what is meant.
+
+`FormulaBuilder` refuses chains and mixtures of operators on which tools disagree, and offers the
+parentheses that make them clear.
 """
 
+import math
 import re
 from collections.abc import Mapping
+from decimal import Decimal, DecimalException
+from typing import Any
 
-from verifai_jax.mtl.expression_builder import MAX_DEPTH
-from verifai_jax.mtl.formula import Formula
-from verifai_jax.mtl.formula_builder import FormulaBuilder
-from verifai_jax.mtl.grammar import FormulaSyntaxError, explain_error, parser
-from verifai_jax.mtl.words import NAME
+from verifai_jax.core.errors import unknown_name
+from verifai_jax.mtl import formula as ast
+from verifai_jax.mtl.expression_builder import MAX_DEPTH, ExpressionBuilder, Part
+from verifai_jax.mtl.formula import Formula, Interval
+from verifai_jax.mtl.grammar import FormulaSyntaxError, Tree, explain_error, parser
+from verifai_jax.mtl.words import NAME, NUMBERS, OPERATORS
 
 MAX_TOKENS = 10_000
 """Words and symbols that a formula's text may have. Far more than a person writes: a file that
@@ -96,3 +103,227 @@ def _check_size(text: str) -> None:
             raise FormulaSyntaxError(
                 f"{reason}: name its parts by definitions", text, token.start()
             )
+
+
+UNITS = {
+    "s": Decimal(1),
+    "ms": Decimal("1e-3"),
+    "us": Decimal("1e-6"),
+    "ns": Decimal("1e-9"),
+    "min": Decimal(60),
+    "h": Decimal(3600),
+    "d": Decimal(86400),
+}
+_CONNECTIVES = ("iff", "impl", "or_", "and_", "bin", "negation", "temporal")
+
+
+class FormulaBuilder(ExpressionBuilder):
+    """Builder of the formula of one text, which refuses what is ambiguous or ill-typed."""
+
+    def _before(self, tree: Tree) -> None:
+        if tree.data == "iff":
+            self._refuse_powers(tree)
+
+    def _iff(self, tree: Tree) -> Part:
+        parts, words = self._operands(tree)
+        if len(words) > 1:
+            raise self._chained(parts, words)
+        left, right = map(self._formula, parts)
+        value = left.iff(right) if words[0].type == "IFF" else left ^ right
+        return Part(value, *self._span(tree), rule="iff")
+
+    def _impl(self, tree: Tree) -> Part:
+        parts, words = self._operands(tree)
+        self._refuse_open(parts, words, tree.children[::2])
+        if len(words) > 1:
+            raise self._chained(parts, words)
+        left, right = map(self._formula, parts)
+        return Part(left >> right, *self._span(tree), rule="impl")
+
+    def _or(self, tree: Tree) -> Part:
+        return self._joined(tree, ast.Or)
+
+    def _and(self, tree: Tree) -> Part:
+        return self._joined(tree, ast.And)
+
+    def _joined(self, tree: Tree, kind: type[ast.And] | type[ast.Or]) -> Part:
+        parts, words = self._operands(tree)
+        self._refuse_open(parts, words, tree.children[::2])
+        for part in parts:
+            if part.rule == "bin":
+                word = next(c for c in words if c)
+                offer = self._offered(", as in ", f"({self._source(part)})")
+                raise self._fail(
+                    f"until and its like next to {str(word)!r} is ambiguous: put it in "
+                    f"parentheses{offer}",
+                    part.start,
+                    part.end,
+                )
+        value = kind(tuple(map(self._formula, parts)))
+        return Part(value, *self._span(tree), rule="join")
+
+    def _refuse_powers(self, tree: Tree) -> None:
+        """Refuse `x^2 < 1`, where `^` stands next to arithmetic: it means exclusive or.
+
+        Between two comparisons it can mean nothing else, as these do not chain.
+        """
+        for k, word in enumerate(tree.children[1::2]):
+            left = self._touching(tree.children[2 * k], -1)
+            right = self._touching(tree.children[2 * k + 2], 0)
+            kinds = [None if side is None else str(side.data) for side in (left, right)]
+            if str(word) != "^" or kinds in ([None, None], ["cmp", "cmp"]):
+                continue
+            base = _text(self.text, _edge(tree.children[2 * k], -1))
+            exponent = _text(self.text, _edge(tree.children[2 * k + 2], 0))
+            power = self._offered("", f"{base}**{exponent}", within='"s" < {}') or "x**2"
+            raise self._fail(
+                f"'^' is exclusive or, and here it stands next to arithmetic: a power is written "
+                f"{power}, and exclusive or (one formula) xor (the other)",
+                word.start_pos,
+                word.start_pos + 1,
+            )
+
+    def _touching(self, tree: Tree, side: int) -> Tree | None:
+        """Return the arithmetic of an operand of `^` where it touches it, or None."""
+        while tree.data in _CONNECTIVES and (side or tree.data not in ("negation", "temporal")):
+            tree = tree.children[side]
+        match tree.data:
+            case "quoted" | "true" | "false" | "negation" | "temporal":
+                return None
+            case "parens":
+                return tree if self._is_arithmetic(tree) else None
+            case "name":
+                return tree if str(tree.children[0]) in {**NUMBERS, **self.constants} else None
+        return tree
+
+    def _is_arithmetic(self, tree: Tree) -> bool:
+        """Return whether a tree is an expression, by its rule alone."""
+        while tree.data == "parens":
+            tree = tree.children[0]
+        if tree.data == "name":
+            name = str(tree.children[0])
+            return name in self.constants or name not in self.known
+        return tree.data not in (*_CONNECTIVES, "cmp", "true", "false")
+
+    def _bin(self, tree: Tree) -> Part:
+        parts = [self._build(c) for c in tree.children[::3]]
+        words, intervals = tree.children[1::3], tree.children[2::3]
+        self._refuse_open(parts, words, tree.children[::3])
+        if len(words) > 1:
+            raise self._chained(parts, words)
+        left, right = map(self._formula, parts)
+        interval = self._interval(intervals[0])
+        value = ast.build(words[0].type.lower(), (left, right), interval)
+        return Part(value, *self._span(tree), rule="bin")
+
+    def _refuse_open(self, parts: list[Part], words: list[Any], trees: list[Tree]) -> None:
+        """Refuse `always a & b`: tools disagree on how far the word reaches."""
+        is_open = [part.rule == "word" and not part.closed for part in parts]
+        if not any(is_open[: len(words)]):
+            return
+        far = near = self._source(parts[-1])
+        for k in reversed(range(len(words))):
+            between = self.text[parts[k].end : parts[k + 1].start]
+            source = self._source(parts[k])
+            if is_open[k]:
+                operator, operand = self._operator(trees[k], parts[k])
+                far = f"{operator} ({operand}{between}{far})"
+                near = f"({source}){between}{near}"
+            else:
+                far, near = f"{source}{between}{far}", f"{source}{between}{near}"
+        first = is_open.index(True)
+        operator, _ = self._operator(trees[first], parts[first])
+        part = parts[first]
+        offer = self._offered("write ", far, near)
+        raise self._fail(
+            f"how far {operator!r} reaches is ambiguous: {offer or 'say so by parentheses'}",
+            part.start,
+            part.end,
+        )
+
+    def _operator(self, tree: Tree, part: Part) -> tuple[str, str]:
+        """Return the operators in front of a part, with their intervals, and what they stand for.
+
+        The grammar's own tree says where one ends: a text has blanks anywhere, or none.
+        """
+        start = part.start
+        while tree.data in ("temporal", "negation"):
+            tree = tree.children[-1]
+            start = tree.meta.start_pos
+        return self.text[part.start : start].strip(), self.text[start : part.end]
+
+    def _negation(self, tree: Tree) -> Part:
+        part = self._build(tree.children[1])
+        start, end = self._span(tree)
+        return Part(ast.Not(self._formula(part)), start, end, part.closed, part.rule)
+
+    def _temporal(self, tree: Tree) -> Part:
+        word, interval, operand = tree.children
+        part = self._build(operand)
+        value = self._formula(part)
+        name = word.type.lower()
+        if interval is not None and not OPERATORS[name].timed:
+            raise self._fail(f"{str(word)!r} takes no interval", *self._span(interval))
+        value = ast.build(name, (value,), self._interval(interval))
+        symbol = not str(word).rstrip("_").islower()
+        rule = part.rule if symbol else "word"
+        return Part(value, *self._span(tree), closed=part.closed, rule=rule)
+
+    def _interval(self, tree: Tree | None) -> Interval:
+        if tree is None:
+            return ast.EVERYTHING
+        low, high = (self._bound(child) for child in tree.children)
+        span = self._span(tree)
+        if low < 0:
+            raise self._fail("an interval starts at 0 or later", *span)
+        if high < low:
+            ends = (_text(self.text, child) for child in reversed(tree.children))
+            offer = self._offered(": write ", f"[{', '.join(ends)}]", within='F{} "s"')
+            raise self._fail(f"an interval ends no earlier than it starts{offer}", *span)
+        if low == float("inf"):
+            raise self._fail("an interval starts at a finite time", *span)
+        return Interval(low, high)
+
+    def _bound(self, tree: Tree) -> float:
+        if len(tree.children) == 1:
+            name = str(tree.children[0])
+            if name in ("inf", "infinity"):
+                return float("inf")
+            if name in self.constants:
+                value = float(self.constants[name])
+                if math.isnan(value):
+                    raise self._fail(
+                        f"the end of an interval is a number; {name} is NaN", *self._span(tree)
+                    )
+                return value
+            raise self._fail(
+                str(unknown_name("constant", name, ["inf", *self.constants])), *self._span(tree)
+            )
+        minus, number, unit = tree.children
+        try:
+            value = float(Decimal(str(number)) * UNITS[str(unit or "s")])
+        except (DecimalException, ValueError):
+            value = math.inf
+        if math.isinf(value):
+            raise self._fail("a time must be a finite number of seconds, or inf", *self._span(tree))
+        return -value if minus else value
+
+    def _true(self, tree: Tree) -> Part:
+        return Part(ast.TRUE, *self._span(tree), closed=True)
+
+    def _false(self, tree: Tree) -> Part:
+        return Part(ast.FALSE, *self._span(tree), closed=True)
+
+
+def _edge(tree: Tree, side: int) -> Tree:
+    """Return the first (0) or last (-1) operand in a tree outside of an open operator."""
+    while tree.data in (*_CONNECTIVES, "cmp", "sum", "product", "power"):
+        if not isinstance(tree.children[side], Tree):
+            break
+        tree = tree.children[side]
+    return tree
+
+
+def _text(text: str, tree: Tree) -> str:
+    """Return the part of `text` that a node of the tree was read from."""
+    return text[tree.meta.start_pos : tree.meta.end_pos]

@@ -99,7 +99,7 @@ def satisfied(
 
 
 def first_nan(formula: Formula, trace: Trace) -> str:
-    """Say where a signal of a formula has no number, or that the value of the formula is none."""
+    """Say where a signal of a formula is NaN, or that the value of the formula is."""
     trace = trace.trim().finely()
     clock = np.asarray(trace.clock())
     for name in formula.signals():

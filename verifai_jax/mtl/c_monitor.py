@@ -236,11 +236,11 @@ def export_c(
     - `name`: the name of the type in C, and before the names of its functions.
     - `semantics`: `hard` or `boolean`.
     - `every`: whether each formula is asked at every instant, or at time 0.
-    - `sizes`: number of components of each signal of which the formulas take a norm.
+    - `sizes`: number of components of each signal whose norm the formulas take.
 
     **Returns:** the text of the header.
 
-    **Raises:** as `watch`; `ValueError` for a name that is none in C.
+    **Raises:** as `watch`; `ValueError` for a name that is not an identifier of C.
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise ValueError(

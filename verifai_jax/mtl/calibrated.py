@@ -67,7 +67,7 @@ class Forecast(NamedTuple):
 
 
 class Distance(NamedTuple):
-    """A sample beside those that were tested.
+    """A sample compared with those that were tested.
 
     - `distance`: from the nearest of them, in standard deviations of the signals.
     - `p_value`: share of the tested runs that were once as far from the others.

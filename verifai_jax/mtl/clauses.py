@@ -78,7 +78,7 @@ class Goals:
     def values(
         self, trace: Trace, semantics: Semantics = hard, end: End = "hold"
     ) -> Float[Array, "goals clauses"]:
-        """Compute the robustness of each clause over scaled margins; `ABSENT` if there is none."""
+        """Compute the robustness of each clause over scaled margins; `ABSENT` for a missing one."""
         scaled = self.margins(trace, end)
         rows = []
         for goal in self.goals:

@@ -1,4 +1,4 @@
-"""Columns of a recording as numbers: what a cell may be, and how one that is none is refused.
+"""Columns of a recording as numbers: valid cells, and errors for the others.
 
 numbers_of("flight.csv", "x", column)               # [time], or [time, k] of a column of lists
 seconds_of("flight.csv", "time", column)            # from the first, and when that was
@@ -172,7 +172,7 @@ def epoch_unit(values: np.ndarray) -> str:
 def moment_of(text: str) -> datetime.datetime:
     """Return the moment of an ISO 8601 text, which may be a time of day alone.
 
-    **Raises:** `ValueError` for a text that is none.
+    **Raises:** `ValueError` for any other text.
     """
     try:
         return datetime.datetime.fromisoformat(text)

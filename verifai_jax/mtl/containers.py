@@ -123,7 +123,7 @@ def _flatten(prefix: str, value: Any, row: dict[str, Any]) -> None:
 
 
 def _cells(cells: list[Any]) -> Any:
-    """Return cells of one kind as they are, and others as texts, which are no signal."""
+    """Return cells of one kind unchanged, and others as texts, which do not become a signal."""
     import pyarrow
 
     try:

@@ -37,7 +37,7 @@ def deciding_instant(
     - `formulas`, `trace`, `end`: as for `robustness`; batches by `jax.vmap`.
 
     **Returns:** the number of the predicate among `leaves_of(formulas)`, and of the sample, 0 and 0
-    where there is none or the robustness is not finite. Where several decide equally, one of them.
+    without one, or if the robustness is not finite. If several decide equally, one of them.
     """
     leaves = leaves_of(formulas)
     # A search is guided by the samples of the clock; verdicts count all.

@@ -85,7 +85,7 @@ class ExpressionBuilder:
         **Arguments:**
 
         - `before`: what stands before the offers; nothing is said where none can be read.
-        - `within`: a formula that has the text in it, for one that is none on its own.
+        - `within`: a formula that contains the text, for a text that is not a formula itself.
         """
         texts = tuple(" ".join(map(str.strip, text.splitlines())) for text in texts)
         offers = [each for each in texts if self.reads(within.format(each))]

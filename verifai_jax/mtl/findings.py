@@ -20,7 +20,7 @@ class Finding(NamedTuple):
     - `kind`: `"signal"`, `"window"`, `"vacuous"`, `"never near"`, `"never holds"`, `"until"`,
       `"units"`, `"no effect"`, `"always true"`, `"always false"`, or `"no verdict"`.
     - `part`: the part of the formula that it is about.
-    - `sentence`: what is so.
+    - `sentence`: the finding in words.
     - `advice`: what was probably meant.
     """
 
@@ -33,7 +33,7 @@ class Finding(NamedTuple):
 
 @dataclass(frozen=True)
 class Findings(InNotebook):
-    """Findings on formulas; `str()` writes them, and they are false where there are none.
+    """Findings on formulas; `str()` writes them, and `bool()` is False without any.
 
     - `recordings`: how many were looked at.
     - `unread`: signals of the recordings that no formula reads.

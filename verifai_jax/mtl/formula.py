@@ -4,13 +4,13 @@
     always((abs(x) <= 2.4) & (theta.abs() <= 0.2095), 0, 4)
     (x > 1).until(signal("y") >= 0, 0.2, 0.6)
 
-A formula is a frozen tree, hashable and equal by value, so it is a static argument under `jax.jit`.
-Sugar (implication, equivalence, weak until, release) is rewritten into the few nodes below when it
-is written, and restored when it is printed. The table `OPERATORS` of `words` describes an operator;
-its kind of node gives its meaning: `Join`, `Window`, `Witness`, or `Derived` from other operators.
+A formula is a frozen tree, hashable and equal by value, so that `jax.jit` takes it as static. The
+table `OPERATORS` of `words` describes an operator; its kind of node gives its meaning: `Join`,
+`Window`, `Witness`, or `Derived`. Implication and weak until are these, but print as written.
 """
 
 import abc
+import functools
 import html
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -33,6 +33,7 @@ class Formula(Tree):
     """A property of a trace at every instant, true or false, with a margin (its robustness)."""
 
     children: ClassVar[tuple[str, ...]] = ()
+    """Names of the fields that hold operands."""
 
     def __and__(self, other: Formulaic) -> "Formula":
         return conjunction(self, other)
@@ -164,7 +165,6 @@ class Constant(Leaf):
     value: bool
 
     def text(self) -> Text:
-        """Return `TRUE` or `FALSE`."""
         return Text("TRUE" if self.value else "FALSE", "name")
 
 
@@ -186,16 +186,13 @@ class Predicate(Leaf):
             )
 
     def terms(self) -> tuple[Term, ...]:
-        """Return both sides."""
         return self.left, self.right
 
     @property
     def compared(self) -> tuple[Term, str, Term]:
-        """Both sides with the comparison between them."""
         return self.left, self.comparison, self.right
 
     def text(self) -> Text:
-        """Return both sides with the comparison between them."""
         return Text(f"{self.left} {self.comparison} {self.right}", "leaf")
 
 
@@ -213,11 +210,9 @@ class Atom(Leaf):
             )
 
     def terms(self) -> tuple[Term, ...]:
-        """Return the expression."""
         return (self.expression,)
 
     def text(self) -> Text:
-        """Return the text of the expression."""
         text = str(self.expression)
         # A signal or one of its components ends where it ends, whatever comes after it.
         return Text(text, "name" if self.expression.is_signal else "leaf")
@@ -228,7 +223,7 @@ class Not(Formula):
     """`!f`."""
 
     operand: Formula
-    children: ClassVar[tuple[str, ...]] = ("operand",)
+    children = ("operand",)
     word = "not"
 
 
@@ -258,8 +253,8 @@ class Window(Formula):
     """The least (`sign` -1) or the greatest (1) value over an interval, ahead or back."""
 
     operand: Formula
+    children = ("operand",)
     interval: Interval = field(default=EVERYTHING)
-    children: ClassVar[tuple[str, ...]] = ("operand",)
     sign: ClassVar[int]
 
 
@@ -292,17 +287,17 @@ class Next(Formula):
     """`f` at the next sample; at the last one, `f` there, whatever the end of trace."""
 
     operand: Formula
-    children: ClassVar[tuple[str, ...]] = ("operand",)
+    children = ("operand",)
     word = "next"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Prev(Formula):
-    """`f` at the previous sample; where there is none, false (or true, if `weak`)."""
+    """`f` at the previous sample; at the first one, false (or true, if `weak`)."""
 
     operand: Formula
+    children = ("operand",)
     weak: bool = False
-    children: ClassVar[tuple[str, ...]] = ("operand",)
 
     @property
     def word(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -338,7 +333,15 @@ class Derived(Formula, abc.ABC):
     A subclass has its operands and its interval as fields, and defines `meaning`.
     """
 
+    children = ("operand",)
     timeless = True  # Its meaning is what looks ahead or back.
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if isinstance(meaning := vars(cls).get("meaning"), property):
+            # Made once, since walks know a part by its identity.
+            cls.meaning = functools.cached_property(meaning.fget)  # pyright: ignore
+            cls.meaning.__set_name__(cls, "meaning")
 
     @property
     @abc.abstractmethod
@@ -346,11 +349,9 @@ class Derived(Formula, abc.ABC):
         """The formula of other operators that it stands for."""
 
     def below(self) -> tuple[Node, ...]:
-        """Return the nodes among its fields, and its meaning."""
         return *super().below(), self.meaning
 
     def valued(self) -> tuple[Formula, ...]:
-        """Return its meaning."""
         return (self.meaning,)
 
 
@@ -388,8 +389,7 @@ def build(word: str, operands: Iterable[Formula], interval: Interval = EVERYTHIN
 def surface(f: Formula) -> tuple[str, tuple[Formula, ...], Interval | None]:
     """Return how a formula reads: its operator's word, the operands, and the interval if any.
 
-    Sugar that was rewritten away (`->`, `<->`, `xor`, weak until, release, rise, fall) is
-    recognised.
+    Sugar that was rewritten away, such as `->` or `rise`, is recognised.
     """
     match f:
         case Not(Or((And((p, q)), And((Not(r), Not(s)))))) if p == r and q == s:

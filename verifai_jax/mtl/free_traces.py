@@ -179,7 +179,7 @@ class FreeTraces:
 def _clock(
     formulas: Sequence[Formula], dt: float | None, duration: float | None
 ) -> tuple[float, int, tuple[int, ...]]:
-    """Return a period of which all windows are multiples, the samples, and the ends of windows."""
+    """Return a period that divides all windows, the samples, and the ends of windows."""
     timed = [f for whole in formulas for f in postorder(whole) if isinstance(f, Tree) and f.side]
     intervals = [f.interval for f in timed if f.operator.timed]
     ends = [t for i in intervals for t in (i.start, i.end) if 0 < t < math.inf]

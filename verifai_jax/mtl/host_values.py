@@ -44,7 +44,7 @@ FUNCTIONS: dict[str, Callable[..., Values]] = {
     "min": lambda *values: _joined(values, -1),
     "max": lambda *values: _joined(values, 1),
 }
-"""The functions of expressions on the host, but for `norm`."""
+"""The functions of expressions on the host, except `norm`."""
 
 
 @dataclass

@@ -183,7 +183,7 @@ def _row(
 def _decision(
     values: HostValues, formula: Formula, clock: Float[np.ndarray, " time"]
 ) -> tuple[float, str]:
-    """Return the instant that decides a formula in seconds, and what is so at it, as text."""
+    """Return the deciding instant of a formula in seconds, and the deciding predicate as text."""
     walk = values.walk(formula)
     found = walk.decision(formula)
     if found is None:

@@ -50,7 +50,7 @@ def margins(plan: Plan, sizes: Mapping[str, int]) -> Margins:
 
     **Arguments:**
 
-    - `sizes`: number of components of the signals of which a norm is taken.
+    - `sizes`: number of components of the signals whose norm is taken.
 
     **Raises:** `ValueError` for a norm of a signal without a size.
     """

@@ -53,7 +53,8 @@ class Mined(Drawn, InNotebook):
       looser. One entry for one parameter.
     - `formula`: the formula with `values`, which the recordings satisfy.
     - `tightest`: `"least"` or `"greatest"` by name, the side on which tight is.
-    - `sampled`: parameters of which only trying out values showed that the formula is monotone.
+    - `sampled`: parameters in which the formula is monotone by the values that were tried, not by
+      its form.
     - `recordings`, `satisfied`: how many there are, and how many satisfy `formula`.
     - `broken`: the rate of recordings that do not satisfy it, with its interval.
     - `searched`: simulations that did not break it, where a problem was searched; else None.

@@ -130,7 +130,7 @@ def prepare(
 
 
 def _missing_signal(name: str, trace: Trace) -> Exception:
-    """Return the error for a signal that a trace lacks, with what its recording says of it."""
+    """Return the error for a signal that a trace lacks, with the note of its recording on it."""
     error = missing_name("the trace", "signal", name, trace.signals)
     said = [note for note in trace.notes if isinstance(note, LeftOut) and note.column == name]
     return type(error)(f"{error}; {said[0]}") if said else error

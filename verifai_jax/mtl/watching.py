@@ -5,7 +5,7 @@
     monitor.interval()                                # whatever may still come
     monitor.finish()                                  # if this was the last sample
 
-The machine's own compiler makes the step, from the code of `export_c`. Where there is none, Python
+The machine's own compiler makes the step, from the code of `export_c`. Without a compiler, Python
 does the same, in some microseconds. `online` is the monitor within JAX.
 """
 
@@ -136,7 +136,8 @@ class Watch(Generic[R]):
         """Take in one more sample, numbers (or vectors `[k]`) by signal name.
 
         **Returns:** the robustness at time 0 if all stayed as it is now, or with `every` that at
-        the newest instant that is decided, `delays` samples ago; NaN while there is none.
+        the newest instant that is decided, `delays` samples ago; NaN until the first one is
+        decided.
 
         **Raises:** `UnknownNameError` for a signal that the sample lacks.
         """
@@ -249,7 +250,7 @@ def watch(
 ) -> "Watch[float] | Watch[dict[str, float]]":
     """Follow one formula, or several by name, on samples `dt` seconds apart.
 
-    Values are those of `robustness` in double precision, bit for bit, but for the last digit of
+    Values are those of `robustness` in double precision, bit for bit, except for the last digit of
     `sin`, `cos`, `exp` and powers.
 
     **Arguments:**
@@ -258,7 +259,7 @@ def watch(
       it does not.
     - `every`: whether each formula is asked at every instant, or at time 0. With it no formula may
       look ahead without end.
-    - `sizes`: number of components of each signal of which the formulas take a norm.
+    - `sizes`: number of components of each signal whose norm the formulas take.
 
     **Returns:** a monitor; its results are numbers, or dictionaries for several formulas.
 

@@ -164,6 +164,15 @@ class Code:
                 last.append(f"{name.text} = {copy.text};")
         self.piece.after += last
 
+    def carried(self, name: str) -> None:
+        """Note that an array is changed in the loop that is opened next, and by it alone."""
+        self._depths[f"array {name}"] = len(self._before) + 1
+
+    def is_carried(self, name: str) -> bool:
+        """Return whether the innermost open loop changes a number of `keep`, or such an array."""
+        key = name if name in self.kept else f"array {name}"
+        return bool(self._before) and self._depths.get(key) == len(self._before)
+
     def memory(self, shape: tuple[int, ...], kind: str, uniform: bool = False) -> Memory:
         """Return a new array in memory."""
         memory = Memory(self.name("m"), kind, uniform, shape)

@@ -1,6 +1,7 @@
 """Loops and branches of a translated program."""
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -20,6 +21,7 @@ from verifai_jax.native_code.values import (
     constant,
     elements,
     kind_of,
+    names_in,
 )
 
 Forms: TypeAlias = list[Form]
@@ -29,21 +31,34 @@ CHOSEN = 6
 
 
 class Carry:
-    """The values that a loop or a branch changes: variables, or arrays in memory."""
+    """The values that a loop or a branch changes: variables, or arrays in memory.
 
-    def __init__(self, t: Translator, forms: Forms, uniform: list[bool]) -> None:
+    Those of a branch are the ones that it begins with, where nothing else uses these: what it
+    leaves as it was is then copied nowhere.
+    """
+
+    def __init__(
+        self, t: Translator, forms: Forms, uniform: list[bool], start: Sequence[Value] = ()
+    ) -> None:
         self.t, self.forms, self.uniform = t, forms, uniform
         self.values: list[Value] = []
         self._next: list[Memory | None] = []
-        for form, same in zip(forms, uniform, strict=True):
+        own = _own(t, start)
+        for i, (form, same) in enumerate(zip(forms, uniform, strict=True)):
             kind, next_one = kind_of(form.dtype), None
-            if kind == KEY:
+            if i in own and not same:
+                self.values.append(start[i])
+                if isinstance(start[i], Memory):
+                    next_one = t.code.memory(form.shape, kind, same)
+            elif kind == KEY:
                 words = [self._variables(form.shape, "u", same) for _ in range(2)]
                 self.values.append(pairs(*words))
             elif form.size <= SINGLE:
                 self.values.append(self._variables(form.shape, kind, same))
             else:
-                self.values.append(t.code.memory(form.shape, kind, same))
+                memory = t.code.memory(form.shape, kind, same)
+                self.values.append(memory)
+                t.code.carried(memory.name)
                 next_one = t.code.memory(form.shape, kind, same)
             self._next.append(next_one)
 
@@ -92,6 +107,25 @@ class Carry:
         return found
 
 
+def _own(t: Translator, start: Sequence[Value]) -> set[int]:
+    """Return which values the loop around a branch changes, and nothing after the branch uses."""
+    if not start:
+        return set()
+    uses, needed = Counter(name for value in start for name in names_in(value)), t.needed()
+    found = set()
+    for i, value in enumerate(start):
+        names = list(names_in(value))
+        whole = (
+            value.formula is None and not value.offset
+            if isinstance(value, Memory)
+            else len(names) == value.size and all(isinstance(each, Element) for each in value.flat)
+        )
+        alone = (n not in needed and uses[n] == 1 and t.code.is_carried(n) for n in names)
+        if whole and names and all(alone):
+            found.add(i)
+    return found
+
+
 def single_numbers(value: Value) -> list[Element]:
     """Return the numbers of a value, of random keys their words."""
     numbers: list[Element] = []
@@ -112,11 +146,15 @@ def until_settled(
     forms: Forms,
     uniform: list[bool],
     emit: Callable[[Carry], list[Value] | None],
+    changed: Sequence[Value] = (),
 ) -> list[Value]:
-    """Write a loop or branch, again as long as more of its values turn out to differ."""
+    """Write a loop or branch, again as long as more of its values turn out to differ.
+
+    - `changed`: the values that a branch begins with, of which it may change its own.
+    """
     mark = t.code.mark()
     while True:
-        carry = Carry(t, forms, uniform)
+        carry = Carry(t, forms, uniform, changed)
         results = emit(carry)
         if results is not None:
             return results
@@ -209,7 +247,7 @@ def _while(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
             t.code.control(f"{{ I on = I(); REPEAT on |= {mask.text}_[k]; if (any(on)) {{")
         else:
             t.code.control(f"{{ if ({on.text}) {{")
-        results = t.closed(params["body_jaxpr"], [*shared, *start])
+        results = t.branch(params["body_jaxpr"], [*shared, *start], start)
         if not on.uniform:
             results = _chosen(t, mask, start, results, forms)
         if carry.varies(results):
@@ -232,7 +270,8 @@ def _while(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
             mask = t.code.keep("b", False)
             t.code.assign([mask], [on])
             t.code.control(f"{{ I on = I(); REPEAT on |= {mask.text}_[k]; if (!any(on)) break; }}")
-            results = t.closed(params["body_jaxpr"], [*shared, *carry.values])
+            inputs = [*shared, *carry.values]
+            results = t.branch(params["body_jaxpr"], inputs, carry.values)
             results = _chosen(t, mask, carry.values, results, forms)
         if carry.varies(results):
             return None
@@ -240,8 +279,10 @@ def _while(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
         t.code.close_loop()
         return carry.values
 
-    written = emit if switch is None else emit_branch
-    return until_settled(t, forms, [is_uniform(value) for value in start], written)
+    uniform = [is_uniform(value) for value in start]
+    if switch is None:
+        return until_settled(t, forms, uniform, emit)
+    return until_settled(t, forms, uniform, emit_branch, start)
 
 
 def _chosen(
@@ -277,7 +318,7 @@ def _cond(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     limits = [constant(0, "i"), index, constant(len(branches) - 1, "i")]
     index = t.compute("clamp", {}, limits, "i")
     if not index.uniform or sum(map(_steps, branches)) <= CHOSEN:
-        results = [t.closed(branch, operands) for branch in branches]
+        results = [t.branch(branch, operands, operands) for branch in branches]
         which = _single(index)
         if len(branches) == 2:
             which = _single(t.compute("ne", {}, [index, constant(0, "i")], "b"))

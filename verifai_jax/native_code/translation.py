@@ -7,7 +7,8 @@ are single variables, large ones lie in memory and are computed in loops.
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 
 import jax
 import numpy as np
@@ -32,6 +33,7 @@ from verifai_jax.native_code.values import (
     elements,
     filled,
     kind_of,
+    names_in,
     same,
 )
 
@@ -62,6 +64,7 @@ class Translator:
     def __init__(self) -> None:
         self.code = Code()
         self._once = False
+        self._needed: list[Callable[[], Iterable[Value]]] = []
 
     def program(
         self, program: Program, constants: Sequence[Array], inputs: Sequence[Value]
@@ -72,19 +75,38 @@ class Translator:
         """
         used = Counter(each for step in program.eqns for each in map(id, step.invars))
         used.update(map(id, program.outvars))
+        known = [self.constant(value) for value in constants]
+        values = dict(zip([*program.constvars, *program.invars], [*known, *inputs], strict=True))
 
         def step(step: Equation, operands: list[Value]) -> list[Value]:
             # What several steps use is stored; the others are computed where they are used.
             self._once = all(used[id(each)] <= 1 for each in step.outvars)
-            return self.step(step, operands)
+            used.subtract(map(id, step.invars))
+            results = self.step(step, operands)
+            values.update(zip(step.outvars, results, strict=True))
+            return results
 
-        return run_through(
-            program,
-            [self.constant(value) for value in constants],
-            inputs,
-            lambda each: self.constant(each.val, each.aval),
-            step,
-        )
+        with self._needing(lambda: (each for var, each in values.items() if used[id(var)] > 0)):
+            return run_through(
+                program, known, inputs, lambda each: self.constant(each.val, each.aval), step
+            )
+
+    @contextmanager
+    def _needing(self, values: Callable[[], Iterable[Value]]) -> Iterator[None]:
+        self._needed.append(values)
+        yield
+        self._needed.pop()
+
+    def branch(
+        self, program: Program, inputs: Sequence[Value], needed: Sequence[Value]
+    ) -> list[Value]:
+        """Translate a program after which some values are needed as they were before."""
+        with self._needing(lambda: needed):
+            return self.closed(program, inputs)
+
+    def needed(self) -> set[str]:
+        """Return the names of all that is used after the present step."""
+        return {name for values in self._needed for each in values() for name in names_in(each)}
 
     def closed(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
         """Translate a program with its constants, or one without."""

@@ -7,7 +7,8 @@
 What only moves elements, as a transposition does, is then a step of NumPy and no code at all.
 """
 
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -89,6 +90,7 @@ Elements: TypeAlias = Any
 """An object array of elements; those of random keys are pairs of elements."""
 Value: TypeAlias = Elements | Memory
 
+_NAME = re.compile(r"\b[a-z]+\d+\b")
 TYPES = {"f": ("F", "float"), "i": ("I", "int"), "u": ("U", "unsigned"), "b": ("I", "int")}
 """C types of each kind: of a vector, and of a single number."""
 KEY = "key"
@@ -164,3 +166,14 @@ def same(value: Elements) -> Any:
 def shape_of(value: Value) -> tuple[int, ...]:
     """Return the shape of a value."""
     return value.shape
+
+
+def names_in(value: Value) -> Iterator[str]:
+    """Yield the names of the program of which a value is made, one as often as it occurs."""
+    if isinstance(value, Memory):
+        yield from _NAME.findall(value.at("0"))
+        return
+    for each in value.ravel():
+        for one in [each] if isinstance(each, Element) else each:
+            if one.value is None:
+                yield from _NAME.findall(one.text)

@@ -42,7 +42,7 @@ STATIC = {"static": True}
 
 
 def vector(value: Vector) -> Float[Array, " n"]:
-    """Return numbers, some of which may be traced, as one array."""
+    """Return numbers as one array; some may be traced."""
     if isinstance(value, tuple | list):
         return jnp.stack([jnp.asarray(entry, float) for entry in value])
     return jnp.asarray(value, float)

@@ -48,7 +48,7 @@ def train_detector(
     seed: int = 0,
     progress: bool | None = None,
 ) -> tuple[Detector, Float[np.ndarray, " steps"]]:
-    """Train a detector by Adam, the rate of which falls as a cosine.
+    """Train a detector by Adam with a cosine schedule of the learning rate.
 
     One step is compiled; the loop is Python's, because convolutions within loops of JAX are slow on
     CPUs. Rows are drawn without replacement, epoch by epoch.

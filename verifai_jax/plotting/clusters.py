@@ -1,14 +1,23 @@
-"""Clusters of rows over the two columns that tell them apart best."""
+"""Pictures of chosen rows among all rows: clusters, a diverse subset, neighbours."""
 
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
+from verifai_jax.analysis._diverse import Diverse
 from verifai_jax.analysis.clustering.clusters import Clusters
+from verifai_jax.analysis.neighbours import Neighbours
 from verifai_jax.core.figure import Figure
-from verifai_jax.plotting.rows import PALETTE, name_axes, pair, positions
-from verifai_jax.plotting.style import WITHOUT_VERDICT, new_figure, show_or_save, tidy
+from verifai_jax.plotting.rows import PALETTE, draw_rows, name_axes, pair, positions, two_columns
+from verifai_jax.plotting.style import (
+    BOUND,
+    FAILING,
+    WITHOUT_VERDICT,
+    new_figure,
+    show_or_save,
+    tidy,
+)
 
 DOTS = 4000
 """Rows drawn at most, over all clusters."""
@@ -75,7 +84,7 @@ def plot_clusters(clusters: Clusters, path: str | Path | None = None) -> Figure:
 
 
 def distinguishing_columns(clusters: Clusters) -> tuple[str, str]:
-    """Return the two columns of which the clusters explain most of the variation."""
+    """Return the two columns whose variation the clusters explain best."""
 
     def explained(total: Float[np.ndarray, "n d"]) -> float:
         spread = ((total - total.mean(axis=0)) ** 2).sum()
@@ -94,3 +103,60 @@ def distinguishing_columns(clusters: Clusters) -> tuple[str, str]:
             scores[column.name] = explained(np.eye(len(column.choices) + 1)[next(codes)])
     best = sorted(scores, key=lambda name: -scores[name])
     return pair(samples, best)
+
+
+def plot_diverse(diverse: Diverse, path: str | Path | None = None) -> Figure:
+    """Draw the rows among all, in their order, and the distance of each from those before.
+
+    **Arguments:**
+
+    - `diverse`: what `analysis.diverse` returned.
+    - `path`: file that the picture is written to, if given.
+
+    **Returns:** the figure.
+    """
+    figure = new_figure(figsize=(8.6, 4.0))
+    cloud, curve = figure.subplots(1, 2, width_ratios=(1.4, 1))
+    across, up = two_columns(diverse.samples)
+    drawn = draw_rows(
+        cloud, diverse.samples, diverse.rows, FAILING, f"{len(diverse.rows)} chosen", (across, up)
+    )
+    for i, (x, y) in enumerate(drawn[:12]):
+        if np.isfinite(x) and np.isfinite(y):
+            style = {"xytext": (5, 4), "textcoords": "offset points", "fontsize": 8}
+            cloud.annotate(str(i + 1), (x, y), **style)
+    curve.plot(
+        np.arange(2, len(diverse.rows) + 1),
+        diverse.distances[1:],
+        "o-",
+        color=FAILING,
+        markersize=3,
+    )
+    curve.set_ylim(bottom=0)
+    curve.set_xlabel("rows chosen")
+    curve.set_ylabel("distance of the last from those before")
+    curve.xaxis.get_major_locator().set_params(integer=True)
+    for axes in (cloud, curve):
+        tidy(axes)
+    figure.suptitle(f"{len(diverse.rows)} diverse rows, {diverse.samples.kind}", fontsize=10)
+    return show_or_save(figure, path)
+
+
+def plot_neighbours(neighbours: Neighbours, path: str | Path | None = None) -> Figure:
+    """Draw the rows among the others, over the two features that vary most.
+
+    **Arguments:**
+
+    - `neighbours`: what `analysis.k_closest`, `nearest` or `random_rows` returned.
+    - `path`: file that the picture is written to, if given.
+
+    **Returns:** the figure.
+    """
+    figure = new_figure(figsize=(5.2, 4.2))
+    axes = figure.subplots()
+    draw_rows(
+        axes, neighbours.samples, neighbours.rows, color=BOUND, label=f"{len(neighbours.rows)} rows"
+    )
+    tidy(axes)
+    figure.suptitle(f"{neighbours.how}, {neighbours.samples.kind}", fontsize=10)
+    return show_or_save(figure, path)

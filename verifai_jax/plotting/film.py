@@ -14,7 +14,7 @@ from verifai_jax.plotting.replay import decisive_instant
 Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]
 
 MAX_FRAMES = 150
-"""Frames of a film for which nobody says how many a second has; a longer one is played faster."""
+"""Frames of a film without a given frame rate; a longer film is played faster."""
 MAX_WANTED = 1000
 """Frames of a film for which somebody does."""
 COLORS = 128

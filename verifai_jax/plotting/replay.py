@@ -189,7 +189,7 @@ def _left_out(names: list[str]) -> str:
 
 
 def decisive_instant(formula: Formula, trace: Trace, end: End = "hold") -> tuple[str, int] | None:
-    """Return the signal and the sample that decide the verdict; None if there are none.
+    """Return the signal and the sample that decide the verdict, or None.
 
     A predicate over several signals is marked on the first.
     """

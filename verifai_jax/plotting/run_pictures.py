@@ -23,7 +23,7 @@ def write_run_pictures(run: Run, folder: str | Path) -> list[Path]:
     **Arguments:**
 
     - `run`: what `falsify` returned.
-    - `folder`: to write into; it is made where there is none.
+    - `folder`: to write into; made if missing.
 
     **Returns:** the paths of the pictures.
     """
@@ -48,7 +48,7 @@ def write_replay_pictures(
     **Arguments:**
 
     - `replay`: what `run.replay` returned.
-    - `folder`: to write into; it is made where there is none.
+    - `folder`: to write into; made if missing.
     - `name`: the name of the files, without an ending; by default that of the row.
 
     **Returns:** the paths of the pictures.

@@ -81,7 +81,7 @@ class Graph:
         return next(iter(zeros.values())) if len(zeros) == 1 else zeros
 
     def to_json(self) -> dict[str, Any]:
-        """Return the graph as plain data, of which `read_graph` makes it again.
+        """Return the graph as plain data, for `read_graph`.
 
         Only for the graphs of `writing.traced`, whose attributes are numbers and texts.
         """
@@ -187,7 +187,7 @@ def read_onnx(
 
     **Returns:** the graph, its weights, and its memory at the start: zeros, or None.
 
-    **Raises:** `PolicyError` for a model that is damaged or uses what is not supported.
+    **Raises:** `PolicyError` for a damaged model, or one with unsupported operators.
     """
     package = require("onnx", extra="policies")
     try:

@@ -39,7 +39,7 @@ class Guide:
 
     **Arguments:**
 
-    - `term`: a formula or its text, of which the robustness serves, or a function of the trace and
+    - `term`: a formula or its text, whose robustness is used, or a function of the trace and
       the features, pure and traceable by JAX, also for a black box; less is nearer to a failure.
     - `weight`: the weight of the term, above 0; with 1 the robustness of safe simulations says
       nothing.

@@ -180,7 +180,7 @@ class Problem(InNotebook):
         return self.system.black_box
 
     def sources(self, first: int = 0) -> Sources:
-        """Return the files of which the problem is made, with their hashes, and versions.
+        """Return the files that make the problem, with their hashes, and versions.
 
         **Arguments:**
 

@@ -30,7 +30,7 @@ MAX_RULES = 30
 
 @dataclass(frozen=True)
 class Rulebook:
-    """Rules by name, and pairs `(higher, lower)` of which the first matters more.
+    """Rules by name, and pairs `(higher, lower)`: the first matters more.
 
     `order` lists the rules so that each comes after all that matter more: topologically, in the
     order of `names` where the edges leave it open.

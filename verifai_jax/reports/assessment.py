@@ -5,11 +5,18 @@
 The steps are those of FDA, Assessing the Credibility of Computational Modeling and Simulation in
 Medical Device Submissions (November 2023). What the report says to a step is referred to, and the
 rest is an empty box with its question: a tool cannot know it, and does not make it up.
+
+The claims are drawn as a tree in Goal Structuring Notation. Source: Goal Structuring Notation
+Community Standard, version 3 (SCSC-141C, 2021): goals are rectangles, a strategy is a
+parallelogram, solutions are circles, assumptions are ellipses with an A, the context is a rounded
+rectangle, and a diamond marks a goal that is not developed.
 """
 
+import textwrap
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
-from verifai_jax.reports.claims_tree import claims_tree
 from verifai_jax.reports.markup import Markup, element, paragraph
 from verifai_jax.reports.page import Page, Section
 from verifai_jax.reports.signing import box, signing_section
@@ -83,3 +90,89 @@ def with_assessment(page: Page) -> Page:
         signing_section("the claims above follow from the evidence, within what was not shown"),
     )
     return replace(page, sections=sections)
+
+
+WIDTH, LINE = 900, 16
+GOALS, SOLUTIONS, ASSUMPTIONS = 30, 480, 720
+"""Left ends of the columns of claims, of their evidence, and of what they assume."""
+UNDEVELOPED = "The model that was simulated stands for the machine in its domain."
+"""The goal that no simulation can support: a person argues it."""
+INK = {"fill": "none", "stroke": "#30323d"}
+
+
+def claims_tree(subject: str, headline: str, claims: Sequence[Mapping[str, Any]]) -> Markup:
+    """Draw the tree: the headline, the strategy, and a row for each claim.
+
+    **Arguments:**
+
+    - `subject`: what the claims are about, the context.
+    - `headline`: the goal at the root.
+    - `claims`: as plain data.
+    """
+    shared = list(dict.fromkeys(text for each in claims for text in each["assumptions"]))
+    parts: list[Markup] = []
+    top = _box(parts, GOALS, 10, 420, f"G0 {headline}") + 10
+    _box(parts, SOLUTIONS + 30, 10, 340, f"Context: {subject}", round_=14)
+    _line(parts, GOALS + 420, 30, SOLUTIONS + 30, 30)
+    y = top + 20
+    _line(parts, GOALS + 60, top, GOALS + 60, y)
+    strategy = "S1 Argue over each claim on its own evidence, and over what the tool cannot show"
+    y = _box(parts, GOALS, y, 420, strategy, slant=14) + 24
+    spine = y - 24
+    for each in claims:
+        bottom = _box(parts, GOALS + 30, y, 390, f"{each['identifier']} {each['claim']}")
+        middle = y + 20
+        _line(parts, GOALS + 10, middle, GOALS + 30, middle)
+        _line(parts, GOALS + 420, middle, SOLUTIONS, middle)
+        bottom = max(bottom, _round(parts, SOLUTIONS, y, 220, "; ".join(each["evidence"])))
+        if each["assumptions"]:
+            names = ", ".join(f"A{shared.index(text) + 1}" for text in each["assumptions"])
+            bottom = max(bottom, _round(parts, ASSUMPTIONS, y, 150, names))
+        y = bottom + 22
+    bottom = _box(parts, GOALS + 30, y, 390, f"GM {UNDEVELOPED}")
+    _line(parts, GOALS + 10, y + 20, GOALS + 30, y + 20)
+    _line(parts, GOALS + 10, spine, GOALS + 10, y + 20)
+    centre = GOALS + 225
+    diamond = f"{centre},{bottom} {centre + 12},{bottom + 12} {centre},{bottom + 24}"
+    parts.append(element("polygon", points=f"{diamond} {centre - 12},{bottom + 12}", **INK))
+    y = bottom + 44
+    for index, text in enumerate(shared, 1):
+        y = _text(parts, GOALS, y, f"A{index} (assumption): {text}", 110) + 4
+    return element(
+        "svg", parts, viewBox=f"0 0 {WIDTH} {y + 10}", width=WIDTH, height=y + 10, role="img",
+        aria_label=f"Tree of the claims on {subject}; the table of claims says the same",
+    )  # fmt: skip
+
+
+def _text(parts: list[Markup], x: int, y: int, text: str, columns: int) -> int:
+    """Write lines from `y` on; return the end."""
+    for line in textwrap.wrap(text, columns) or [""]:
+        y += LINE
+        parts.append(element("text", line, x=x, y=y, font_size=13, font_family="sans-serif"))
+    return y
+
+
+def _box(
+    parts: list[Markup], x: int, y: int, width: int, text: str, round_: int = 0, slant: int = 0
+) -> int:
+    """Draw a rectangle around a text, or a parallelogram; return its lower end."""
+    end = _text(parts, x + 10 + slant, y + 4, text, (width - 2 * slant) // 8) + 10
+    if slant:
+        points = f"{x + slant},{y} {x + width},{y} {x + width - slant},{end} {x},{end}"
+        parts.append(element("polygon", points=points, **INK))
+    else:
+        shape = {"x": x, "y": y, "width": width, "height": end - y, "rx": round_}
+        parts.append(element("rect", **shape, **INK))
+    return end
+
+
+def _round(parts: list[Markup], x: int, y: int, width: int, text: str) -> int:
+    """Draw an ellipse around a text; return its lower end."""
+    end = _text(parts, x + width // 6, y + 6, text, width // 12) + 14
+    centre = {"cx": x + width // 2, "cy": (y + end) // 2, "rx": width // 2, "ry": (end - y) // 2}
+    parts.append(element("ellipse", **centre, **INK))
+    return end
+
+
+def _line(parts: list[Markup], x1: int, y1: int, x2: int, y2: int) -> None:
+    parts.append(element("line", x1=x1, y1=y1, x2=x2, y2=y2, stroke="#30323d"))

@@ -24,11 +24,10 @@ from verifai_jax.mtl import Judgement
 from verifai_jax.problem.problem import Problem
 from verifai_jax.reports.assessment import with_assessment
 from verifai_jax.reports.comparison_report import comparison_page
-from verifai_jax.reports.errors_section import with_errors
 from verifai_jax.reports.estimate_report import estimate_page
 from verifai_jax.reports.failure_table_report import failure_table_page
 from verifai_jax.reports.judgement_report import judgement_page
-from verifai_jax.reports.odd_section import with_odd
+from verifai_jax.reports.optional_sections import with_errors, with_odd
 from verifai_jax.reports.page import write_page
 from verifai_jax.reports.run_question import About
 from verifai_jax.reports.run_report import run_page

@@ -18,11 +18,11 @@ from verifai_jax.reports.page import Section
 
 ENDS = {
     "hold": "After the end of a trace its last sample counts as if it went on for ever.",
-    "truncate": "What a formula says of the time after the end of a trace is left out.",
+    "truncate": "The reading of a formula beyond the end of a trace is left out.",
 }
 """Meaning of the end of a trace for the formulas."""
 NO_REASON = "not stated"
-"""Cell of a unit or a reason that nobody gave."""
+"""Cell of a missing unit or reason."""
 
 
 DEMANDED = ("text", "source", "severity", "rationale", "links")

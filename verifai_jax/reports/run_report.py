@@ -16,7 +16,7 @@ from verifai_jax.mtl.english import formula_words
 from verifai_jax.reports.claims import Claim, about_json, claims_json
 from verifai_jax.reports.commands import replay_command, report_command, run_command, run_python
 from verifai_jax.reports.markup import element, paragraph, preformatted
-from verifai_jax.reports.modes_section import mode_claims, modes_section
+from verifai_jax.reports.optional_sections import mode_claims, modes_section
 from verifai_jax.reports.page import Page, Section
 from verifai_jax.reports.provenance import (
     Input,

@@ -1,4 +1,4 @@
-"""Results of which a command wrote a file: `estimate --json`, `compare --json`, `verify --into`.
+"""Results that a command wrote to a file: `estimate --json`, `compare --json`, `verify --into`.
 
 result = read_result(Path("estimate.json"))     # an Estimate, a Comparison or a Verification
 """

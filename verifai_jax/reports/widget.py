@@ -59,7 +59,7 @@ def _widget_class() -> Any:
             self.on_msg(lambda _, message, __: self.answer(message))
 
         def answer(self, message: dict[str, Any]) -> None:
-            """Send the trace of the row that a message asks for, or why there is none."""
+            """Send the trace of the requested row, or the reason why it is missing."""
             row = message.get("row")
             if not isinstance(row, int):
                 return

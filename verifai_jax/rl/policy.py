@@ -112,9 +112,7 @@ class Policy:
             save_policy(self, path)
             return Path(path)
         graph, arrays, start = self.as_graph()
-        return lazy_import("verifai_jax.policies.writing", "write")(
-            graph, arrays, start, Path(path)
-        )
+        return lazy_import("verifai_jax.policies.base", "write")(graph, arrays, start, Path(path))
 
     def as_graph(self, observation: object = None) -> tuple[Any, Any, Any]:
         """Return the policy as a graph of ONNX operators, as policies of other frameworks do."""

@@ -98,7 +98,7 @@ class _Evaluation:
         self.values, self.bindings, self.ego = values, bindings, ego
 
     def of(self, tree: ast.AST | None) -> Any:
-        """Return the value of an expression; the ego object where there is none."""
+        """Return the value of an expression; the ego object for an absent one."""
         if tree is None:
             return self._ego()
         compute = getattr(self, f"_{type(tree).__name__}", None)

@@ -118,7 +118,7 @@ def _visit(
     owners: Mapping[int, str],
     variables: Mapping[int, str],
 ) -> None:
-    """Name everything below a property that has no name yet, but for other objects' own."""
+    """Name everything unnamed below a property, except what belongs to other objects."""
     stack = [(root, label, "")]
     seen: set[int] = set()
     while stack:

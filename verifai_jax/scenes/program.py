@@ -1,8 +1,10 @@
-"""A Scenic program as a feature space, with its scenes as a function of JAX (`ScenicProgram`)."""
+"""A Scenic program as a feature space, and its scenes: as functions of JAX, and as Scenic code."""
 
-from collections.abc import Callable, Mapping
+import math
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -12,11 +14,11 @@ import numpy as np
 from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.trace import Trace
 from verifai_jax.features import FeatureSpace
+from verifai_jax.scenes.graph import kind_of
 from verifai_jax.scenes.outputs import Outputs
 from verifai_jax.scenes.recipe import Recipe
 from verifai_jax.scenes.requirements import Constraint
 from verifai_jax.scenes.sampling import LOCK, Refused, Sampling
-from verifai_jax.scenes.scene_code import scene_code
 from verifai_jax.scenes.simulation import OnScenes, ScenicSimulation, check_simulation
 from verifai_jax.systems.base import Seed, System
 from verifai_jax.systems.blackbox import blackbox
@@ -24,6 +26,7 @@ from verifai_jax.systems.blackbox._blackbox import BlackBox, PooledBlackBox, Vec
 
 if TYPE_CHECKING:
     import pandas as pd
+
 
 HostSystem = BlackBox | PooledBlackBox | VectorisedBlackBox
 
@@ -254,3 +257,124 @@ class ScenicProgram:
     def __repr__(self) -> str:
         objects = ", ".join(name for name in self.objects if name != "params")
         return f"ScenicProgram(objects: {objects}; {self.space.dim} coordinates)"
+
+
+POSE = ("position", "orientation", "parentOrientation", "heading", "yaw", "pitch", "roll")
+"""Properties that `at` and `facing` set together."""
+
+UNWRITTEN = frozenset((*POSE, "shape", "regionContainedIn", "lastActions", "sensors"))
+"""Properties that are written otherwise, or that say nothing about a scene that is drawn."""
+
+SIZE = ("width", "length", "height")
+"""Properties that may come from a shape which is not written."""
+
+SHAPES = ("CylinderShape", "ConeShape", "SpheroidShape")
+"""Shapes that are known by their name and the size of the object."""
+
+
+class _NoCodeError(Exception):
+    """A value that Scenic code cannot write."""
+
+
+def scene_code(scene: Any, planar: bool) -> str:
+    """Return Scenic code whose only scene is this one.
+
+    Scenic's own `dumpAsScenicCode` needs the classes of the program. Here they are defined, without
+    their properties, which each object has. What code cannot write, such as a behaviour, is named
+    in a comment. Requirements are left out, since they hold in this scene.
+
+    **Arguments:**
+
+    - `scene`: the scene of Scenic.
+    - `planar`: Scenic's `mode2D`, in which the code is meant to be compiled.
+    """
+    lines = [f"# One scene of a Scenic program{', in mode2D' if planar else ''}."]
+    for kind in dict.fromkeys(each for body in scene.objects for each in _own_classes(type(body))):
+        above = [base.__name__ for base in kind.__bases__ if _is_own(base)]
+        lines += [f"class {kind.__name__}{f'({above[0]})' if above else ''}:", "    pass"]
+    for name, value in scene.params.items():
+        label = name if str(name).isidentifier() else f'"{name}"'
+        try:
+            lines.append(f"param {label} = {_written(value)}")
+        except _NoCodeError as kind:
+            lines.append(f"# The parameter {name!r} is left out: code cannot write a {kind}.")
+    for body in scene.objects:
+        specifiers, left_out = _specifiers(body, planar)
+        lines += [f"# The property {name!r} of the next object is left out." for name in left_out]
+        ego = "ego = " if body is scene.egoObject else ""
+        kind = type(body).__name__ if _is_own(type(body)) else "Object"
+        lines.append(f"{ego}new {kind} " + ",\n    ".join(specifiers))
+    return "\n".join(lines) + "\n"
+
+
+def _is_own(kind: type) -> bool:
+    """Return whether a class of objects is no class of Scenic's language itself."""
+    return issubclass(kind, _objects().Object) and kind.__module__ != _objects().__name__
+
+
+def _own_classes(kind: type) -> Iterator[type]:
+    """Return a class and its bases that need a definition in the code."""
+    return (each for each in reversed(kind.__mro__) if _is_own(each))
+
+
+def _objects() -> Any:
+    return sys.modules["scenic.core.object_types"]
+
+
+def _specifiers(body: Any, planar: bool) -> tuple[list[str], list[str]]:
+    """Return what sets the properties of an object, and the names of those that code cannot set."""
+    yaw, pitch, roll = (float(angle) for angle in body.orientation.eulerAngles)
+    facing = f"{yaw!r}" if planar else f"({yaw!r}, {pitch!r}, {roll!r})"
+    found, left_out = [f"at {_written(body.position)}", f"facing {facing}"], []
+    shape = kind_of(body.shape)
+    if shape in SHAPES:
+        found.append(f"with shape {shape}()")
+    elif shape != "BoxShape":
+        left_out.append("shape")
+    for name in body.properties:
+        value = getattr(body, name)
+        hidden = name in UNWRITTEN or name.startswith(("_", "mutat")) or value is None
+        if hidden or name in body._finalProperties or _is_scenics_default(body, name):
+            continue
+        if name == "color" and isinstance(value, str):
+            left_out.append(name)  # Scenic takes a name for a color only where it is random.
+            continue
+        try:
+            found.append(f"with {name} {_written(value)}")
+        except _NoCodeError:
+            left_out.append(name)
+    return found, left_out
+
+
+def _is_scenics_default(body: Any, name: str) -> bool:
+    """Return whether a property has the value that Scenic itself gives to every object."""
+    if name not in body._constProps or name in SIZE:
+        return False
+    kinds = (kind for kind in type(body).__mro__ if name in getattr(kind, "_scenic_properties", {}))
+    return not _is_own(next(kinds))
+
+
+def _written(value: Any) -> str:
+    """Return a value as Scenic code.
+
+    **Raises:** `_NoCodeError` for one that code cannot write.
+    """
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float):
+        return repr(value) if math.isfinite(value) else f'float("{value}")'
+    if value is None or isinstance(value, bool | int | str):
+        return repr(value)
+    if isinstance(value, PurePath):
+        return repr(str(value))
+    if kind_of(value) in ("Vector", "OrientedVector"):
+        return f"Vector({', '.join(_written(part) for part in value.coordinates)})"
+    if kind_of(value) == "Orientation":
+        return f"Orientation.fromEuler({', '.join(map(_written, value.eulerAngles))})"
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{_written(k)}: {_written(v)}' for k, v in value.items())}}}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_written, value))}]"
+    if isinstance(value, tuple):
+        return f"({', '.join(map(_written, value))}{',' * (len(value) == 1)})"
+    raise _NoCodeError(kind_of(value))

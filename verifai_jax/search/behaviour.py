@@ -4,7 +4,7 @@
     seen = seen.widened(outcomes).recorded(outcomes)
     seen.unlike(outcomes, others)                       # [n, m], from 0 to 1
 
-Outcomes are those of `core.outcomes`: the predicate that decides, the instant, the shape of the
+Outcomes are those of `core.clauses`: the predicate that decides, the instant, the shape of the
 trace.
 """
 
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from verifai_jax.core.outcomes import OUTCOME, SEGMENTS, SIGNALS
+from verifai_jax.core.clauses import OUTCOME, SEGMENTS, SIGNALS
 
 MEMORY = 256
 """Outcomes that are remembered; the last ones. As many as `Diverse` archives failures by

@@ -26,7 +26,7 @@ class Rate:
     - `low`, `high`: bounds of the true rate.
     - `confidence`: probability with which the bounds hold.
     - `at_any_time`: whether they hold whatever decided when sampling ended.
-    - `undecided`: further samples of which it is open whether they failed; the lower bound takes
+    - `undecided`: further samples whose outcome is unknown; the lower bound takes
       them for safe and the upper one for failed.
     """
 
@@ -86,7 +86,8 @@ def exact_interval(
 
     **Arguments:**
 
-    - `low_count`, `high_count`: failures at least and at most, of which the ends take one each.
+    - `low_count`, `high_count`: the smallest and the greatest possible number of failures, each
+      used for one end.
     - `samples`: samples in all, or as many as weighted ones are worth.
     - `confidence`: probability with which the interval is to hold.
     """
@@ -138,7 +139,7 @@ def simulations_until(
     **Arguments:**
 
     - `p0`: failure rate to exclude.
-    - `failures`, `simulations`: samples that there are already.
+    - `failures`, `simulations`: samples taken so far.
     - `confidence`: probability with which the statement is to hold.
 
     **Returns:** the least `n` for which `upper_bound(failures, simulations + n)` is at most `p0`.

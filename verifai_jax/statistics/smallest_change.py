@@ -52,7 +52,7 @@ def shortest_in_box(
     - `rows`, `maximum`: linear inequalities; rows of zeros are left out.
     - `low`, `high`: the box.
 
-    **Returns:** the vector; None if there is none.
+    **Returns:** the vector, or None.
     """
     sizes = np.linalg.norm(rows, axis=1)
     rows, maximum, sizes = rows[sizes > 0], maximum[sizes > 0], sizes[sizes > 0]

@@ -96,7 +96,7 @@ def write_record(path: Path, record: Mapping[str, Any], locked: bool = True) -> 
 def read_record(path: Path) -> dict[str, Any]:
     """Read what `write_record` has written.
 
-    **Raises:** `FileNotFoundError` where there is none; `DamagedError` for anything that is not a
+    **Raises:** `FileNotFoundError` for a missing file; `DamagedError` for anything that is not a
     record, or not as it was written.
     """
     try:

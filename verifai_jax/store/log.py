@@ -81,7 +81,7 @@ class Log:
             self._extents.update(_extents(frame, begin))
 
     def get(self, name: str) -> dict[str, np.ndarray] | None:
-        """Return an entry; None if there is none, or it is damaged."""
+        """Return an entry; None for a missing or damaged one."""
         if (extent := self._index().get(name)) is None:
             return None
         with self._opened() as file:
@@ -103,7 +103,7 @@ class Log:
         self.put({name: {_JSON: np.frombuffer(json.dumps(value).encode(), np.uint8)}})
 
     def get_json(self, name: str) -> Any:
-        """Return the plain data of an entry; None if there is none, or it is damaged."""
+        """Return the plain data of an entry; None for a missing or damaged one."""
         entry = self.get(name)
         with contextlib.suppress(ValueError, KeyError, RecursionError):
             return None if entry is None else json.loads(entry[_JSON].tobytes())

@@ -70,7 +70,7 @@ class SweepRecord:
     - `columns`: the table, name -> column `[rows]`, in order: `BEFORE`, the hyper-parameters,
       `AFTER`. Unknown numbers are NaN, unknown texts empty. `steps` are the wanted ones.
     - `hyperparameters`: columns that the space of the study gave; `steps` is that of `BEFORE`.
-    - `policies`: the policies of each row, on the host; None if there is none.
+    - `policies`: the policies of each row, on the host; None without policies.
     - `worst`: features of each row with the least robustness, as `space.rows` writes them; None
       where nothing was simulated.
     - `curves`: learning curve of each training run, by `(configuration, seed)`.

@@ -41,7 +41,7 @@ Certificates take fresh samples."""
 _MAX_BARREN = 64
 """Rounds of a search without a new configuration before proposals end."""
 FOR_TRAINING = 2 / 3
-"""Share of `max_seconds` after which no training begins, so that there is time to certify."""
+"""Share of `max_seconds` after which no training begins, to leave time to certify."""
 _LAST = 10**9
 """Number of a checkpoint beyond the last one of every training."""
 
@@ -280,7 +280,7 @@ class RunningSweep:
     # Certification
 
     def _certify(self) -> Certificates | None:
-        """Certify the finite policies of all rows; None if there are none."""
+        """Certify the finite policies of all rows; None without any."""
         entries = [
             (run, rung)
             for run in self._runs_of(range(len(self.configurations)))

@@ -156,7 +156,7 @@ class Study(InNotebook):
         return self.trainer.algorithms_in(self.space)
 
     def sources(self) -> Sources:
-        """Return the files of which the study and its problem are made, and versions."""
+        """Return the files that make the study and its problem, and versions."""
         problem = self.untrained_problem()
         return sources_of(self, problem, made=(*(self.made_in or ()), *(problem.made_in or ())))
 

@@ -106,7 +106,7 @@ def repair(
       attack goes to the ends of all tails at once.
     - `gradient`: whether to follow gradients; by default where the system has them without
       changing the backend.
-    - `max_seconds`: wall-clock seconds, of which a fifth is kept for the check.
+    - `max_seconds`: wall-clock seconds; a fifth is reserved for the check.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
     - all other arguments: as in `falsify`.
 

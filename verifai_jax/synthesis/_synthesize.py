@@ -110,7 +110,7 @@ def synthesize(
     - `gradient`: whether to follow gradients; by default where the system has them without
       changing the backend.
     - `batch`: simulations at once.
-    - `max_seconds`: wall-clock seconds, of which a fifth is kept for the check.
+    - `max_seconds`: wall-clock seconds; a fifth is reserved for the check.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
     - all other arguments: as in `falsify`.
 

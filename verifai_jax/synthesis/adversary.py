@@ -43,7 +43,7 @@ class Attack(NamedTuple):
 
     @property
     def worst(self) -> float:
-        """Least robustness with a verdict; infinite if there is none."""
+        """Least robustness with a verdict; infinite without a verdict."""
         return float(np.nanmin(self.rho, initial=np.inf))
 
     def select(self, maximum: int) -> Float[np.ndarray, "k d"]:

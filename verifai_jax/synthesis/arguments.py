@@ -81,7 +81,7 @@ def feature_parameters(
 def attack_search(problem: Problem, search: str | Search, loop: Parametric) -> Search:
     """Return the search over the environment, if it can work there.
 
-    **Raises:** `ValueError` for one that needs gradients where there are none, or of clauses.
+    **Raises:** `ValueError` for a search that needs gradients of a system without them, or clauses.
     """
     if isinstance(search, str):
         search = searches.named(search)

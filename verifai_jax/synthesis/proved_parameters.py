@@ -69,7 +69,7 @@ def prove_around(
     **Arguments:**
 
     - `problem`: one that `enclosable` gave.
-    - `point`: of the unit cube, of which the `chosen` coordinates are the parameters.
+    - `point`: of the unit cube; its `chosen` coordinates are the parameters.
     - `low`, `high`: corners of the part of the cube in which the other features lie.
     - `seconds`: how long, about.
     - `precision`, `seed`: as of `verify`.
@@ -152,7 +152,7 @@ class _Hope:
         return np.all((low < self.high) & (high > self.low), axis=1)
 
     def proved(self, boxes: Boxes) -> tuple[np.ndarray, np.ndarray]:
-        """Return the corners of a box within this one of which all is proved; they may be equal."""
+        """Return the corners of an inner box that is proved completely; they may be equal."""
         left = boxes[self.touches(boxes) & ~np.isin(boxes.state, (PROVED, OUTSIDE))]
         return self.without(left.low[:, self.chosen], left.high[:, self.chosen])
 

@@ -182,7 +182,7 @@ class System(ForUsers):
         raise NotImplementedError(f"{self!r} has no refined(factor)")
 
     def renewed(self) -> "System":
-        """Return the same system without what its simulations so far have left behind in it.
+        """Return the same system without the state that its simulations left in it.
 
         That is the system itself where it has nothing that could be made anew.
         """

@@ -294,7 +294,7 @@ def _named_parts(form: PyTree) -> dict[str, Any]:
 
 
 def _of_one_kind(forms: Mapping[str, Any], names: Iterable[str]) -> list[str]:
-    """Return the parts of real numbers; where there are none, those of whole numbers."""
+    """Return the parts of real numbers; without any, those of whole numbers."""
     names = [name for name in names if hasattr(forms[name], "dtype")]
     real = [name for name in names if jnp.issubdtype(forms[name].dtype, jnp.floating)]
     return real or [n for n in names if jnp.issubdtype(forms[n].dtype, jnp.integer)]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LINKS = ("tests", "runs", "claims", "reports")
-"""Links of the chain behind the problem, each with a column of its own."""
+"""Links of the chain after the problem, each with a column of its own."""
 
 
 class Gap(NamedTuple):
@@ -42,7 +42,7 @@ class TraceRow(NamedTuple):
     """A requirement with one problem that has its formula.
 
     - `requirement`, `text`: its identifier and its sentence; empty for a formula without one.
-    - `formula`, `problem`: empty where nobody has written it.
+    - `formula`, `problem`: empty if not written yet.
     - `tests`, `runs`, `claims`, `reports`: names of functions, folders and files.
     """
 

@@ -6,7 +6,6 @@ import pytest
 from checked_types import unchecked
 from sklearn.metrics import adjusted_rand_score
 
-from verifai_jax.analysis.clustering import density
 from verifai_jax.analysis.clustering.clusters import clusters
 from verifai_jax.analysis.clustering.prototypes import prototypes
 from verifai_jax.analysis.data.samples import Samples
@@ -131,7 +130,7 @@ def test_density_finds_what_k_means_cannot():
 def test_density_of_many_rows(monkeypatch):
     frame, _ = blobs(2000)
     whole = clusters(frame, "dbscan")
-    monkeypatch.setattr(density, "MAX_ROWS", 300)
+    monkeypatch.setattr("verifai_jax.analysis.clustering.clusters.MAX_ROWS", 300)
     part = clusters(frame, "dbscan")
     assert part.count == 3
     both = (whole.assigned >= 0) & (part.assigned >= 0)

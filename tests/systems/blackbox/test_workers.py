@@ -117,6 +117,7 @@ def test_seeds_and_waveforms_arrive(troublesome):
     np.testing.assert_array_equal(outcome.trace["x"], [1.0, 3.0])
 
 
+@pytest.mark.thorough
 def test_a_caller_that_stops_ends_what_runs(troublesome):
     running = troublesome.simulate_each([{"a": 0}] + [{"a": 4}] * 5, [0] * 6)
     assert next(running)[0] == 0
@@ -126,6 +127,7 @@ def test_a_caller_that_stops_ends_what_runs(troublesome):
     assert outcomes(troublesome, [{"a": 0}])[0].status == Status.OK
 
 
+@pytest.mark.thorough
 def test_what_a_simulator_has_started_ends_with_the_pool():
     with_children = blackbox(host_systems.troublesome, workers=1)
     (outcome,) = outcomes(with_children, [{"a": 12}])
@@ -253,7 +255,7 @@ def test_a_function_of_the_script_itself(tmp_path):
     assert not [line for line in done.stderr.splitlines() if "is still importing" not in line]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_script_without_a_guard_is_told_so(tmp_path):
     done = run(script(tmp_path, SCRIPT + "\n    main()\n"))
     assert done.returncode == 1
@@ -264,6 +266,7 @@ def test_a_script_without_a_guard_is_told_so(tmp_path):
     assert "under `if __name__ == '__main__':`" in last
 
 
+@pytest.mark.thorough
 def test_a_session_without_a_file_is_told_so():
     done = run("-", stdin=textwrap.dedent(SCRIPT) + "\nmain()\n")
     assert done.returncode == 1
@@ -271,6 +274,7 @@ def test_a_session_without_a_file_is_told_so():
     assert "%%writefile simulator.py" in done.stderr
 
 
+@pytest.mark.thorough
 def test_a_module_that_only_its_file_finds(tmp_path, monkeypatch):
     # As `verifai-jax falsify folder/script.py` loads its target.
     monkeypatch.setattr(sys, "path", list(sys.path))

@@ -95,6 +95,21 @@ int fmi3DoStep(Model *c, double t, double h, bool p, bool *e, bool *end, bool *r
 )
 
 
+STATES_TWO = r"""
+int fmi2GetFMUstate(C2 *c, C2 **s) { *s = malloc(sizeof(C2)); memcpy(*s, c, sizeof(C2)); return 0; }
+int fmi2SetFMUstate(C2 *c, C2 *s) { memcpy(c, s, sizeof(C2)); return 0; }
+"""
+STATES_THREE = STATES_TWO.replace("fmi2", "fmi3").replace("FMUs", "FMUS").replace("C2", "Model")
+
+
+def build_forgetful(folder, version, can=""):
+    """Compile the spring with a reset that resets only its speed, and states that can be saved."""
+    code, states = (TWO, STATES_TWO) if version == 2 else (THREE, STATES_THREE)
+    call = "reset(&c->m);" if version == 2 else "reset(c);"
+    code = code.replace(call, f"c->{'m.' if version == 2 else ''}r[5] = 0;")
+    return build(folder, version, MODEL + code + states, description(version, can=can))
+
+
 BALL_VARIABLES = {
     "g": (0, "parameter", "fixed", "9.81", None, "m/s2"),
     "e": (1, "parameter", "fixed", "0.7", None, "1"),
@@ -192,7 +207,9 @@ STRUCTURE = (
 )
 
 
-def description(version, doctype="", variables=VARIABLES, kind="CoSimulation", more_of_root=""):
+def description(
+    version, doctype="", variables=VARIABLES, kind="CoSimulation", more_of_root="", can=""
+):
     real = "Real" if version == 2 else "Float64"
     rows = []
     for name, (reference, causality, variability, start, ends, unit) in variables.items():
@@ -230,7 +247,7 @@ def description(version, doctype="", variables=VARIABLES, kind="CoSimulation", m
     return (
         f'<?xml version="1.0"?>{doctype}<fmiModelDescription fmiVersion="{version}.0" '
         f'modelName="spring" {token} numberOfEventIndicators="1">'
-        f'<{kind} modelIdentifier="spring"/>'
+        f'<{kind} modelIdentifier="spring" {can}/>'
         f"<TypeDefinitions>{''.join(kinds)}</TypeDefinitions>"
         f"<ModelVariables>{''.join(rows)}</ModelVariables>{more_of_root}</fmiModelDescription>"
     )
@@ -239,7 +256,8 @@ def description(version, doctype="", variables=VARIABLES, kind="CoSimulation", m
 def build_ball(folder, version):
     """Compile the FMU for model exchange, and return its file."""
     code = INCLUDES + BALL + (BALL_TWO if version == 2 else BALL_THREE)
-    text = description(version, "", BALL_VARIABLES, "ModelExchange", STRUCTURE)
+    asks = 'needsCompletedIntegratorStep="true"'
+    text = description(version, "", BALL_VARIABLES, "ModelExchange", STRUCTURE, asks)
     return build(folder, version, code, text)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from tests.systems.fmu.compiled_fmu import build, description
+from tests.systems.fmu.compiled_fmu import build, build_forgetful, description
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="binaries of Linux are compiled")
 TIMES = {"duration": 2.0, "dt": 0.05}
@@ -71,6 +71,37 @@ def test_a_crash_is_one_row(file):
     assert "DoStep of spring" in table["message"][2]
     if file.name == "spring2.fmu":
         assert "the spring broke" in table["message"][2]
+
+
+@pytest.mark.parametrize("version", [2, 3])
+class TestForgetfulReset:
+    def test_a_saved_state_is_as_good_as_a_new_instance(self, version, tmp_path):
+        can = f'canGetAndSetFMU{"state" if version == 2 else "State"}="true"'
+        can += ' canBeInstantiatedOnlyOncePerProcess="true"'
+        file = build_forgetful(tmp_path, version, can)
+        system = vj.fmu(file, **TIMES, workers=None)
+        first = system({})
+        assert int(system({"m": 2.0, "x0": 3.0, "mode": 3}).valid) == 1
+        with pytest.raises(RuntimeError, match="DoStep of spring"):
+            system({"k": 2.0, "mode": 2})
+        again = system({})
+        assert again.valid is None
+        for name, values in first.signals.items():
+            np.testing.assert_array_equal(again.signals[name], values)
+        with pytest.raises(ValueError, match="one instance of the FMU"):
+            vj.fmu(file, **TIMES, reuse=False)
+
+    def test_without_states(self, version, tmp_path):
+        file = build_forgetful(tmp_path, version)
+        system = vj.fmu(file, **TIMES, workers=None)
+        # After an early end there is a new instance.
+        assert int(system({"m": 2.0, "mode": 3}).valid) == 1
+        first = system({}).signals["body_x"]
+        assert np.any(system({"m": 2.0}).signals["body_x"] != first)
+        assert np.any(system({}).signals["body_x"] != first)
+        fresh = vj.fmu(file, **TIMES, workers=None, reuse=False)
+        fresh({"m": 2.0})
+        np.testing.assert_array_equal(fresh({}).signals["body_x"], first)
 
 
 class TestDescription:

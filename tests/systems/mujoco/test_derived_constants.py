@@ -123,7 +123,7 @@ def in_c(system):
         return next(iter(in_c._native.batches.values())).get_model(1)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DERIVED)
 def test_constants_are_those_of_mujoco(oracle, in_jax, in_c, name):
     wanted = getattr(oracle, name)

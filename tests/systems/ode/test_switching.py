@@ -161,7 +161,7 @@ def gears(count, extra=0):
     return system, calls
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(("extra", "copies"), [(0, 19), (30, 10)])
 def test_the_dynamics_are_traced_as_often_for_many_switches_as_for_one(extra, copies):
     times, sines = [], []

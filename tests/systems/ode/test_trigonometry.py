@@ -17,14 +17,16 @@ def test_as_close_as_float32_can_tell(largest):
     np.testing.assert_allclose(cos, np.cos(angles.astype(float)), atol=1.3e-7)
 
 
-def test_parts_of_half_pi_have_exact_products():
+@pytest.mark.parametrize(("dtype", "quadrants"), [("float32", 2**16), ("float64", 2**20)])
+def test_parts_of_half_pi_have_exact_products(dtype, quadrants):
     # Without fused operations a rounded product is as wrong as half a unit in its last place.
-    parts = trigonometry._HALF_PI
-    assert abs(math.fsum(map(float, parts)) - math.pi / 2) < 1e-16
-    quadrants = np.arange(2**16)
-    for part in parts[:-1]:
-        exact = quadrants * float(part)
-        np.testing.assert_array_equal(np.float32(exact), exact)
+    numbers = trigonometry._NUMBERS[np.dtype(dtype)]
+    assert abs(math.fsum(map(float, numbers.half_pi)) - math.pi / 2) < 1e-16
+    assert numbers.largest * 2 / np.pi < quadrants
+    bits = 24 if dtype == "float32" else 53
+    for part in numbers.half_pi[:-1]:
+        whole, _ = float(part).as_integer_ratio()
+        assert whole.bit_length() + (quadrants - 1).bit_length() <= bits
 
 
 def test_special_angles():
@@ -40,9 +42,14 @@ def test_derivatives():
     assert float(second) == pytest.approx(-np.sin(1.2), rel=1e-6)
 
 
-def test_float64_is_exact():
+@pytest.mark.parametrize("largest", [1.0, 1e3, 1e6])
+def test_float64_is_exact(largest):
     with jax.enable_x64():
-        angles = jnp.linspace(-10, 10, 1001, dtype=jnp.float64)
-        sin, cos = sin_cos(angles)
-        np.testing.assert_allclose(sin, np.sin(np.asarray(angles)), atol=1e-15)
-        np.testing.assert_allclose(cos, np.cos(np.asarray(angles)), atol=1e-15)
+        angles = np.random.default_rng(0).uniform(-largest, largest, 20_000)
+        angles[::100] = np.round(angles[::100]) * (np.pi / 2)
+        sin, cos = sin_cos(jnp.asarray(angles))
+        exact = angles.astype(np.longdouble)
+        inside = np.abs(angles) <= 1e6
+        np.testing.assert_allclose(sin[inside], np.sin(exact)[inside], atol=2.3e-16, rtol=0)
+        np.testing.assert_allclose(cos[inside], np.cos(exact)[inside], atol=2.3e-16, rtol=0)
+        assert np.all(np.isnan(sin[~inside]))

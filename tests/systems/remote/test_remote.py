@@ -27,7 +27,7 @@ from verifai_jax import remote_client
 from verifai_jax.core.trace import Status
 from verifai_jax.core.waveform import Waveform
 from verifai_jax.systems.blackbox.trace_form import TraceForm
-from verifai_jax.systems.remote import absence, connection, server, wire
+from verifai_jax.systems.remote import connection, server, wire
 from verifai_jax.systems.remote._remote import remote
 
 ROOT = Path(__file__).parents[3]
@@ -617,7 +617,7 @@ def test_time_is_counted_from_when_a_client_can_begin():
 
 
 def test_nobody_there(caplog, monkeypatch):
-    monkeypatch.setattr(absence, "REMINDER", 0.2)
+    monkeypatch.setattr(connection, "REMINDER", 0.2)
     with remote(patience=0.7) as system:
         outcomes = Asked(system, 3).all()
         host, port = system.address

@@ -43,7 +43,7 @@ class Column:
     def codes(self, entries: pd.Series | pd.DataFrame) -> Int[np.ndarray, " n"]:
         """Return the indices of entries in `choices`; -1 for an absent one.
 
-        **Raises:** `ValueError` for an entry that is none of the choices.
+        **Raises:** `ValueError` for an entry that is not one of the choices.
         """
         kinds, values = pd.factorize(entries)
         indices = _indices(self.choices)

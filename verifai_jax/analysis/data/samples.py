@@ -291,7 +291,7 @@ class Samples:
         )
 
     def need_ordered(self, purpose: str) -> None:
-        """Check that there is an ordered column, which `purpose` needs.
+        """Check that an ordered column exists, which `purpose` needs.
 
         **Raises:** `ValueError` where there is none.
         """
@@ -302,7 +302,7 @@ class Samples:
             )
 
     def need_unordered(self, purpose: str) -> None:
-        """Check that there is an unordered column, which `purpose` needs.
+        """Check that an unordered column exists, which `purpose` needs.
 
         **Raises:** `ValueError` where there is none.
         """

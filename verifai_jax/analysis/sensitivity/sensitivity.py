@@ -50,7 +50,7 @@ class Sensitivity(InNotebook):
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the indices with their intervals; returns the figure."""
-        return lazy_import("verifai_jax.plotting.bars", "plot_sensitivity")(self, path)
+        return lazy_import("verifai_jax.plotting.overview", "plot_sensitivity")(self, path)
 
     def __repr__(self) -> str:
         return str(self)
@@ -110,7 +110,7 @@ class Coordinates(NamedTuple):
     def centres(
         self, cells: Int[np.ndarray, "n d"], counts: Int[np.ndarray, " d"]
     ) -> Float[np.ndarray, "n d"]:
-        """Return the middles of cells, of which coordinate `i` has `counts[i]`."""
+        """Return the middles of cells; coordinate `i` has `counts[i]` cells."""
         middles = (cells + 0.5) / counts
         for i, weights in enumerate(self.weights):
             if weights is not None:

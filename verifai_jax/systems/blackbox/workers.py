@@ -49,7 +49,7 @@ DROPPED = "an answer of a worker belonged to another simulation and was dropped"
 """The note of a simulation before whose answer there came one to another question."""
 
 REMEMBERED = 1 << 16
-"""Simulations of which a pool remembers in which worker they were."""
+"""Simulations whose workers a pool remembers."""
 
 # True in a worker that still imports the simulator.
 _numbers = itertools.count()

@@ -184,7 +184,7 @@ def brax(
     - `signals`: names of all entries of the observation, or `{name: index or key of it}`; `action`
       and `reward` come along. Or a function `(state, observation, action, reward, features) ->
       dict`, whose state is Brax's. When left out: `q`, `qd`, the metrics, `observation`, `action`
-      and `reward`, as far as they are scalars and vectors. An action of one number is a scalar.
+      and `reward`, if they are scalars or vectors. An action of one number is a scalar.
     - `dt`: seconds of a step; `env.dt` when left out.
     - `policy_memory`: what a policy with memory remembers at first. It is then called
       `(observation, memory)` or `(observation, memory, key)` and returns `(action, memory)`.
@@ -199,7 +199,7 @@ def brax(
 
     A `Signal` feature reaches `sys` and functions as its value at the beginning of the step.
 
-    **Returns:** a `Brax` system, one episode of which is one simulation.
+    **Returns:** a `Brax` system; one episode is one simulation.
 
     **Raises:** `MissingExtra` without brax, or with one that is too old; `UnknownNameError` for an
     unknown environment, backend or part; `ValueError` for a part that the backend does not read,

@@ -28,7 +28,6 @@ from verifai_jax.systems.base import KnownSignals
 from verifai_jax.systems.blackbox._blackbox import BlackBox, PooledBlackBox, blackbox
 from verifai_jax.systems.channels import Channels, Link, Passing
 from verifai_jax.systems.delays import NO_DELAY, Delay, DelayOption, as_delay
-from verifai_jax.systems.environments.derived_attributes import DERIVED
 from verifai_jax.systems.environments.episode import (
     Moment,
     check_features,
@@ -38,18 +37,17 @@ from verifai_jax.systems.environments.episode import (
     sampling_period,
 )
 from verifai_jax.systems.environments.episode_signals import (
-    check_signals_option,
-    names_of_entries,
-    read_signals,
-)
-from verifai_jax.systems.environments.episode_values import (
     as_arrays,
+    check_signals_option,
     entry_form,
     host_policy_function,
     named_entries,
+    names_of_entries,
+    read_signals,
     single_picture,
 )
 from verifai_jax.systems.environments.spaces import (
+    DERIVED,
     Fitted,
     Misfit,
     check_observation,

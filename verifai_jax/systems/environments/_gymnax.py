@@ -147,7 +147,7 @@ def gymnax(
     - `signals`: names of all entries of the observation, or `{name: index or key of it}`; `action`
       and `reward` come along. Or a function `(state, observation, action, reward, features) ->
       dict`. When left out: the parts of the state (but `time`), `observation`, `action` and
-      `reward`, as far as they are scalars and vectors. An action of one number is a scalar signal.
+      `reward`, if they are scalars or vectors. An action of one number is a scalar signal.
     - `dt`: seconds of a step; the parameter `dt` or `tau` of the environment when left out, or 1.
     - `params`: the parameters that features change; the environment's own when left out.
     - `policy_memory`: what a policy with memory remembers at first. It is then called
@@ -160,7 +160,7 @@ def gymnax(
     A `Signal` feature reaches parameters and functions as its value at the beginning of the step.
     Environments that support gradients are asked for them; differentiating any other raises.
 
-    **Returns:** a `Gymnax` system, one episode of which is one simulation.
+    **Returns:** a `Gymnax` system; one episode is one simulation.
 
     **Raises:** `MissingExtra` without gymnax, or with one that is too old; `UnknownNameError` for
     an unknown environment or parameter; `ValueError` for numbers that do not fit, and, once the

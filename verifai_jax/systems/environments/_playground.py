@@ -130,7 +130,7 @@ def playground(
     - `signals`: names of all entries of the observation, or `{name: index or key of it}`; `action`
       and `reward` come along. Or a function `(state, observation, action, reward, features) ->
       dict`, whose state is Playground's. When left out: `qpos`, `qvel`, the metrics, `observation`,
-      `action` and `reward`, as far as they are scalars and vectors.
+      `action` and `reward`, if they are scalars or vectors.
     - `dt`: seconds of a step; `env.dt` when left out.
     - `policy_memory`: what a policy with memory remembers at first; that of `policy` itself when
       left out.
@@ -139,7 +139,7 @@ def playground(
     - `observation_delay`, `action_delay`: steps after which the policy sees an observation, and
       after which its action takes effect: a number, or `{feature: greatest number}`.
 
-    **Returns:** a `Playground` system, one episode of which is one simulation.
+    **Returns:** a `Playground` system; one episode is one simulation.
 
     **Raises:** `MissingExtra` without Playground; `UnknownNameError` for an unknown environment or
     path; `ValueError` for an environment whose assets are not installed, for forces and controls

@@ -247,7 +247,7 @@ def steps_plainly(env: Env) -> bool:
 def _with_counted_frames(kind: type) -> type:
     """Return the class of an environment whose number of frames JAX traces.
 
-    Brax scans over the frames, of which it has to know the number.
+    Brax scans over the frames and must know their number.
     """
 
     def pipeline_step(self: Any, state: Any, action: Array) -> Any:

@@ -109,7 +109,7 @@ def fold(
     carry: Carry,
     update: Callable[[Carry, dict[str, Array]], Carry],
 ) -> tuple[Carry, Int[Array, ""]]:
-    """Apply `carry = update(carry, sample)` to the samples of `rollout`, of which none is stored.
+    """Apply `carry = update(carry, sample)` to the samples of `rollout` without storing them.
 
     After the end the last valid sample comes again. **Returns:** the last carry, and the status.
     """

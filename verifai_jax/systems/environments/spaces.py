@@ -7,7 +7,7 @@ Classes are recognised by their names: Gymnasium is an optional package, and old
 same.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ Space = Any
 
 
 class Misfit(ValueError):
-    """A value that is none of a space; the message says why, and where in it."""
+    """A value outside of a space; the message says why, and which part."""
 
 
 class Fitted(NamedTuple):
@@ -131,7 +131,7 @@ def fit(space: Space, action: object, clip: bool = True) -> Fitted:
 
 
 def check_observation(space: Space, observation: object) -> None:
-    """Refuse an observation that is none of its space; beyond the bounds of a Box it may lie.
+    """Refuse an observation outside of its space; it may exceed the bounds of a Box.
 
     **Raises:** `Misfit`.
     """
@@ -248,3 +248,12 @@ def named_numbers(name: str, value: object) -> dict[str, np.ndarray]:
     for key, part in parts:
         named |= named_numbers(f"{name}.{key}" if name else str(key), part)
     return named
+
+
+# What environments compute once from their attributes, and would not follow a feature.
+DERIVED: dict[str, dict[str, Callable[[Any], Any]]] = {
+    "CartPoleEnv": {
+        "total_mass": lambda env: env.masspole + env.masscart,
+        "polemass_length": lambda env: env.masspole * env.length,
+    }
+}

@@ -27,7 +27,7 @@ from verifai_jax.systems.base import Features, System
 from verifai_jax.systems.blackbox._blackbox import blackbox
 from verifai_jax.systems.fmu.description import Description, read_description
 from verifai_jax.systems.fmu.exchange import ExchangeInstance
-from verifai_jax.systems.fmu.library import Instance
+from verifai_jax.systems.fmu.library import FMUError, Instance
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -92,16 +92,20 @@ class FMUSimulation:
                 moving[variable] = course
             else:
                 constant[variable] = float(value)
-        instance = self._instance()
+        instance, about = self._instance(), self.description
         try:
-            return self._simulated(instance, constant, moving, features)
+            trace = self._simulated(instance, constant, moving, features)
         except BaseException:
-            # An instance that failed is in no state to be used again.
-            _instances.pop(self._key, None)
+            # An instance that failed is in no state to be used again, nor to be given back.
+            instance.failed = True
+            if not about.only_once:
+                _instances.pop(self._key, None)
             raise
-        finally:
-            if not self.reuse and _instances.pop(self._key, None):
-                instance.free()
+        # Some that ended their simulation still think so when they are reset.
+        doubtful = trace.valid is not None and not about.keeps_states
+        if not about.only_once and (doubtful or not self.reuse):
+            _instances.pop(self._key).free()
+        return trace
 
     def _simulated(
         self,
@@ -111,29 +115,27 @@ class FMUSimulation:
         features: Features,
     ) -> Trace:
         steps = round(self.duration / self.dt)
-        names = list(self.outputs.values())
-        rows = np.zeros((steps + 1, len(names)))
+        names = tuple(self.outputs.values())
 
         def at(time: float) -> dict[str, float]:
             return {name: float(course(time)) for name, course in moving.items()}
 
         instance.begin({**constant, **at(0.0)}, steps * self.dt)
-        rows[0], valid = instance.get(names), 1
+        rows = [instance.get(names)]
         for step in range(steps):
             time = step * self.dt
-            inputs = at(time)
+            inputs = at(time) if moving else {}
             if self.controller is not None:
-                seen = dict(zip(self.outputs, rows[step].tolist(), strict=True))
+                seen = dict(zip(self.outputs, rows[step], strict=True))
                 inputs.update(self.controller(time, seen, features))
             if inputs:
                 instance.set(inputs)
-            going = instance.step(time, self.dt)
-            if not going:
+            if not instance.step(time, self.dt):
                 break
-            rows[step + 1] = instance.get(names)
-            valid += 1
-        rows[valid:] = rows[valid - 1]
-        signals = {name: rows[:, i] for i, name in enumerate(self.outputs)}
+            rows.append(instance.get(names))
+        valid = len(rows)
+        table = np.array(rows + rows[-1:] * (steps + 1 - valid))
+        signals = {name: table[:, i] for i, name in enumerate(self.outputs)}
         return Trace(signals, dt=self.dt, valid=None if valid > steps else np.int32(valid))
 
     def _variable(self, feature: str) -> str | None:
@@ -146,6 +148,12 @@ class FMUSimulation:
 
     def _instance(self) -> Instance:
         if self._key not in _instances:
+            if self.description.only_once and any(key[0] == self.file for key in _instances):
+                raise FMUError(
+                    f"a process can have one instance of {self.file.name} only, and this one has "
+                    "another one already; let each system simulate in processes of its own, by "
+                    "workers=1"
+                )
             kind = ExchangeInstance if self.description.exchange else Instance
             _instances[self._key] = kind(self.description, _unpacked(self.file))
         return _instances[self._key]
@@ -197,8 +205,9 @@ def fmu(
       names, called once a step; features that are no variable are for it alone.
     - `workers`: processes that simulate; None for this process, which a crash of the FMU ends.
     - `timeout`: seconds after which a simulation is ended.
-    - `reuse`: whether a process resets its instance for the next simulation, which saves its
-      loading; False for an FMU whose reset forgets to reset something.
+    - `reuse`: whether a process uses its instance for the next simulation too, which saves its
+      loading: it goes back to the state that the FMU had when it was new, or is reset where the
+      FMU cannot save its state; False for an FMU whose reset forgets something.
     - `exchange`: whether its equations are integrated here, by model exchange; when left out only
       those of an FMU without a solver of its own.
 
@@ -211,6 +220,11 @@ def fmu(
     if dt > duration:
         raise ValueError(f"dt must be at most the duration of {duration:zg} s; got {dt}")
     description = read_description(file, exchange)
+    if description.only_once and not reuse:
+        raise ValueError(
+            f"a process can have one instance of the FMU {description.file.name} only; leave out "
+            "reuse=False"
+        )
     _ = description.binary
     if outputs is None:
         there = [v for v in description.variables.values() if v.causality == "output"]

@@ -16,7 +16,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from verifai_jax.core.errors import missing_name
-from verifai_jax.core.xml import read_xml
+from verifai_jax.core.foreign_files import read_xml
 
 MAX_BYTES = 64 << 20
 """Bytes of a description at most."""
@@ -79,6 +79,9 @@ class Description:
     - `variables`: by name.
     - `exchange`: whether it is to be simulated by model exchange, and not by co-simulation.
     - `sizes`: numbers of continuous states and event indicators, as FMI 2 declares them.
+    - `keeps_states`: whether the FMU can save its state, and go back to it.
+    - `only_once`: whether a process can have one instance of it only.
+    - `asks_after_steps`: whether it is to be asked after steps of the integrator.
     """
 
     file: Path
@@ -89,6 +92,9 @@ class Description:
     variables: dict[str, Variable] = field(repr=False)
     exchange: bool = False
     sizes: tuple[int, int] = (0, 0)
+    keeps_states: bool = False
+    only_once: bool = False
+    asks_after_steps: bool = True
 
     def variable(self, name: str) -> Variable:
         """Return a scalar variable.
@@ -174,10 +180,19 @@ def read_description(file: str | Path, exchange: bool | None = None) -> Descript
         )
     token = root.get("guid") if version == "2" else root.get("instantiationToken")
     states = len(root.findall("ModelStructure/Derivatives/Unknown"))
+    kind, two = there[exchange], version == "2"
+
+    def says(attribute: str) -> bool:
+        return kind.get(attribute, "false") in ("true", "1")
+
     return Description(
         path, int(version), root.get("modelName", path.stem),
-        there[exchange].get("modelIdentifier", ""), token or "", _variables(root, int(version)),
+        kind.get("modelIdentifier", ""), token or "", _variables(root, int(version)),
         exchange, (states, int(root.get("numberOfEventIndicators", "0"))),
+        says("canGetAndSetFMUstate" if two else "canGetAndSetFMUState"),
+        says("canBeInstantiatedOnlyOncePerProcess"),
+        not says("completedIntegratorStepNotNeeded") if two
+        else says("needsCompletedIntegratorStep"),
     )  # fmt: skip
 
 

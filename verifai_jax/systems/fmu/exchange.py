@@ -2,9 +2,10 @@
 
 instance = ExchangeInstance(description, folder)     # begin, set, step and get as of `Instance`
 
-LSODA integrates, which changes to implicit steps where the equations are stiff. An event happens
-where an indicator has changed its sign after a step of communication, which bisection finds within
-it, at a time that the FMU named, where it asks for one, and wherever an input changes.
+LSODA integrates, which changes to implicit steps where the equations are stiff; samples within one
+of its steps are interpolated. An event happens where an indicator has changed its sign after a step
+or a sample, which is found within that step, at a time that the FMU named, where it asks for one,
+and wherever an input changes.
 """
 
 from collections.abc import Mapping
@@ -12,7 +13,7 @@ from ctypes import Structure, byref, c_bool, c_double, c_int, c_size_t
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from verifai_jax.systems.fmu.library import FMUError, Instance
 
@@ -45,23 +46,37 @@ class _EventInfo(Structure):
 class ExchangeInstance(Instance):
     """An instance of an FMU for model exchange; arguments and errors are those of `Instance`."""
 
-    _running = False
+    _running = _prepared_for_states = False
 
     def begin(self, values: Mapping[str, float], duration: float) -> None:
         """Set start values, and initialize; after an earlier simulation the instance is reset."""
         self._running = False
         super().begin(values, duration)
         self._running, self._ended = True, False
-        self._inputs, self._time, self._stop = dict(values), 0.0, duration
-        self._size, self._count = self._sizes()
-        self._states, self._state_view = _shared(self._size)
-        self._slopes, self._slope_view = _shared(self._size)
-        self._indicators, self._indicator_view = _shared(self._count)
-        nominals, nominal = _shared(self._size)
-        if self._size:
-            self._call("GetNominalsOfContinuousStates", nominals, c_size_t(self._size))
-        self._tolerances: Any = TOLERANCE * np.where(nominal == 0, 1.0, np.abs(nominal))
+        self._inputs, self._time, self._longest = dict(values), 0.0, duration / MIN_STEPS
+        if not self._prepared_for_states:
+            self._prepare(*self._sizes())
+        self._solver: Any = self._integrator() if self._size else None
         self._settle()
+
+    def _prepare(self, size: int, count: int) -> None:
+        """Make memory for states and indicators, and the calls that use it."""
+        self._size, self._watched = size, count
+        self._states, self._state_view = _shared(size)
+        self._slopes, self._slope_view = _shared(size)
+        indicators, self._indicator_view = _shared(count)
+        self._values_before = np.zeros(count)
+        kind = c_int if self._two else c_bool
+        self._asks, self._ends = kind(), kind()
+        slopes = "Derivatives" if self._two else "ContinuousStateDerivatives"
+        self._set_time = self._prepared("SetTime", self._clock)
+        self._set_states = self._prepared("SetContinuousStates", self._states, c_size_t(size))
+        self._get_states = self._prepared("GetContinuousStates", self._states, c_size_t(size))
+        self._get_slopes = self._prepared(f"Get{slopes}", self._slopes, c_size_t(size))
+        self._get_indicators = self._prepared("GetEventIndicators", indicators, c_size_t(count))
+        ask = (kind(True), byref(self._asks), byref(self._ends))
+        self._complete = self._prepared("CompletedIntegratorStep", *ask)
+        self._prepared_for_states = True
 
     def set(self, values: Mapping[str, float]) -> None:
         """Set variables by name; a change of an input is an event."""
@@ -80,80 +95,119 @@ class ExchangeInstance(Instance):
         **Raises:** `FMUError` also where the integration fails, or events do not end.
         """
         end, events = time + size, 0
-        while self._time < end and not self._ended:
+        for _ in range(MAX_STEPS):
+            if self._time >= end or self._ended:
+                return not self._ended
             event = self._integrate(min(end, self._next))
-            if self._completed() or event or self._time >= self._next:
+            if self.description.asks_after_steps:
+                self._complete()
+                self._ended = self._ended or bool(self._ends.value)
+            if event or self._asks.value or self._time >= self._next:
                 events += 1
                 if events > MAX_EVENTS:
                     raise self._chatters("events in a step of communication")
                 self._call("EnterEventMode")
                 self._settle()
-        return not self._ended
+        raise self._unsolved(end)
 
     def _integrate(self, end: float) -> bool:
-        """Go on up to a time, or to a change of sign before it, and return whether there is one."""
-        from scipy.integrate import ode, solve_ivp
+        """Take one step of the integrator at most, and return whether an indicator has changed.
 
-        begin, before = self._time, self._state_view.copy()
-        if self._solver is None:
-            self._solver = ode(self._slope).set_integrator(
-                "lsoda", rtol=TOLERANCE, atol=self._tolerances, max_step=self._stop / MIN_STEPS,
-                nsteps=MAX_STEPS,
-            )  # fmt: skip
-            self._solver.set_initial_value(before, begin)
-        longer = end - begin > RESOLUTION * end
-        self._move(end, self._solver.integrate(end) if longer else before)
-        if not self._solver.successful():
-            raise FMUError(
-                f"{self.description.file.name} cannot be integrated from {begin:z.6g} to {end:z.6g}"
-                f" s{self._said()}"
-            )
-        self._time = end
-        if not self._changed():
+        An FMU that need not see each step of the integrator is taken to the last one only.
+        """
+        begin = self._time
+        if self._solver is not None:
+            if self._reached <= begin:
+                self._advance()
+            if self._reached < end and not (self._watched or self.description.asks_after_steps):
+                self._time = self._reached
+                return False
+            end = min(end, self._reached)
+        if self._watched:
+            self._values_before[:] = self._indicator_view
+        self._go(end)
+        if self._signs() == self._signs_before:
             return False
-        course: Any = solve_ivp(
-            self._slope, (begin, end), before, "LSODA", rtol=TOLERANCE, atol=self._tolerances,
-            dense_output=True,
-        ).sol  # fmt: skip
-        low, high = begin, end
-        while high - low > RESOLUTION * max(high, end - begin):
-            middle = (low + high) / 2
-            self._move(middle, course(middle))
-            low, high = (low, middle) if self._changed() else (middle, high)
-        self._time = high
-        self._move(high, course(high))
+        self._find_event(begin, end)
         return True
 
-    def _changed(self) -> bool:
-        """Return whether an indicator has another sign than after the last event."""
-        return bool(self._count) and bool(np.any(self._signs() != self._signs_before))
+    def _advance(self) -> None:
+        """Take one step of the integrator."""
+        solver, begin = self._solver, self._reached
+        if self._restarts:
+            solver.set_initial_value(self._state_view.copy(), begin)
+            self._restarts = False
+        solver.integrate(begin + self._longest, step=True)
+        self._reached = solver.t
+        if not solver.successful():
+            raise self._unsolved(begin + self._longest)
 
-    def _signs(self) -> Bool[np.ndarray, " indicators"]:
-        if self._count:
-            self._call("GetEventIndicators", self._indicators, c_size_t(self._count))
-        return self._indicator_view > 0
+    def _go(self, time: float) -> None:
+        """Take the FMU to a time that the integrator has reached."""
+        solver, self._time = self._solver, time
+        if solver is None:
+            self._clock.value = time
+            self._set_time()
+        else:
+            self._move(time, solver.y if time == solver.t else solver.integrate(time))
+
+    def _find_event(self, low: float, high: float) -> None:
+        """Go to the first change of sign between two times, by the Illinois method.
+
+        Of two ends of which one stays, its value counts half as much, or less (Dowell and Jarratt,
+        A modified regula falsi method for computing the root of an equation, 1971).
+        """
+        before, after = self._values_before, self._indicator_view.copy()
+        narrow, moved, weight, rounds = RESOLUTION * max(high, high - low), 0, 1.0, 0
+        while (width := high - low) > narrow:
+            rounds += 1
+            changed = (before > 0) != (after > 0)
+            gaps = np.abs(before[changed]), weight * np.abs(after[changed])
+            share = 0.5 if rounds % 4 == 0 else float(np.min(gaps[0] / (gaps[0] + gaps[1])))
+            # So far from both ends that they close in on a change next to one of them.
+            edge = min(0.5, narrow / (2 * width))
+            self._go(low + min(max(share, edge), 1 - edge) * width)
+            side = 1 if self._signs() != self._signs_before else -1
+            weight, moved = (weight * 2.0**side if side == moved else 1.0), side
+            if side > 0:
+                high, after = self._time, self._indicator_view.copy()
+            else:
+                low, before = self._time, self._indicator_view.copy()
+        if moved < 0:
+            self._go(high)
+
+    def _signs(self) -> bytes:
+        """Return which indicators are positive."""
+        if not self._watched:
+            return b""
+        self._get_indicators()
+        return (self._indicator_view > 0).tobytes()
 
     def _slope(self, time: float, states: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         self._move(time, states)
-        if self._size:
-            name = "GetDerivatives" if self._two else "GetContinuousStateDerivatives"
-            self._call(name, self._slopes, c_size_t(self._size))
+        self._get_slopes()
         return self._slope_view
 
     def _move(self, time: float, states: Float[np.ndarray, " n"]) -> None:
         """Take the FMU to a time and its states."""
-        self._call("SetTime", c_double(time))
-        if self._size:
-            self._state_view[:] = states
-            self._call("SetContinuousStates", self._states, c_size_t(self._size))
+        self._clock.value = time
+        self._set_time()
+        self._state_view[:] = states
+        self._set_states()
 
-    def _completed(self) -> bool:
-        """Say that a step is done, and return whether the FMU asks for an event."""
-        kind = c_int if self._two else c_bool
-        asks, ends = kind(False), kind(False)
-        self._call("CompletedIntegratorStep", kind(True), byref(asks), byref(ends))
-        self._ended = self._ended or bool(ends.value)
-        return bool(asks.value)
+    def _integrator(self) -> Any:
+        """Make the integrator of this simulation."""
+        from scipy.integrate import ode
+
+        nominals, nominal = _shared(self._size)
+        self._call("GetNominalsOfContinuousStates", nominals, c_size_t(self._size))
+        tolerances = TOLERANCE * np.where(nominal == 0, 1.0, np.abs(nominal))
+        solver: Any = ode(self._slope).set_integrator(
+            "lsoda", rtol=TOLERANCE, atol=tolerances, max_step=self._longest
+        )
+        # LSODA can take one step at a time, as SciPy's own class of that name makes it do.
+        solver._integrator.supports_step = True
+        return solver
 
     def _settle(self) -> None:
         """Let the FMU go through an event, and go on in continuous time."""
@@ -164,8 +218,8 @@ class ExchangeInstance(Instance):
             raise self._chatters("rounds of one event")
         self._call("EnterContinuousTimeMode")
         if self._size:
-            self._call("GetContinuousStates", self._states, c_size_t(self._size))
-        self._signs_before, self._solver = self._signs(), None
+            self._get_states()
+        self._signs_before, self._reached, self._restarts = self._signs(), self._time, True
 
     def _event(self) -> bool:
         """Go through one round of an event, and return whether another one is needed."""
@@ -192,6 +246,12 @@ class ExchangeInstance(Instance):
             self._call(f"GetNumberOf{kind}", byref(number))
         return found[0].value, found[1].value
 
+    def _unsolved(self, end: float) -> FMUError:
+        return FMUError(
+            f"{self.description.file.name} cannot be integrated from {self._time:z.6g} to "
+            f"{end:z.6g} s{self._said()}"
+        )
+
     def _chatters(self, events: str) -> FMUError:
         return FMUError(
             f"{self.description.file.name} has more than {MAX_EVENTS:,} {events} at "
@@ -200,9 +260,6 @@ class ExchangeInstance(Instance):
 
 
 def _shared(count: int) -> tuple[Any, Float[np.ndarray, " n"]]:
-    """Return numbers for C, and the same memory as an array.
-
-    It has one number at least: a model without states is integrated as one that stands still.
-    """
+    """Return numbers for C, and the same memory as an array."""
     numbers: Any = (c_double * max(count, 1))()
-    return numbers, np.frombuffer(numbers)
+    return numbers, np.frombuffer(numbers)[:count]

@@ -8,10 +8,12 @@ An FMU is a program of this process: what it does to the process it does to the 
 """
 
 import ctypes
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from ctypes import byref, c_bool, c_char_p, c_double, c_int, c_size_t, c_uint32, c_void_p
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from verifai_jax.systems.fmu.description import Description, Variable
 
@@ -43,6 +45,16 @@ class _Callbacks(ctypes.Structure):
     )
 
 
+class _Group(NamedTuple):
+    """Variables of one type: their indices, memory for their values, and calls that use it."""
+
+    kind: str
+    indices: list[int]
+    buffer: Any
+    get: Callable[[], int]
+    set: Callable[[], int]
+
+
 class FMUError(RuntimeError):
     """A function of an FMU failed; the message is what the FMU said."""
 
@@ -60,8 +72,7 @@ class Instance:
 
     def __init__(self, description: Description, folder: Path) -> None:
         self.description, self.messages = description, []
-        self._groups: dict[tuple[str, ...], list[tuple[str, list[int], Any, Any]]] = {}
-        self._functions: dict[str, Any] = {}
+        self._groups: dict[tuple[str, ...], list[_Group]] = {}
         self._two, three = description.version == 2, description.version == 3
         self._prefix = f"fmi{description.version}"
         try:
@@ -78,7 +89,7 @@ class Instance:
             # Co-simulation without event mode, early returns, and news from within a step.
             none = (c_bool(), c_bool(), c_void_p(), c_size_t(0)), (c_void_p(),)
             before, after = ((), ()) if description.exchange else none
-            self._component = self._function(f"Instantiate{kind}", c_void_p)(
+            made = self._function(f"Instantiate{kind}", c_void_p)(
                 c_char_p(name), c_char_p(token), c_char_p(path), c_bool(False), c_bool(False),
                 *before, c_void_p(), self._logger, *after,
             )  # fmt: skip
@@ -86,20 +97,29 @@ class Instance:
             own = ctypes.CDLL(None)
             pointers = (ctypes.cast(f, c_void_p) for f in (own.calloc, own.free))
             self._callbacks = _Callbacks(self._logger, *pointers, None, None)
-            self._component = self._function("Instantiate", c_void_p)(
+            made = self._function("Instantiate", c_void_p)(
                 c_char_p(name), c_int(not description.exchange), c_char_p(token),
                 c_char_p(resources.as_uri().encode()), byref(self._callbacks), c_int(0), c_int(0),
             )  # fmt: skip
-        if not self._component:
+        if not made:
             raise FMUError(f"{description.file.name} made no instance{self._said()}")
-        self._begun = False
+        self._component = c_void_p(made)
+        # Arguments of a step in C's types, made once: FMI 3 answers by flags and a time.
+        self._clock, self._span, last = c_double(), c_double(), c_double()
+        self._flags: Any = (c_bool * 3)()
+        answers = () if self._two else (*(byref(self._flags, i) for i in range(3)), byref(last))
+        more = (c_int if self._two else c_bool)(1), *answers
+        self._do_step = self._prepared("DoStep", self._clock, self._span, *more)
+        self._begun, self.failed, self._new_state = False, False, c_void_p()
+        if description.keeps_states:
+            with suppress(FMUError):
+                self._call(f"GetFMU{self._state}", byref(self._new_state))
 
     def begin(self, values: Mapping[str, float], duration: float) -> None:
-        """Set start values, and initialize; after an earlier simulation the instance is reset."""
+        """Set start values, and initialize, from the state that a new instance has."""
         if self._begun:
-            self._call("Terminate")
-            self._call("Reset")
-        self._begun = True
+            self._renew()
+        self._begun, self.failed = True, False
         end = (c_bool(True), c_double(duration))
         if self._two:
             rest = (c_int(0), c_double(0.0), c_double(0.0), c_int(1), c_double(duration))
@@ -114,89 +134,105 @@ class Instance:
 
     def step(self, time: float, size: float) -> bool:
         """Simulate one step; False if the FMU ended its simulation."""
-        if self._two:
-            status = self._call("DoStep", c_double(time), c_double(size), c_int(1))
-            return status != DISCARD
-        flags = [c_bool(False) for _ in range(3)]
-        last = c_double(0.0)
-        pointers = (byref(flag) for flag in flags)
-        status = self._call(
-            "DoStep", c_double(time), c_double(size), c_bool(True), *pointers, byref(last)
-        )
-        return status != DISCARD and not flags[1].value
+        self._clock.value, self._span.value = time, size
+        return self._do_step() != DISCARD and not self._flags[1]
 
     def set(self, values: Mapping[str, float]) -> None:
         """Set variables by name."""
-        for kind, indices, references, buffer in self._grouped(tuple(values)):
-            numbers = list(values.values())
-            for i, index in enumerate(indices):
-                buffer[i] = numbers[index] if kind in FLOATS else round(numbers[index])
-            self._exchange("Set", kind, references, buffer)
+        numbers = list(values.values())
+        for group in self._grouped(tuple(values)):
+            whole = group.kind not in FLOATS
+            for i, index in enumerate(group.indices):
+                group.buffer[i] = round(numbers[index]) if whole else numbers[index]
+            group.set()
 
-    def get(self, names: Sequence[str]) -> list[float]:
+    def get(self, names: tuple[str, ...]) -> list[float]:
         """Return the values of variables by name."""
         found = [0.0] * len(names)
-        for kind, indices, references, buffer in self._grouped(tuple(names)):
-            self._exchange("Get", kind, references, buffer)
-            for i, index in enumerate(indices):
-                found[index] = float(buffer[i])
+        for group in self._grouped(names):
+            group.get()
+            for index, value in zip(group.indices, group.buffer, strict=True):
+                found[index] = float(value)
         return found
 
     def free(self) -> None:
         """Give the instance back; it cannot be used any more."""
-        component, self._component = self._component, None
-        if component:
-            self._function("FreeInstance", None)(c_void_p(component))
+        if self._component:
+            self._function("FreeInstance", None)(self._component)
+        self._component = c_void_p()
 
-    def _grouped(self, names: tuple[str, ...]) -> list[tuple[str, list[int], Any, Any]]:
-        """Return variables by type: their indices, references, and a buffer for their values."""
+    def _renew(self) -> None:
+        """Go back to the state of a new instance: the saved one, or where that fails by a reset.
+
+        A reset may forget something, as that the FMU ended its simulation; a saved state does not.
+        """
+        if self._new_state:
+            try:
+                self._call(f"SetFMU{self._state}", self._new_state)
+                return
+            except FMUError:
+                self._new_state = c_void_p()
+        if not self.failed:
+            self._call("Terminate")
+        self._call("Reset")
+
+    @property
+    def _state(self) -> str:
+        return "state" if self._two else "State"
+
+    def _grouped(self, names: tuple[str, ...]) -> list[_Group]:
+        """Return variables by type, with memory for their values."""
         if names not in self._groups:
-            by_type: dict[str, list[tuple[int, Variable]]] = {}
+            by_type: dict[str, dict[int, Variable]] = {}
             for index, name in enumerate(names):
                 variable = self.description.variable(name)
-                by_type.setdefault(variable.type, []).append((index, variable))
-            self._groups[names] = [
-                (
-                    kind,
-                    [index for index, _ in those],
-                    (c_uint32 * len(those))(*(variable.reference for _, variable in those)),
-                    (self._c_type(kind) * len(those))(),
-                )
-                for kind, those in by_type.items()
-            ]
+                by_type.setdefault(variable.type, {})[index] = variable
+            self._groups[names] = [self._group(kind, those) for kind, those in by_type.items()]
         return self._groups[names]
 
-    def _c_type(self, kind: str) -> Any:
-        return c_bool if kind == "Boolean" and not self._two else C_TYPES[kind]
-
-    def _exchange(self, verb: str, kind: str, references: Any, buffer: Any) -> None:
-        count = c_size_t(len(references))
-        counts = () if self._two else (count,)
-        self._call(f"{verb}{kind}", references, count, buffer, *counts)
+    def _group(self, kind: str, variables: Mapping[int, Variable]) -> _Group:
+        references = (c_uint32 * len(variables))(*(v.reference for v in variables.values()))
+        c_type = c_bool if kind == "Boolean" and not self._two else C_TYPES[kind]
+        buffer, count = (c_type * len(variables))(), c_size_t(len(variables))
+        arguments = (references, count, buffer, *(() if self._two else (count,)))
+        get, set_ = (self._prepared(f"{verb}{kind}", *arguments) for verb in ("Get", "Set"))
+        return _Group(kind, [*variables], buffer, get, set_)
 
     def _call(self, name: str, *arguments: Any) -> int:
         """Call a function of the instance.
 
         **Raises:** `FMUError` where it fails.
         """
-        status = self._function(name, c_int)(c_void_p(self._component), *arguments)
-        if status > DISCARD or (status == DISCARD and name != "DoStep"):
-            raise FMUError(
-                f"{self._prefix}{name} of {self.description.file.name} failed with status "
-                f"{status}{self._said()}"
-            )
-        return status
+        return self._prepared(name, *arguments)()
+
+    def _prepared(self, name: str, *arguments: Any) -> Callable[[], int]:
+        """Return a call of a function of the instance, which reads its arguments each time."""
+        function: Any = None
+        passes = DISCARD if name == "DoStep" else WARNING
+
+        def call() -> int:
+            nonlocal function
+            if function is None:
+                function = partial(self._function(name, c_int), self._component, *arguments)
+            status = function()
+            if status > passes:
+                raise FMUError(
+                    f"{self._prefix}{name} of {self.description.file.name} failed with status "
+                    f"{status}{self._said()}"
+                )
+            return status
+
+        return call
 
     def _function(self, name: str, returns: Any) -> Any:
-        if name not in self._functions:
-            try:
-                self._functions[name] = getattr(self._library, f"{self._prefix}{name}")
-            except AttributeError:
-                raise FMUError(
-                    f"the binary of {self.description.file.name} has no {self._prefix}{name}"
-                ) from None
-            self._functions[name].restype = returns
-        return self._functions[name]
+        try:
+            function = getattr(self._library, f"{self._prefix}{name}")
+        except AttributeError:
+            raise FMUError(
+                f"the binary of {self.description.file.name} has no {self._prefix}{name}"
+            ) from None
+        function.restype = returns
+        return function
 
     def _said(self) -> str:
         return f": {'; '.join(self.messages[-MESSAGES:])}" if self.messages else ""

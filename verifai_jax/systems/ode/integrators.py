@@ -59,7 +59,7 @@ def rk4(derivative: Derivative, time: Time, state: PyTree, dt: Step) -> PyTree:
 
 
 def looped_rk4(derivative: Derivative, time: Time, state: PyTree, dt: Step) -> PyTree:
-    """Take a step of `rk4` by a loop over its stages, equal but for rounding.
+    """Take a step of `rk4` by a loop over its stages; equal up to rounding.
 
     The derivative is traced once instead of four times.
     """
@@ -86,7 +86,7 @@ METHODS: dict[str, Integrator] = {
 def integrator(method: str | Integrator) -> Integrator:
     """Return the integrator of this name; one of the user's own as it is.
 
-    **Raises:** `UnknownNameError` for a name that is none of `METHODS`.
+    **Raises:** `UnknownNameError` for a name that is not in `METHODS`.
     """
     if callable(method):
         return method

@@ -25,9 +25,8 @@ from verifai_jax.systems.base import Features, Outcome, Seed, System
 from verifai_jax.systems.blackbox._blackbox import plain_leaves, seed_of, single_trace
 from verifai_jax.systems.blackbox.trace_form import SignalNames, TraceForm
 from verifai_jax.systems.remote import wire
-from verifai_jax.systems.remote.connection import Batch, Rules
+from verifai_jax.systems.remote.connection import Batch, File, Rules, server_context
 from verifai_jax.systems.remote.server import Server
-from verifai_jax.systems.remote.tls import File, server_context
 
 log = logging.getLogger("verifai_jax.remote")
 

@@ -1,18 +1,22 @@
 """One client of the server: its hello, its points, and the bytes that wait to be sent to it.
 
-Nothing here blocks: bytes wait in a buffer until the socket takes them.
+Nothing here blocks: bytes wait in a buffer until the socket takes them. `Absence` counts the time
+without a client, and `server_context` encrypts connections by TLS.
 """
 
 import hashlib
 import hmac
 import itertools
+import logging
 import math
+import os
 import queue
 import secrets
 import socket
 import ssl
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from verifai_jax.systems.blackbox.trace_form import TraceForm
@@ -225,7 +229,7 @@ class Client:
         return (bool(self.out) and not self._sends_after_reading) or self.reads_after_sending
 
     def receive(self) -> bytes | None:
-        """Return bytes that have come; empty at the end of the connection, None if there are none.
+        """Return received bytes; empty at the end of the connection, None if nothing has come.
 
         **Raises:** `OSError` if it has vanished.
         """
@@ -269,3 +273,69 @@ def keep_alive(sock: socket.socket) -> None:
             sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
     if hasattr(socket, "TCP_USER_TIMEOUT"):
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 25_000)
+
+
+log = logging.getLogger("verifai_jax.remote")
+
+REMINDER = 10.0
+"""Seconds without a client until the log says so; then twice as long, up to 60."""
+
+
+class Absence:
+    """The time since the last client left; the log reports it now and then."""
+
+    def __init__(self) -> None:
+        self.since: float | None = None
+        self._next = REMINDER
+
+    def end(self) -> None:
+        """Note that a client is connected, or that no client is needed."""
+        self.since, self._next = None, REMINDER
+
+    def seconds(self, now: float) -> float:
+        """Return how long no client has been there."""
+        if self.since is None:
+            self.since = now
+        return now - self.since
+
+    def remind(self, seconds: float, host: str, port: int) -> None:
+        """Say in the log what to start, if it is time to."""
+        if seconds <= self._next:
+            return
+        self._next += min(self._next, 60.0)
+        log.warning(
+            "no simulator has connected to %s for %.0f s; start one with "
+            "`python -m verifai_jax.remote_client --address %s MODULE:FUNCTION`",
+            (host, port),
+            seconds,
+            f"[{host}]:{port}" if ":" in host else f"{host}:{port}",
+        )
+
+
+File = str | os.PathLike[str]
+
+
+def server_context(certificate: File, private_key: File | None) -> ssl.SSLContext:
+    """Return the settings of a server that shows a certificate.
+
+    **Arguments:**
+
+    - `certificate`: a PEM file with the certificate, and those between it and its authority.
+    - `private_key`: a PEM file with its key; the same file when None. The key is not encrypted.
+
+    **Raises:** `ValueError` for files that are not there, or hold no such thing.
+    """
+    for name, file in (("certificate", certificate), ("private_key", private_key)):
+        if file is not None and not Path(file).is_file():
+            raise ValueError(f"{name} must be a PEM file; there is no file {str(file)!r}")
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    key = certificate if private_key is None else private_key
+    try:
+        # Without a password here, OpenSSL would ask for one at the terminal.
+        context.load_cert_chain(certificate, key, password="")
+    except (ssl.SSLError, OSError) as error:
+        raise ValueError(
+            f"{str(certificate)!r} and {str(key)!r} are no certificate and its private key in PEM "
+            f"form, without a password: {error}"
+        ) from error
+    return context

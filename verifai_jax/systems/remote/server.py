@@ -20,8 +20,7 @@ from typing import Any
 from verifai_jax.core.trace import Status
 from verifai_jax.systems.base import Outcome
 from verifai_jax.systems.remote import connection, wire
-from verifai_jax.systems.remote.absence import Absence
-from verifai_jax.systems.remote.connection import Batch, Client, Point, Rules, keep_alive
+from verifai_jax.systems.remote.connection import Absence, Batch, Client, Point, Rules, keep_alive
 
 log = logging.getLogger("verifai_jax.remote")
 
@@ -36,7 +35,7 @@ UNCOUNTED = 1 << 16
 MAX_CLIENTS = 256
 """Clients that may be connected at a time."""
 REMEMBERED = 1 << 16
-"""Simulations of which is remembered which client made them."""
+"""Simulations whose clients are remembered."""
 
 
 class Server(threading.Thread):
@@ -184,7 +183,7 @@ class Server(threading.Thread):
             self._drop(oldest, "was dropped for another, as it had not said hello")
 
     def _bound_memory(self) -> None:
-        """Send away whoever keeps a message unfinished longest while all hold too much."""
+        """Disconnect clients with the oldest unfinished messages while all hold too much."""
         while sum(client.held for client in self.clients) > self.rules.max_memory:
             client = min(self.clients, key=lambda client: (client.began, -client.held))
             # It may be as honest as the others, so its points have lost nothing but time.

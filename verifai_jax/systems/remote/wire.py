@@ -70,7 +70,7 @@ class Frames:
     def feed(self, data: bytes) -> Iterator[Message]:
         """Yield the whole messages among the bytes that have come so far.
 
-        **Raises:** `WireError` for what is none. Nothing can be understood after that.
+        **Raises:** `WireError` for anything else. Later bytes cannot be understood either.
         """
         self._bytes += data
         at = 0
@@ -129,7 +129,7 @@ RESULT = ("type", "id", "bytes", "signals", "dt", "times", "valid", "error")
 def trace_of(message: Message) -> Trace:
     """Return the trace in a `result`.
 
-    **Raises:** `WireError`, or `ValueError` from `Trace`, for anything that is none.
+    **Raises:** `WireError`, or `ValueError` from `Trace`, for anything else.
     """
     header, raw = message.header, message.raw
     check_names("field of a result", header, RESULT)
