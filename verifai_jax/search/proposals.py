@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from verifai_jax.core.clauses import ABSENT, CLAUSES, OUTCOME
+from verifai_jax.core.clauses import ABSENT, CLAUSES
 from verifai_jax.core.compilation import Compilation
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Plan, Search
