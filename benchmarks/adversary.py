@@ -48,7 +48,7 @@ def gusty_lane():
 
 
 def crossing():
-    """A pedestrian who walks unsteadily, anew every 0.2 s, and a car that brakes when it is late."""
+    """A pedestrian who walks unsteadily, anew every 0.2 s, and a car that brakes."""
 
     def dynamics(time, state, step, features):
         ahead = 22.0 - state["x"]
@@ -75,7 +75,7 @@ class Game:
     margin: Any
     every: int
     time_limit: int = PERIODS
-    action: Continuous = Continuous(-4.0, 4.0)
+    action: Any = Continuous(-4.0, 4.0)  # noqa: RUF009
 
     def reset(self, key):
         """Start as the loop does."""
@@ -175,8 +175,12 @@ def main():
         for seed in range(args.seeds):
             trained, course = by_adversary(game, args.simulations, seed)
             searched = by_cross_entropy(game, args.simulations, seed)
-            print(f"{name}, seed {seed}: adversary {trained:.2f}, cross-entropy {searched:.2f}"
-                  f" (adversary after a tenth {course[len(course) // 10]:.2f})", flush=True)  # fmt: skip
+            tenth = course[len(course) // 10]
+            print(
+                f"{name}, seed {seed}: adversary {trained:.2f} (after a tenth {tenth:.2f}), "
+                f"cross-entropy {searched:.2f}",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

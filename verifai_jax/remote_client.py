@@ -235,7 +235,7 @@ def _trusting(certificate: str | os.PathLike[str]) -> ssl.SSLContext:
     try:
         return ssl.create_default_context(cafile=file)
     except (OSError, ssl.SSLError) as error:
-        raise ValueError(f"{file!r} is no certificate in a PEM file: {error}") from error
+        raise ValueError(f"{file!r} is not a certificate in a PEM file: {error}") from error
 
 
 class _Connection:
@@ -421,7 +421,7 @@ def _refusal(message: dict[str, Any]) -> ConnectionError:
 
 
 def _no_run(why: str) -> Refused:
-    return Refused(f"what answers there is no run of verifai_jax: {why}")
+    return Refused(f"the server there is not a run of verifai_jax: {why}")
 
 
 def plain(text: object) -> str:

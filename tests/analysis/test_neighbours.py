@@ -116,7 +116,7 @@ def test_what_is_wrong_is_refused_where_it_is_made():
         random_rows(frame, 2.5, 0)  # pyright: ignore[reportArgumentType]
     with pytest.raises(UnknownNameError, match=r"unknown feature 'y'.*Known: x, a, b"):
         nearest(frame, {"x": 1.0, "a": "p", "b": True})
-    with pytest.raises(ValueError, match="'a' holds 's', which is none of its choices 'p', 'q'"):
+    with pytest.raises(ValueError, match="'a' holds 's', which is not one of its choices 'p', 'q'"):
         nearest(frame, {"x": 1.0, "y": 0.0, "a": "s", "b": True})
     with pytest.raises(IndexError, match="row 120 is not in the table of 120 rows"):
         nearest(frame, 120)

@@ -240,10 +240,10 @@ conversion: {length: {fathom: {m: {scale: 1.8288}}}}
     [
         ("[0 .. 54] km/h", "0 to 54", r"ego_speed: expected .* got '0 to 54'"),
         ("[0 .. 54] km/h", "[0 .. 54] kg", "kg cannot be converted into m/s"),
-        ("[street, lane]", "[street, path]", "'path' is none of its values, motorway, street"),
+        ("[street, lane]", "[street, path]", "'path' is not one of its values, motorway, street"),
         ("      gap:", "      gape:", "unknown attribute or module of module town of .* 'gape'"),
         ("TITLE", "TITEL", "unknown entry of module town of .* 'TITEL'.*TITLE"),
-        ("rain: [none", "rain: !!python/name:os.system [none", "is no YAML"),
+        ("rain: [none", "rain: !!python/name:os.system [none", "is not YAML"),
         ("ego_speed: float velocity", "ego_speed:", "ego_speed is a list of literals, or"),
         ("ego_speed: float velocity", "ego_speed: date", "kind date has no values to compare"),
         ('lanes: ">= 3"', "town: true", "in a circle: town -> town"),

@@ -58,7 +58,7 @@ def test_the_verdict_comes_with_the_sample_that_decides(text, says, lines):
         ([], {}, "is empty; its first line has the names"),
         (["t,dist", "0,1"], {}, "no column 'time' of sample times. Give the sampling period, --dt"),
         (["time,dst", "0,1"], {}, "no column 'dist'; did you mean 'dst'"),
-        (["time,dist", "0,1"], {}, "has 1 sample, of which no sampling period follows"),
+        (["time,dist", "0,1"], {}, "has 1 sample, too few to show the sampling period"),
         (["time,dist", "0,1", "0,2"], {}, "must increase; line 2 of the standard input has 0 s"),
         (["time,dist", "0,1", "1"], {}, "line 3 of the standard input has 1 cells, and the first"),
         (["dist", "x"], {"dt": 0.1}, "line 2 of the standard input has 'x' in column 'dist'"),

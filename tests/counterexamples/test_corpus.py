@@ -137,7 +137,7 @@ def test_bad_files_are_named_and_do_not_stop_the_others(tmp_path):
     assert states(result) == ["no longer valid"] * 3
     text = str(result)
     assert "a.json cannot be read" in text
-    assert "b.json is no counterexample of format 1; its format is 7" in text
+    assert "b.json is not a counterexample of format 1; its format is 7" in text
     assert "c.json lacks problem, target" in text
     with pytest.raises(FileNotFoundError, match="there is no corpus of counterexamples in"):
         vj.replay_counterexamples(problem(), tmp_path / "none")

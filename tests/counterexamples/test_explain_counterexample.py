@@ -103,7 +103,7 @@ def test_without_nominal_features(driven):
 
 
 def test_what_cannot_work_is_refused_with_the_reason(driven):
-    with pytest.raises(ValueError, match="row 1 is no counterexample: status ok"):
+    with pytest.raises(ValueError, match="row 1 is not a counterexample: status ok"):
         explain(driven, 1)
     with pytest.raises(ValueError, match="unknown feature 'mas'; did you mean 'mass'"):
         explain(driven, nominal={"mas": 1.0})

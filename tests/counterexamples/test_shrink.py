@@ -168,7 +168,7 @@ def test_each_kind_by_itself():
 
 def test_what_cannot_work_is_refused_with_the_reason(edges):
     safe = int(edges.table.safe.index[0])
-    with pytest.raises(ValueError, match=rf"row {safe} is no counterexample: status ok, robustn"):
+    with pytest.raises(ValueError, match=rf"row {safe} is not a counterexample: status ok"):
         shrink(edges, safe)
     with pytest.raises(IndexError, match="row 512 is not in the table of 512 simulations"):
         shrink(edges, 512)

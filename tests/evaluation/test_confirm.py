@@ -514,7 +514,7 @@ def test_another_simulator_has_to_agree(circles):
 
 def test_errors_say_what_to_do(circles, tmp_path):
     safe = int(circles.table.safe.index[0])
-    with pytest.raises(ValueError, match=f"row {safe} is no counterexample: it keeps the property"):
+    with pytest.raises(ValueError, match=f"row {safe} is not a counterexample: it keeps"):
         confirm(circles, safe)
     with pytest.raises(IndexError, match="row 999 is not in the table of 256 simulations"):
         confirm(circles, 999)

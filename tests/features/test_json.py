@@ -147,5 +147,5 @@ def test_what_is_wrong_is_refused_where_it_is_made(data, message):
 def test_what_json_cannot_hold():
     with pytest.raises(ValueError, match="a domain of your own"):
         FeatureSpace({"x": Mine()}).to_json()
-    with pytest.raises(ValueError, match=r"the choice \(1, 2\) is no plain data"):
+    with pytest.raises(ValueError, match=r"the choice \(1, 2\) is not plain data"):
         FeatureSpace({"x": Categorical((1, 2), "b")}).to_json()

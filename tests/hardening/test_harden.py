@@ -35,7 +35,7 @@ PPO_SMALL = PPO(
 )  # fmt: skip
 SMALL = {
     "algorithm": PPO_SMALL, "rounds": 2, "steps": 256, "further_steps": 128, "samples": 64,
-    "attack_simulations": 64, "added": 16, "episodes": 16, "progress": False,
+    "attack_simulations": 64, "added": 32, "episodes": 16, "progress": False,
 }  # fmt: skip
 
 
@@ -91,7 +91,7 @@ def test_result_agrees_with_its_table(whole):
     assert (own["failure_high"] >= own["failure_rate"]).all()
     assert own["added"].sum() == len(result.added) > 0
     assert not table[table["arm"] == "randomised"]["added"].any()
-    assert set(result.added["source"]) <= {"counterexample", "shrunk", "rule"}
+    assert set(result.added["source"]) <= {"sample", "counterexample", "shrunk", "rule"}
     # Both arms are one training up to the first round.
     first = table[table["round"] == 0].drop(columns=["arm", "added", "cost", "seconds"])
     pd.testing.assert_series_equal(first.iloc[0], first.iloc[1], check_names=False)

@@ -160,7 +160,7 @@ def test_files_of_requirements(tmp_path):
     refused("[constants]\na = 'b'", "constant 'a' must be a number")
     refused("requirement = 3", "begins with a line")
     refused("", "has no requirement")
-    refused("a = ", "is no TOML")
+    refused("a = ", "is not TOML")
     (tmp_path / "some.txt").write_text("")
     with pytest.raises(ValueError, match=r"ends with .toml, .yaml, .* got some.txt"):
         read_requirements(tmp_path / "some.txt")

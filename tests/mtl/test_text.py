@@ -136,7 +136,7 @@ def test_a_formula_is_written_so_that_it_is_read_again(formula, text):
         ("(x > 1", "expected ')', but found the end of the text"),
         ("x > 1)", "there is no '(' for this ')'"),
         ("a & & b", "but found '&'"),
-        ("x = 1", "'=' is no comparison: write == for equal, >= or <="),
+        ("x = 1", "'=' is not a comparison: write == for equal, >= or <="),
         ("0 < x < 1", "comparisons do not chain: write (0 < x) & (x < 1)"),
         ("G[0,2 a", "expected a unit (s, ms, us, ns, min, h, d) or ']', but found 'a'"),
         ("G[0] a", "expected ',' or ':', but found ']'"),

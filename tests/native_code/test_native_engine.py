@@ -167,6 +167,7 @@ def test_by_default_it_is_native_unless_few_simulations_may_do(ending, monkeypat
     assert run.table.all.equals(natively.table.all)
     assert vj.falsify(ending, "uniform", 700, stop_after=10**6, **options).engine == "xla"
     assert vj.falsify(ending, "uniform", 300, **options).engine == "xla"
+    assert vj.falsify(ending, "cross_entropy", 700, **options).engine == "xla"
 
 
 def test_given_features_are_simulated_natively(ending):

@@ -74,7 +74,7 @@ def test_files_that_hold_no_detector_are_refused(tmp_path):
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
     np.savez(tmp_path / "pickle.npz", about=np.array([{"format": 1}], dtype=object))
     for name in ("text", "other", "pickle"):
-        with pytest.raises(DetectorFileError, match=rf"{name}.npz is no detector"):
+        with pytest.raises(DetectorFileError, match=rf"{name}.npz is not a detector"):
             load_detector(tmp_path / f"{name}.npz")
 
 

@@ -142,7 +142,7 @@ def test_what_cannot_be_saved_or_was_damaged(tmp_path):
     for change, message in (
         (lambda g: g["nodes"][0].__setitem__(0, "System"), "uses System, which is not supported"),
         (lambda g: g["nodes"].reverse(), "which no node before it computes"),
-        (lambda g: g.pop("inputs"), "its graph is none"),
+        (lambda g: g.pop("inputs"), "its graph is not valid"),
     ):
         broken = json.loads(json.dumps(about))
         change(broken["graph"])

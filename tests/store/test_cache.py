@@ -64,7 +64,7 @@ def test_files_of_another_kind(tmp_path):
     file = tmp_path / "sweep.cache"
     for content in ("keep me", "no cache, but longer than its header" * 10):
         file.write_text(content)
-        with pytest.raises(CacheError, match=r"sweep\.cache is no cache: it is a file of an"):
+        with pytest.raises(CacheError, match=r"sweep\.cache is not a cache: it is another kind"):
             Cache(tmp_path)
         assert file.read_text() == content
     file.unlink()

@@ -264,7 +264,7 @@ def test_a_black_box_has_no_gradient():
 
 
 def test_a_fixed_feature_is_no_parameter():
-    with pytest.raises(ValueError, match="x0 does not vary, so it is no parameter to choose"):
+    with pytest.raises(ValueError, match="x0 does not vary, so it cannot be chosen"):
         synthesize(first_order.only("k", "w"), ["x0"])
 
 

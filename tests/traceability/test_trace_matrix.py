@@ -264,10 +264,10 @@ def test_reqif_of_other_tools(tmp_path):
             "DOCTYPE a>",
         ),
         ('<!DOCTYPE REQ-IF SYSTEM "http://x/y.dtd"><REQ-IF/>', "which is refused"),
-        ("<REQ-IF>&x;</REQ-IF>", "is no XML: undefined entity"),
+        ("<REQ-IF>&x;</REQ-IF>", "is not XML: undefined entity"),
         ("<other/>", "its first element is other, not REQ-IF"),
         ("<REQ-IF/>", "has no requirement"),
-        ("", "is no XML"),
+        ("", "is not XML"),
     ],
 )
 def test_xml_that_is_refused(tmp_path, text, match):
@@ -280,7 +280,7 @@ def test_xml_that_is_refused(tmp_path, text, match):
 def test_yaml_runs_nothing(tmp_path):
     path = tmp_path / "some.yaml"
     path.write_text("requirements: !!python/object/apply:os.getcwd []")
-    with pytest.raises(ValueError, match=r"some.yaml is no YAML"):
+    with pytest.raises(ValueError, match=r"some.yaml is not YAML"):
         read_requirements(path)
     path.write_text("- id: A")
     with pytest.raises(ValueError, match="must have a list `requirements`; got list"):

@@ -240,7 +240,7 @@ def test_sines_of_this_package_are_as_tight_as_those_of_jax():
 
 @pytest.mark.thorough
 def test_what_may_not_be_finite_is_not_proved():
-    """A simulation without a verdict is no counterexample, and no proof either."""
+    """A simulation without a verdict is not a counterexample, and no proof either."""
 
     def system(f, key):
         x = jnp.exp(f["x"] * jnp.arange(4.0))

@@ -134,7 +134,7 @@ class Boundary(InNotebook):
         ]
         if self._prior is not None:
             lines.append(
-                f"  mean over the prior {format_percent(self.share)}, which is no bound; "
+                f"  mean over the prior {format_percent(self.share)}, which is not a bound; "
                 f"{format_percent(self.unsampled)} of the prior was never sampled"
             )
         for low, high, rows, failed in self.calibration.to_numpy(float):

@@ -275,7 +275,8 @@ def _read_test(attribute: Attribute, value: object, conversions: Conversions) ->
         said = [name for each in given for name in attribute.groups.get(each, (each,))]
         for each in said:
             if each not in attribute.literals:
-                raise ValueError(f"{each!r} is none of its values, {', '.join(attribute.literals)}")
+                values = ", ".join(attribute.literals)
+                raise ValueError(f"{each!r} is not one of its values, {values}")
         return Test(attribute.name, frozenset(map(attribute.literals.index, said)))
     if attribute.kind not in ("float", "integer"):
         raise ValueError(f"an attribute of kind {attribute.kind} has no values to compare with")

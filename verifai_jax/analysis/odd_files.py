@@ -91,7 +91,7 @@ def odd_of(
             taxonomy[feature] = f"{kind} {measured}".strip()
             include[feature] = f"[{found.low!r} .. {found.high!r}]{unit}"
         else:
-            raise ValueError(f"feature {feature!r} is no range and no choice; got {domain!r}")
+            raise ValueError(f"feature {feature!r} is neither a range nor a choice; got {domain!r}")
     tree = {"TAXONOMY": taxonomy, "ODD": {name: {"INCLUDE_AND": include}}}
     return _domain(name, name, tree, {})
 
@@ -260,7 +260,7 @@ def _mapping(path: Path) -> dict[str, Any]:
     try:
         whole = read_yaml(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise ValueError(f"{path} is no YAML: {error}") from None
+        raise ValueError(f"{path} is not YAML: {error}") from None
     if not isinstance(whole, dict):
         raise ValueError(f"{path} must be a mapping, TAXONOMY: ...; got {type(whole).__name__}")
     return whole

@@ -41,7 +41,7 @@ def summarize(outcome: Outcome) -> str:
 
 
 def findings(outcome: Outcome, metric: str = "error") -> list[str]:
-    """Write which arms lower a metric that is the better the less it is, and which raise it.
+    """Write which arms lower a metric (lower is better), and which raise it.
 
     An arm counts as better or worse where its interval of paired differences excludes zero.
 

@@ -50,9 +50,10 @@ class Simulator(Protocol):
 
         **Arguments:**
 
-        - `members`: of each block the policy, by its index in the group.
+        - `members`: the index in the group of each block's policy.
         - `points`: the samples of each block.
-        - `first`: of each block the number of its first sample, which its random keys come from.
+        - `first`: the number of the first sample of each block, from which its random keys are
+          made.
         - `key`: the key of all simulations.
         """
         ...

@@ -44,7 +44,7 @@ def analyze(
     path = analysis.save((into or folder) / "analysis")
     click.echo(f"  written      {path}")
     if boundary is not None:
-        from verifai_jax.analysis import boundary as learn
+        from verifai_jax import boundary as learn
 
         found = learn(run)
         click.echo(printable(str(found)))
@@ -52,7 +52,7 @@ def analyze(
         click.echo(printable(points.to_string(index=False)))
         give_result(boundary=found.calibration, brier=found.brier, next_points=points)
     if odd is not None:
-        from verifai_jax.analysis import read_odd
+        from verifai_jax import read_odd
 
         covered = read_odd(odd).coverage(run)
         click.echo(printable(str(covered)))

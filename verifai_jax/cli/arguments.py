@@ -14,9 +14,8 @@ from click.core import ParameterSource
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 
 if TYPE_CHECKING:
+    from verifai_jax import Problem, Run
     from verifai_jax.core.executors import Executor
-    from verifai_jax.falsification.run import Run
-    from verifai_jax.problem import Problem
 
 Command = TypeVar("Command", bound=Callable[..., object])
 
@@ -252,8 +251,8 @@ def on_cluster(address: str | None) -> "Iterator[Executor | None]":
 
 def load_problem(target: str, only: str | None = None) -> "Problem":
     """Load the problem FILE.py:NAME, with only some of its features varied."""
+    from verifai_jax import Problem
     from verifai_jax.core.targets import load_target
-    from verifai_jax.problem import Problem
 
     problem = load_target(target, Problem)
     return problem if only is None else problem.only(*split_names(only))
@@ -278,8 +277,8 @@ def load_run(folder: Path, target: str | None) -> "Run":
 
 def read_run(folder: Path, problem: "Problem | None" = None) -> "Run":
     """Read the run in a folder; say what the folder is where it holds none."""
+    from verifai_jax import load
     from verifai_jax.core.text import printable
-    from verifai_jax.falsification.run_folder import load
 
     read_record(folder)
     run = load(folder, problem)

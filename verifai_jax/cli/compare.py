@@ -45,10 +45,10 @@ def compare(
     specs/FILE.py:NAME@REVISION is the problem as it was at a revision of git; the checkout is not
     touched.
     """
-    from verifai_jax.comparison import compare as run_compare
+    from verifai_jax import Problem
+    from verifai_jax import compare as run_compare
     from verifai_jax.core.revisions import load_at_revision
     from verifai_jax.core.text import printable
-    from verifai_jax.problem import Problem
 
     with kept_until_done() as kept, on_cluster(cluster) as executor:
         named = {name: name for name in candidates}
@@ -56,7 +56,7 @@ def compare(
         click.echo(printable(str(result)))
         kept.stopped(result.stopped)
     if errors is not None:
-        from verifai_jax.error_budgets import error_budget
+        from verifai_jax import error_budget
 
         with load_at_revision(target, Problem) as baseline:
             for one in result.candidates:

@@ -49,8 +49,8 @@ def replay_counterexamples(
     target: str, folder: Path, rename: tuple[str, ...], fail_on: Gate | None
 ) -> None:
     """Simulate the saved counterexamples in FOLDER (or one file) again, on TARGET as it is now."""
+    from verifai_jax import replay_counterexamples as replay
     from verifai_jax.core.text import printable
-    from verifai_jax.counterexamples import replay_counterexamples as replay
 
     names = dict(arguments.split_pairs("--rename", rename))
     result = replay(arguments.load_problem(target), folder, rename=names)

@@ -12,7 +12,7 @@ from verifai_jax.cli.going_on import kept_until_done
 from verifai_jax.cli.json_output import command, give_result, show_result
 
 if TYPE_CHECKING:
-    from verifai_jax.estimation import Estimate
+    from verifai_jax import Estimate
 
 
 @command()
@@ -57,8 +57,8 @@ def estimate(
     **options: Any,
 ) -> None:
     """Estimate the probability that TARGET (FILE.py:NAME) fails, with an interval and a bound."""
+    from verifai_jax import estimate as run
     from verifai_jax.core.text import printable
-    from verifai_jax.estimation import estimate as run
 
     if fail_on is not None and fail_on.name == "p0" and p0 is None:
         raise click.UsageError("--fail-on p0 goes with --p0")
@@ -71,7 +71,7 @@ def estimate(
         kept.stopped(found.stopped)
     budget = None
     if errors is not None:
-        from verifai_jax.error_budgets import error_budget
+        from verifai_jax import error_budget
 
         budget = error_budget(problem, found, pairs=errors)
         click.echo(printable(str(budget)))

@@ -16,10 +16,8 @@ from verifai_jax.cli.json_output import command, describe_run, give_result
 from verifai_jax.cli.next_folder import given_or_next
 
 if TYPE_CHECKING:
-    from verifai_jax.falsification.run import Run
-    from verifai_jax.problem import Problem
+    from verifai_jax import Decided, Problem, Run, Within
     from verifai_jax.search import Search
-    from verifai_jax.statistics.stopping import Decided, Within
 
 
 _RESUMES = (
@@ -217,7 +215,7 @@ def _stopping_rule(within: float | None, decide: float | None) -> "Within | Deci
         return None
     if within is not None and decide is not None:
         raise click.UsageError("--within and --decide are two ways to stop; give one")
-    from verifai_jax.statistics.stopping import Decided, Within
+    from verifai_jax import Decided, Within
 
     if within is not None:
         return Within(within)

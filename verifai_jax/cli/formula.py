@@ -11,7 +11,7 @@ from verifai_jax.cli.json_output import command, give_result, show_result
 from verifai_jax.cli.monitor_fleet import load_requirements
 
 if TYPE_CHECKING:
-    from verifai_jax.mtl import Formula
+    from verifai_jax import Formula
 
 End = Literal["hold", "truncate"]
 

@@ -42,7 +42,7 @@ def fuzz(
     **options: Any,
 ) -> None:
     """Look for failures of TARGET (specs/FILE.py:NAME) by covering what can happen in it."""
-    from verifai_jax.fuzzing import fuzz as run_fuzz
+    from verifai_jax import fuzz as run_fuzz
 
     chosen = {name: _cells(name, text) for name, text in arguments.split_pairs("--cells", cells)}
     problem = arguments.load_problem(target)

@@ -35,11 +35,11 @@ def harden(
     target: str, folder: Path | None, plot: Path | None, fail_on: Gate | None, **options: Any
 ) -> None:
     """Train a policy of the study TARGET (FILE.py:NAME), go on where it fails, certify it."""
+    from verifai_jax import Study
+    from verifai_jax import harden as run
     from verifai_jax.core.targets import load_target
     from verifai_jax.core.text import printable
-    from verifai_jax.hardening import harden as run
     from verifai_jax.statistics.confidence_sequences import safe_at
-    from verifai_jax.sweeps.study import Study
 
     study = load_target(target, Study)
     into = folder or Path("runs") / f"harden-{target.rpartition(':')[2]}"

@@ -10,8 +10,7 @@ from verifai_jax.cli.exit_codes import WRONG_USAGE
 from verifai_jax.cli.json_output import command, give_result
 
 if TYPE_CHECKING:
-    from verifai_jax.problem import Problem
-    from verifai_jax.sweeps.study import Study
+    from verifai_jax import Problem, Study
 
 
 @command(name="list")
@@ -21,11 +20,10 @@ def list_targets(location: str | None) -> None:
 
     Its Python files are run for that, those of inner folders are not.
     """
+    from verifai_jax import Problem, Study
     from verifai_jax.core.errors import MissingExtra
     from verifai_jax.core.targets import NothingDefined, TargetError, definitions
-    from verifai_jax.problem import Problem
     from verifai_jax.search import names
-    from verifai_jax.sweeps.study import Study
 
     path = Path(location or "specs")
     if location is None and not path.exists():

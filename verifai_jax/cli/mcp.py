@@ -129,11 +129,11 @@ class Server:
             try:
                 request = json.loads(line)
             except ValueError:
-                yield _line(None, error={"code": -32700, "message": "the message is no JSON"})
+                yield _line(None, error={"code": -32700, "message": "the message is not JSON"})
                 continue
             valid = isinstance(request, dict) and isinstance(request.get("method"), str)
             if not valid or not isinstance(request.get("params", {}), dict):
-                yield _line(None, error={"code": -32600, "message": "this is no request"})
+                yield _line(None, error={"code": -32600, "message": "this is not a request"})
             elif "id" in request:  # Nothing is answered to a notification.
                 yield self._answer(request["id"], request["method"], request.get("params", {}))
 

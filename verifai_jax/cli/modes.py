@@ -30,7 +30,7 @@ from verifai_jax.cli.json_output import command, show_result
 @arguments.PLOT
 def modes(target: str, only: str | None, plot: Path | None, **options: Any) -> None:
     """List the modes of failure of TARGET (FILE.py:NAME), each with its probability."""
-    from verifai_jax.failure_modes import modes as run
+    from verifai_jax import modes as run
 
     problem = arguments.load_problem(target, only)
     with kept_until_done() as kept:

@@ -28,8 +28,8 @@ from verifai_jax.core.errors import UnknownNameError, missing_name, nearest_name
 from verifai_jax.core.text import format_time, printable
 
 if TYPE_CHECKING:
+    from verifai_jax import Formula
     from verifai_jax.core.trace import Trace
-    from verifai_jax.mtl import Formula
     from verifai_jax.mtl.resampling import Missing
 
 
@@ -302,8 +302,8 @@ def _period(samples: Iterator[Sample], dt: float | None) -> tuple[Iterator[Sampl
     first = list(itertools.islice(samples, 2))
     if len(first) < 2:
         raise ValueError(
-            f"{SOURCE} has {len(first)} sample{'s' * (len(first) != 1)}, of which no sampling "
-            "period follows: give it, --dt SECONDS"
+            f"{SOURCE} has {len(first)} sample{'s' * (len(first) != 1)}, too few to show the "
+            "sampling period: give it, --dt SECONDS"
         )
     before, after = (sample.time for sample in first)
     assert before is not None
@@ -393,7 +393,7 @@ def _number(cells: dict[str, str], line: int, separator: str, name: str) -> floa
         return float(text.replace(",", ".") if separator == ";" else text)
     except ValueError:
         raise ValueError(
-            f"line {line} of {SOURCE} has {text!r} in column {name!r}, which is no number"
+            f"line {line} of {SOURCE} has {text!r} in column {name!r}, which is not a number"
         ) from None
 
 

@@ -23,8 +23,8 @@ def qualify(folder: Path, only: tuple[str, ...]) -> None:
     Formulas against definitions, rates against closed forms, gradients against differences, kills,
     replays bit for bit. It ends with code 3 if one falls.
     """
+    from verifai_jax import qualify as run
     from verifai_jax.core.text import printable
-    from verifai_jax.qualification import qualify as run
 
     found = run(only)
     path = found.save(folder)

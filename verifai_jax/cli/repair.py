@@ -45,8 +45,8 @@ def repair(
     **keywords: Any,
 ) -> None:
     """Change parameters of TARGET (specs/FILE.py:NAME) as little as removes its failures."""
+    from verifai_jax import repair as run_repair
     from verifai_jax.core.text import printable
-    from verifai_jax.synthesis import repair as run_repair
 
     problem = arguments.load_problem(target)
     with kept_until_done() as kept:

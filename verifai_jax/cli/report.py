@@ -69,7 +69,7 @@ def report(
         result = read_result(folder, None if problem is None else problem.space)
         output = folder.with_suffix(".html") if output == folder / "report.html" else output
     elif arguments.is_sweep(folder):
-        from verifai_jax.sweeps.result import load_sweep
+        from verifai_jax import load_sweep
 
         result = load_sweep(folder)
     else:
@@ -77,7 +77,7 @@ def report(
             arguments.read_run(folder) if without_problem else arguments.load_run(folder, target)
         )
     if odd is not None:
-        from verifai_jax.analysis import read_odd
+        from verifai_jax import read_odd
     path = write_report(
         result,
         output,

@@ -15,7 +15,7 @@ from verifai_jax.cli.json_output import command, draw, give_result
 from verifai_jax.cli.next_folder import given_or_next
 
 if TYPE_CHECKING:
-    from verifai_jax.sweeps.result import Sweep
+    from verifai_jax import Sweep
 
 _RESUMES = (
     *("resume", "target", "configurations", "max_seconds", "cache", "even_if_changed", "cluster"),
@@ -82,11 +82,11 @@ def sweep(
     **given: Any,
 ) -> None:
     """Train configurations of the study TARGET (specs/FILE.py:NAME), certify their policies."""
+    from verifai_jax import Study
     from verifai_jax.core.targets import load_target, target_of_project
     from verifai_jax.core.text import printable
     from verifai_jax.store.cache import cache_file
     from verifai_jax.sweeps._sweep import sweep as run_sweep
-    from verifai_jax.sweeps.study import Study
 
     if resume is not None:
         arguments.refuse_others(_RESUMES, "is fixed in the sweep that --resume goes on with")
@@ -178,8 +178,8 @@ def _resuming(
 
 def _keywords(given: Mapping[str, Any], options: tuple[str, ...]) -> dict[str, Any]:
     """Turn options of the command into keyword arguments of `sweep`."""
+    from verifai_jax import Halving
     from verifai_jax.search import named
-    from verifai_jax.sweeps.halving import Halving
 
     keywords = {
         name: given[name]
@@ -188,7 +188,7 @@ def _keywords(given: Mapping[str, Any], options: tuple[str, ...]) -> dict[str, A
     }
     search, values = given["search"] or "halton", arguments.plain_values("--set", options)
     if search.startswith("optuna:"):
-        from verifai_jax.sweeps.optuna import OptunaSampler
+        from verifai_jax import OptunaSampler
 
         keywords["search"] = OptunaSampler(search.removeprefix("optuna:"), values)
     else:

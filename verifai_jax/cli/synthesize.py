@@ -34,7 +34,7 @@ def synthesize(
     **keywords: Any,
 ) -> None:
     """Find parameters for which TARGET (specs/FILE.py:NAME) holds, whatever its other features."""
-    from verifai_jax.synthesis import synthesize as run_synthesize
+    from verifai_jax import synthesize as run_synthesize
 
     problem = load_problem(target)
     with kept_until_done() as kept:

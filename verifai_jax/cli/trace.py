@@ -44,8 +44,8 @@ def trace(
 
     Files of problems, and of tests, are run for that. pyproject.toml's vj_specs are tests too.
     """
+    from verifai_jax import trace_matrix
     from verifai_jax.core.text import printable
-    from verifai_jax.traceability import trace_matrix
 
     asked = {
         "tests": [*(tests or _usual("tests")), *_tested_files()],
@@ -85,7 +85,7 @@ def _tested_files() -> list[Path]:
     try:
         options = tomllib.loads(file.read_text(encoding="utf-8")).get("tool", {}).get("pytest", {})
     except ValueError as error:
-        raise ValueError(f"{file} is no TOML: {error}") from None
+        raise ValueError(f"{file} is not TOML: {error}") from None
     patterns = options.get("ini_options", {}).get("vj_specs", [])
     patterns = patterns.split() if isinstance(patterns, str) else patterns
     return sorted({path for pattern in patterns for path in Path().glob(str(pattern))})

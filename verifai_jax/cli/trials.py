@@ -41,7 +41,7 @@ def trials(
     TRIALS is a CSV or Parquet file with a column for each feature, and `failed` (yes or no) or
     `recording` (a file of signals). Without it, --sheet plans the first trials.
     """
-    from verifai_jax.trials import real_trials, trial_protocol
+    from verifai_jax import real_trials, trial_protocol
 
     problem = arguments.load_problem(target)
     if trials is None:

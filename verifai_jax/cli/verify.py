@@ -39,7 +39,7 @@ def verify(
     **options: Any,
 ) -> None:
     """Divide the features of TARGET (FILE.py:NAME) into proved, broken and undecided boxes."""
-    from verifai_jax.verification import verify as run
+    from verifai_jax import verify as run
 
     problem = arguments.load_problem(target, only)
     before = into if into is not None and into.exists() else None

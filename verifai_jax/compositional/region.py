@@ -87,7 +87,7 @@ class AbstractLoop:
         return as_system(self.abstraction(severity))(features, self.key)
 
     def outcome(self, features: Features, severity: Float[Array, ""] | float) -> Outcome:
-        """Simulate with an error of this severity, and decide as everywhere."""
+        """Simulate the loop with an error of this severity, and return its verdict."""
         trace = self.trace(features, severity)
         rho, status = trace_verdict(self.problem, trace)
         proper = status == Status.OK

@@ -108,7 +108,7 @@ def gather(
     ended: Callable[[int, Any], None],
     further: Callable[[], Sequence[Future]] = tuple,
 ) -> None:
-    """Wait until all futures have ended, and call `ended(place, result)` as each does.
+    """Wait until all futures have ended, and call `ended(index, result)` as each ends.
 
     `further()` is asked for more futures whenever some have ended; their places go on.
 

@@ -1,10 +1,10 @@
-"""Batches of matrix factorizations on a processor that cannot wait for themselves for ever.
+"""Batches of matrix factorizations on a processor that cannot deadlock.
 
 Jaxlib 0.10.0 up to 0.11.1 cuts a large batch of matrices into parts, and the thread that asked for
-them waits until other threads of XLA's pool have done them. That thread may be of the pool itself:
-where each thread waits in this way nobody is left to do the parts, and the program hangs. One
-Cholesky factorization or one linear solve of 20 rows in the dynamics of a batch is enough. Later
-versions do not cut (jax-ml/jax, commit 859992407d), nor did earlier ones.
+them waits until other threads of XLA's pool have done them. That thread may belong to the pool
+itself: when all its threads wait in this way, no thread is left for the parts, and the program
+hangs. One Cholesky factorization or one linear solve of 20 rows in the dynamics of a batch is
+enough. Later versions do not cut (jax-ml/jax, commit 859992407d), nor did earlier ones.
 
 `avoid_deadlock` lowers these batches as a loop over blocks that are too small to be cut. Each
 matrix is factorized by the same routine of LAPACK as before, so results are the same.
@@ -62,7 +62,7 @@ _FACTORIZATIONS = {
 
 
 def avoid_deadlock() -> None:
-    """Let this process lower large batches of factorizations block by block, where it is needed.
+    """Let this process lower large batches of factorizations block by block, for affected versions.
 
     It holds for all programs of the process, which compute what they did before.
     """

@@ -10,8 +10,8 @@ from verifai_jax.core.errors import require
 def read_xml(data: bytes, name: str) -> Element:
     """Read XML that may come from anywhere.
 
-    **Raises:** `ValueError` for a document type, with which entities are declared, and for what is
-    no XML.
+    **Raises:** `ValueError` for text that is not XML, and for a document type, which can declare
+    entities.
     """
 
     def refuse(*declared: object) -> None:
@@ -26,7 +26,7 @@ def read_xml(data: bytes, name: str) -> Element:
         parser.Parse(data, True)
         return ElementTree.fromstring(data)
     except (expat.ExpatError, ElementTree.ParseError) as error:
-        raise ValueError(f"{name} is no XML: {error}") from None
+        raise ValueError(f"{name} is not XML: {error}") from None
 
 
 def read_yaml(text: str) -> object:

@@ -1,4 +1,4 @@
-"""Going through a program that JAX traced, with values of any kind in place of arrays."""
+"""Running a program that JAX traced, on values of any kind instead of arrays."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar

@@ -1,11 +1,11 @@
-"""Numbers that a compiled program reads from an argument, where they would be constants in it.
+"""Numbers that a compiled program reads from an argument instead of having them as constants.
 
     numbers = LiftedNumbers()
     numbers.read_from(vector, lambda: simulate(u))      # while a program of (u, vector) is traced
     numbers.vector("float32")                           # the argument to call the program with
 
-A program that holds the bounds of a space is another one for every edit of a bound, and compiled
-anew. Within `lifting()`, which stands around the map from the unit cube to features, a domain asks
+A program with the bounds of a space as constants is compiled anew after every edit of a bound.
+Within `lifting()`, which stands around the map from the unit cube to features, a domain asks
 `lifted(self, ...)` for its numbers; elsewhere they stay constants.
 """
 

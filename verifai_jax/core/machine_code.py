@@ -2,7 +2,7 @@
 
     path = library_file("monitor-4f2a", lambda: (source, ("-std=c99", "-O2")))
 
-A file is only used if its content has the checksum that its name says, from a folder that nobody
+A file is used only if its content has the checksum in its name, from a folder that nobody
 else can write to.
 """
 
@@ -24,13 +24,13 @@ MAX_SECONDS = 60.0
 
 
 class Unavailable(Exception):
-    """There is no library; the text says why."""
+    """Raised when a library cannot be made, with the reason."""
 
 
 def compiler() -> Path:
     """Return the compiler of this machine, for a library that is kept.
 
-    **Raises:** `Unavailable` where there is none, or no folder to keep what it makes.
+    **Raises:** `Unavailable` without a compiler, or without a folder for the library.
     """
     if cache_folder() is None:
         raise Unavailable("the cache of compiled programs is switched off")

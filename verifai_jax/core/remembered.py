@@ -1,13 +1,13 @@
-"""Programs that follow from what was just traced, kept on disk between processes.
+"""Programs derived from a traced one, such as its gradient, kept on disk between processes.
 
     key = remembered_as("gradients", fingerprint(traced.jaxpr), (lanes, "reverse"))
     lowered = lower_or_recall(key, function, arguments)           # to be compiled
 
-To trace the derivative of a simulation takes ten times as long as to trace the simulation, and
-what comes out depends on nothing else. So a simulation is traced afresh in each process, and where
-it is the same as in an earlier one, so is its derivative: that is read from a file, in a form that
-JAX exports and that can compute nothing but arrays. A file that is missing, damaged, or of another
-version of JAX or of this package is one that does not exist.
+Tracing the derivative of a simulation takes ten times as long as tracing the simulation, and the
+result depends on the simulation alone. So each process traces the simulation, and if an earlier
+process traced the same one, reads its derivative from a file that JAX has exported, which can
+compute nothing but arrays. A missing or damaged file, or one of another version of JAX or of this
+package, is ignored.
 """
 
 import contextlib
@@ -46,15 +46,15 @@ _SETTINGS = (
 
 
 def remembered_as(kind: str, *values: object) -> str | None:
-    """Return the name under which a program is kept: one for all that it depends on.
+    """Return the name under which a program is kept, a hash of all that it depends on.
 
     **Arguments:**
 
     - `kind`: of the program, for people who look into the folder.
-    - `values`: all that the program follows from, in addition to this package and JAX; see
+    - `values`: everything that determines the program, besides this package and JAX; see
       `identity`.
 
-    **Returns:** the name; None if it cannot be said, or nothing is kept on disk.
+    **Returns:** the name; None if a value has no identity, or nothing is kept on disk.
     """
     if cache_folder() is None or None in values:
         return None

@@ -182,7 +182,7 @@ class _Collector:
                 self.add_data(str(part), MODEL)
 
     def _hash_of_module(self, file: str) -> str:
-        """Return the hash of a file as it was imported, or as it is where it is not imported."""
+        """Return the hash of a module as it was imported, or of its file if it was not imported."""
         values = self._loaded.get(file)
         if values is None:
             return _hash_of_code(file)

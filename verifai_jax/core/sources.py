@@ -204,7 +204,7 @@ class Sources:
         return tuple(found)
 
     def other_versions(self, now: "Sources") -> tuple[str, ...]:
-        """Return packages whose version is another one now, as text."""
+        """Return the packages whose version has changed, as text."""
         return tuple(
             f"{name} {was} then, {now.versions[name]} now"
             for name, was in self.versions.items()
@@ -257,7 +257,7 @@ def versions() -> dict[str, str]:
 
 
 def shown_path(file: str) -> str:
-    """Return the name of a file: from the working directory, or absolute where it is elsewhere."""
+    """Return the path of a file: relative to the working directory, or absolute if elsewhere."""
     path = Path(file)
     for root in (tree_of(file), Path.cwd(), Path.cwd().resolve()):
         if root is not None and path.is_relative_to(root):

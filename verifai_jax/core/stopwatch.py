@@ -61,9 +61,9 @@ class Stopwatch:
             self.move(seconds_waited() - before, name)
 
     def move(self, seconds: float, to: str) -> None:
-        """Count seconds that were measured inside what is timed now for `to` instead.
+        """Count seconds that were measured inside the present part for `to` instead.
 
-        They are at most those that it has taken.
+        At most the seconds of the present part are moved.
         """
         self._count()
         own = self._names[-1]

@@ -166,7 +166,7 @@ def printable(text: str, maximum: int | None = None) -> str:
 
 
 def storable(text: object, maximum: int = 2000) -> str:
-    r"""Return a text of somebody's code as files and sockets can hold it, of bounded length.
+    r"""Return a text from a user's code in a form that files and sockets accept, of bounded length.
 
     A lone surrogate, which UTF-8 cannot hold, becomes its escape: `\ud800`.
 

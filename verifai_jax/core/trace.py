@@ -69,8 +69,8 @@ class Trace(InNotebook):
     - `between`: samples that were recorded after each sample and before the next one, the same
       number for each: a trace of signals `[time * m]` or `[time * m, k]`, with sample times.
       `mtl.resample` keeps there what its clock passes over, and verdicts count it.
-    - `notes`: what the producer says of this simulation or recording, with how often it happened,
-      `{"the solver fell back to Euler": 3}`. A run adds them up and has them among its notes.
+    - `notes`: what messages of the producer on this simulation or recording, each with how often it
+      came, `{"the solver fell back to Euler": 3}`. A run adds them up and has them among its notes.
     - `units`: units of signals by name, as their recording has them.
 
     Notes and units are for the host: JAX's transformations drop them.

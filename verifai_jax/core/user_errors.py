@@ -187,7 +187,7 @@ def source_line(traceback: object) -> str | None:
 def explain_user_error(
     error: BaseException, features: object = None, *, system: bool = True, native: bool = False
 ) -> str:
-    """Write what a user's code did, where, and what to do about it, in one line.
+    """Write what failed in a user's code, at which line, and the remedy, in one line.
 
     **Arguments:**
 
@@ -321,7 +321,7 @@ def _same_names(one: Mapping[Any, Any], other: object) -> bool:
 
 
 def raised_in_callback(error: BaseException) -> str | None:
-    """Return what a function raised that JAX calls on the host, and its line; None elsewhere.
+    """Return the error of a function that JAX calls on the host, and its line, or None.
 
     JAX has the whole traceback as the text of an error of its own.
     """

@@ -337,7 +337,7 @@ def acting_spans(
     width: float | None,
     duration: float,
 ) -> list[tuple[float, float]]:
-    """Return from when to when each control point changes the function, in seconds.
+    """Return the begin and the end of the time in which each control point acts, in seconds.
 
     A point between two lines acts from the point before to the one after, one of a cubic as far
     as the second point before and after it, and the first and the last to the ends.

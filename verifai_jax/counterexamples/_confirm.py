@@ -156,11 +156,11 @@ def _check_fails(number: int | None, values: Mapping[str, Any]) -> None:
     which = "this row" if number is None else f"row {number}"
     if values["status"] != "ok":
         raise ValueError(
-            f"{which} is no counterexample: its simulation has no verdict ({values['status']})"
+            f"{which} is not a counterexample: its simulation has no verdict ({values['status']})"
         )
     if not values["violated"]:
         raise ValueError(
-            f"{which} is no counterexample: it keeps the property with robustness "
+            f"{which} is not a counterexample: it keeps the property with robustness "
             f"{values['rho']:z.4g}; confirm(run) checks those that do not"
         )
 

@@ -104,7 +104,7 @@ class SavedCounterexample:
         form = content.get("format") if isinstance(content, dict) else None
         if form != FORMAT:
             raise CorpusError(
-                f"{path} is no counterexample of format {FORMAT}; its format is {form!r}"
+                f"{path} is not a counterexample of format {FORMAT}; its format is {form!r}"
             )
         missing = [field.name for field in fields(cls) if field.name not in content]
         if missing:

@@ -36,8 +36,8 @@ class Influence:
     when each coordinate acts, for the control points of a signal, else None; `reverted`: the
     robustness with the whole feature back at nominal; `each` `[k]`: with one of its coordinates
     back; `slopes` `[k]`: derivative of the smooth robustness by each of its real numbers, in their
-    own unit, at the row; `gradient` `[k]`: the same over the whole range of each, which of a
-    distribution is twice that of its middle half. What is not known is NaN. `gone`: whether the
+    own unit, at the row; `gradient` `[k]`: the same over the whole range of each (for a
+    distribution, twice the range of its middle half). Unknown numbers are NaN. `gone`: whether the
     failure vanishes with the whole feature back; `departs`: whether the feature is not nominal;
     `each_gone`: whether the failure vanishes with one coordinate back.
     """

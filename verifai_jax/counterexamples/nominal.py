@@ -48,7 +48,7 @@ class Nominal:
         **Arguments:**
 
         - `problem`: says what is nominal.
-        - `nominal`: features that take the place of what it says.
+        - `nominal`: nominal values that override those of the problem.
 
         **Raises:** `ValueError` where neither names all features, or one is outside the space.
         """

@@ -58,7 +58,7 @@ def select_row(run: Run, row: Row) -> tuple[int, dict[str, Any]]:
     if number not in failing.index and not bool(entry.get("violated", False)):
         some = ", ".join(map(str, failing.index[:5]))
         raise ValueError(
-            f"row {number} is no counterexample: status {entry['status']}, robustness "
+            f"row {number} is not a counterexample: status {entry['status']}, robustness "
             f"{entry['rho']:z.4g}; counterexamples are {some}{', ...' * (len(failing) > 5)}"
         )
     return number, entry

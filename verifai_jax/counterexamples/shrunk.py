@@ -18,7 +18,7 @@ from verifai_jax.problem.problem import Problem
 
 
 class Step(NamedTuple):
-    """The least departure after so many simulations: its coordinates' number, and its distance."""
+    """The smallest departure after some simulations: how many coordinates depart, and how far."""
 
     simulations: int
     count: int

@@ -141,10 +141,10 @@ def divide_under_keys(
 def _likeliest_of(
     own: LimitState, found: Regions, z: Float[np.ndarray, "n d"]
 ) -> Int[np.ndarray, " n"]:
-    """Return the region whose likeliest failure a path leads to from each failure; -1 for none.
+    """Return, for each failure, the region whose likeliest failure a path leads to; -1 for none.
 
-    Under an unlucky key regions are near one another, and failures of both are frequent. So a path
-    to any failure of a region counts only where there is none to a likeliest one.
+    Under an unlucky key regions lie close together, with frequent failures between them. So a path
+    to another failure of a region counts only if no path leads to a likeliest failure.
     """
     region, ends = np.full(len(z), -1), found.design_points
     nearest = np.argsort(squared_distances(z, ends), axis=1)

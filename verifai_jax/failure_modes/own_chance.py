@@ -153,5 +153,5 @@ def _connected(
 
 
 def _as_often(count: int, lower: int, times: int) -> bool:
-    """Return whether a point may fail about as often as the end that fails less often."""
+    """Return whether a point may fail about as often as the end with fewer failures."""
     return count >= AS_OFTEN * lower or bool(binom.cdf(count, times, lower / times) > SURELY_LESS)

@@ -59,9 +59,23 @@ class Effect:
         return " + ".join(self.faults)
 
     @property
+    def severity_text(self) -> str:
+        """The lowest severities at which it fails."""
+        return ", ".join(f"{name} {value:z.4g}" for name, value in self.severity.items())
+
+    @property
     def confirmed(self) -> bool:
         """True if the counterexample failed in every closer replay."""
         return self.verdict == "confirmed"
+
+
+COLUMNS = {
+    "fails": "fails", "severity": "severity_text", "property": "broken",
+    "onset_to_violation": "delay", "shown_by": "shown_by", "shown_after": "shown_after",
+    "occurrence": "occurrence", "probability": "probability", "low": "low", "high": "high",
+    "verdict": "verdict", "replay": "command",
+}  # fmt: skip
+"""Columns of the table, each with the attribute of an effect that it shows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,25 +126,9 @@ class FailureTable(Drawn, InNotebook):
         """A row for each effect, by name."""
         import pandas as pd
 
-        rows = [
-            {
-                "fails": each.fails,
-                "severity": severity_text(each),
-                "property": each.broken,
-                "onset_to_violation": each.delay,
-                "shown_by": each.shown_by,
-                "shown_after": each.shown_after,
-                "occurrence": each.occurrence,
-                "probability": each.probability,
-                "low": each.low,
-                "high": each.high,
-                "verdict": each.verdict,
-                "replay": each.command,
-            }
-            for each in self.effects
-        ]
-        names = [each.name for each in self.effects]
-        return pd.DataFrame(rows, index=pd.Index(names, name="fault"))
+        rows = [[getattr(each, name) for name in COLUMNS.values()] for each in self.effects]
+        names = pd.Index([each.name for each in self.effects], name="fault")
+        return pd.DataFrame(rows, index=names, columns=list(COLUMNS))
 
     def to_csv(self, path: str | Path) -> None:
         """Write the table to a file.
@@ -183,7 +181,7 @@ class FailureTable(Drawn, InNotebook):
             elif each.row is None:
                 line += ", fails under few random keys"
             else:
-                line += f", {each.verdict}\n    from {severity_text(each)}; breaks {each.broken} "
+                line += f", {each.verdict}\n    from {each.severity_text}; breaks {each.broken} "
                 line += f"{format_seconds(each.delay, 3)} after the onset"
                 if each.shown_by:
                     shown = format_seconds(each.shown_after, 3)
@@ -197,8 +195,3 @@ class FailureTable(Drawn, InNotebook):
 
     def _notebook_parts(self) -> Iterator[str]:
         yield frame_html(self.table)
-
-
-def severity_text(effect: Effect) -> str:
-    """Write the least severities at which a row fails."""
-    return ", ".join(f"{name} {value:z.4g}" for name, value in effect.severity.items())

@@ -144,11 +144,10 @@ def falsify(
       this machine alone, bit for bit, on workers with its kind of processor.
     - `keep_going`: whether to simulate on if all of the first simulations raise. Otherwise the run
       ends with an error after 16 that raise the same, or after a first round of many at once.
-    - `engine`: `"xla"`, or `"native"`: rows from the 513th on are simulated by vector code that
-      the machine's own C++ compiler makes of the problem, two to five times as fast where no
-      large network is in the loop. It agrees with XLA up to rounding; XLA decides what is near to
-      zero, and simulates what cannot be translated. `"auto"` takes it if the budget is worth it,
-      without `stop_after` and `stop_when`.
+    - `engine`: `"xla"`, or `"native"`: rows from the 513th on are simulated by vector code of the
+      machine's own C++ compiler, two to five times as fast where no large network is in the loop,
+      and equal up to rounding; XLA decides what is near to zero, and simulates what cannot be
+      translated. `"auto"` is native for a budget that is worth it, unless the search learns.
     - `cheap`: a cheap model of the same features, searched first with 20 times the budget. At
       most a quarter of the budget is spent on what it found. Only `problem` decides what fails.
     - `proved`: what `verify` found of this problem, or its file. The run is of the rest, and is
@@ -166,8 +165,8 @@ def falsify(
     """
     started = time.perf_counter()
     check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
+    as_wanted(engine)
     ends_early = stop_after is not None or stop_when is not None
-    wanted = as_wanted(engine, ends_early)
     of_rest: tuple[str, ...] = ()
     if proved is not None:
         from verifai_jax.verification.result import as_verification
@@ -220,7 +219,8 @@ def falsify(
         table = ErrorTable(tuple(problem.space.columns), path)
         rounds = Rounds(
             problem, search, size, seed, table, precision, path, confirm, executor, target, given,
-            suggests=asking is not None, engine=wanted, budget=budget,
+            suggests=asking is not None, budget=budget,
+            engine=as_wanted(engine, ends_early or search.learns),
         )  # fmt: skip
         if asking is not None:
             rounds.ask(replace(asking, search=search))

@@ -87,14 +87,15 @@ def batch_size(
     return min(usual if asked is None else asked, budget)
 
 
-def as_wanted(engine: object, ends_early: bool = False) -> Wanted:
+def as_wanted(engine: object, portable: bool = False) -> Wanted:
     """Return an engine that was asked for, or that was recorded: a host system has no other.
 
-    - `ends_early`: whether few simulations may end the run, for which `"auto"` is XLA.
+    - `portable`: whether `"auto"` is XLA: if few simulations may end the run, or if rounding may
+      decide which points a search that learns proposes next.
 
     **Raises:** `UnknownNameError`.
     """
-    if engine == "host" or (ends_early and engine == "auto"):
+    if engine == "host" or (portable and engine == "auto"):
         return "xla"
     if engine not in WANTED:
         raise unknown_name("engine", str(engine), WANTED)

@@ -100,6 +100,8 @@ class Fault:
     """Whether a channel of whole numbers can have it."""
     draws: ClassVar[bool] = False
     """Whether it draws random numbers."""
+    holds: ClassVar[bool] = False
+    """Whether it remembers a value to repeat it."""
 
     channel: str = field(kw_only=False)
     onset: Number = 0.0
@@ -179,7 +181,7 @@ class Fault:
 
     def memory(self, zero: Vector, period: float) -> PyTree:
         """Return what it remembers at first, for entries like `zero`."""
-        return ()
+        return zero if self.holds else ()
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         """Return the entries that the fault makes of `good` ones, and what it remembers then."""

@@ -151,7 +151,8 @@ class Injected(Link):
             self.side == "action", other, lambda count: uniform(seed, now.step, count, xp),
         )  # fmt: skip
         bad, after = self.fault.corrupt(good, memory, at)
-        after = after if xp is np else jax.tree.map(_like, after, memory)
+        if xp is not np:
+            after = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), after, memory)
         bad = xp.broadcast_to(xp.asarray(bad), good.shape).astype(good.dtype)
         if xp is np or self.entries.whole:
             faulty = xp.where(on, bad, good)
@@ -277,7 +278,3 @@ def on_host(
     - `period`: seconds between two observations.
     """
     return OnHost(faults, features, seed, period)
-
-
-def _like(new: Any, old: Any) -> Any:
-    return jnp.asarray(new, old.dtype)

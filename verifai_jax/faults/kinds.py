@@ -39,8 +39,7 @@ class Stuck(Dropout):
 class Freeze(Fault):
     """The channel repeats its last value before the onset."""
 
-    def memory(self, zero: Vector, period: float) -> PyTree:
-        return zero
+    holds = True
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         held = at.xp.where(at.live & ~at.first, memory, good)
@@ -51,13 +50,10 @@ class Freeze(Fault):
 class HeldAction(Fault):
     """The channel changes only every `hold` seconds, and is held between."""
 
-    severity = "hold"
+    severity, holds = "hold", True
     ranges: ClassVar[Ranges] = within(hold=POSITIVE)
     channel: str = field(default="action", kw_only=False)
     hold: Number
-
-    def memory(self, zero: Vector, period: float) -> PyTree:
-        return zero
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         steps = at.xp.maximum(1, at.xp.round(at.number["hold"] / at.period))
@@ -93,8 +89,7 @@ class Delay(Fault):
 class ClockJitter(Fault):
     """Each value is late by a random time up to `jitter` seconds, in whole periods."""
 
-    severity = "jitter"
-    draws = True
+    severity, draws = "jitter", True
     ranges: ClassVar[Ranges] = within(jitter=POSITIVE)
     jitter: Number
 
@@ -109,13 +104,9 @@ class ClockJitter(Fault):
 class PacketLoss(Fault):
     """Each value is lost with probability `loss`; the last one that arrived is used instead."""
 
-    severity = "loss"
-    draws = True
+    severity, draws, holds = "loss", True, True
     ranges: ClassVar[Ranges] = within(loss=(0.0, 1.0))
     loss: Number
-
-    def memory(self, zero: Vector, period: float) -> PyTree:
-        return zero
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         lost = at.live & (at.uniform(1)[0] < at.number["loss"]) & ~at.first
@@ -124,7 +115,7 @@ class PacketLoss(Fault):
             return held, held
         # On average: the derivative of the probability with which the older value is used.
         expected = held + (memory - good) * at.number["loss"]
-        constant = (memory - good) * _still(at.number["loss"])
+        constant = (memory - good) * jax.lax.stop_gradient(at.number["loss"])
         return straight(held, expected - constant), held
 
 
@@ -196,7 +187,8 @@ class Quantisation(Fault):
         if at.xp is np:
             return rounded, memory
         # Rounding has no slope: the value is followed, and the remainder grows with the step.
-        return straight(rounded, good + _still(at.xp.round(exact) - exact) * step), memory
+        left = jax.lax.stop_gradient(at.xp.round(exact) - exact)
+        return straight(rounded, good + left * step), memory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -271,7 +263,3 @@ def _late(good: Vector, line: Any, seconds: Any, at: Moment) -> tuple[Vector, An
     share = periods - left
     smooth = entry(line, left, xp) * (1 - share) + entry(line, left + 1, xp) * share
     return straight(whole, smooth), line
-
-
-def _still(value: Any) -> Any:
-    return jax.lax.stop_gradient(value)

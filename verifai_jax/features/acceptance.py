@@ -82,7 +82,7 @@ def acceptance_rate(
 
 
 def _entropy(seed: int | Key[Array, ""]) -> int | list[int]:
-    """Return the seed of NumPy's generator; that of a key are its words."""
+    """Return the seed of NumPy's generator; the words of a key are its seed."""
     if isinstance(seed, jax.Array) and jnp.issubdtype(seed.dtype, jax.dtypes.prng_key):
         return [int(word) for word in np.ravel(jax.random.key_data(seed))]
     return seed  # pyright: ignore[reportReturnType]

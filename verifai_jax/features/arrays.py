@@ -179,8 +179,8 @@ class VariableArray(Domain):
     """From `shortest` to `longest` values of one domain: `Array(domain, length=(1, 3))`.
 
     A value is an `Items`; a person may write a list of as many items as there are. The first
-    coordinate is the length, each equally likely (none if `shortest == longest`). In a table the
-    column `cars.length` holds the length; the entries of absent items are empty (NaN or None).
+    coordinate is the length, all equally likely (without it if `shortest == longest`). In a table
+    the column `cars.length` holds the length; the entries of absent items are empty (NaN or None).
     """
 
     domain: Domain

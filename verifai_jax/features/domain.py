@@ -14,16 +14,8 @@ import math
 from collections.abc import Iterable, Sequence
 from decimal import Decimal
 from fractions import Fraction
-from typing import (
-    Any,
-    ClassVar,
-    Literal,
-    NamedTuple,
-    Protocol,
-    TypeAlias,
-    TypeVar,
-    runtime_checkable,
-)
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import runtime_checkable as checkable
 
 import jax
 import jax.numpy as jnp
@@ -48,7 +40,7 @@ Numbers: TypeAlias = float | Sequence | np.generic | np.ndarray | jax.Array
 Value = TypeVar("Value")
 
 
-@runtime_checkable
+@checkable
 class Row(Protocol):
     """A row of a table: a mapping, or a row of pandas."""
 
@@ -282,7 +274,8 @@ class Domain(ForUsers, abc.ABC):
         return None
 
     def spans(self, duration: float) -> list[tuple[float, float]] | None:
-        """Return from when to when each control point acts, in seconds; None without any.
+        """Return the begin and the end of the time in which each control point acts, in seconds, or
+        None.
 
         **Arguments:**
 

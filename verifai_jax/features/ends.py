@@ -115,8 +115,8 @@ class _Ends(NamedTuple):
     """The ends of intervals in a precision.
 
     - `first`, `last`: the least and the greatest number within.
-    - `under`, `over`: the ends as they are rounded to single precision.
-    - `inside`: True where nothing can be rounded to a number outside.
+    - `under`, `over`: the ends rounded to single precision.
+    - `inside`: True where rounding cannot lead outside.
     """
 
     first: np.ndarray

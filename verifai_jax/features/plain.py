@@ -41,7 +41,7 @@ def to_plain(domain: Domain) -> dict[str, Any]:
         case Categorical():
             for choice in domain.choices:
                 if not isinstance(choice, bool | int | float | str | None):
-                    raise ValueError(f"the choice {choice!r} is no plain data")
+                    raise ValueError(f"the choice {choice!r} is not plain data")
             weights = None if domain.probabilities is None else list(domain.probabilities)
             return {"kind": "Categorical", "choices": list(domain.choices), "weights": weights}
         case Fixed():

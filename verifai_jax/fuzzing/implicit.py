@@ -54,8 +54,8 @@ class CheckedSystem(System):
     **Arguments:**
 
     - `system`: the system.
-    - `ranges`: the ranges of signals; what is not finite is replaced by the middle, as it is
-      reported anyway.
+    - `ranges`: the ranges of signals; numbers that are not finite are replaced by the middle, as
+      they are reported anyway.
     - `verdicts`: whether a simulation that raises, hangs or is not finite gets a trace that breaks
       a property, instead of a status without a verdict.
     - `cells`: the cells of signals, as given to `fuzz`; they are for the record of the run.

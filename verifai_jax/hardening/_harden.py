@@ -30,7 +30,7 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import reproducible_settings
 from verifai_jax.core.progress import say_done, shows_progress
 from verifai_jax.features import Categorical
-from verifai_jax.hardening.arms import Arms, FunctionArms, TaskArms
+from verifai_jax.hardening.arms import FunctionArms, TaskArms
 from verifai_jax.hardening.collecting import Collected, collect, end_if_interrupted
 from verifai_jax.hardening.mixture import CAPACITY, HardeningError, Mixture, Start, mixture_of
 from verifai_jax.hardening.result import BASELINE, HARDENED, Hardening
@@ -208,7 +208,7 @@ class Work:
         stages = [plan.steps + stage * plan.further_steps for stage in range(plan.rounds + 1)]
         trainer, space, named = study.trainer, untrained.space, self.arms_named
         self.task, self.stages = trainer.nominal, stages
-        self.arms: Arms
+        self.arms: TaskArms | FunctionArms
         if isinstance(trainer, FunctionTrainer):
             self.arms = FunctionArms(study, values, stages, plan.seed, cache, named)
         else:
@@ -250,7 +250,7 @@ class Work:
             attack_simulations=plan.attack_simulations, tie=plan.p, progress=False,
             remember=self.cache.remember,
         )  # fmt: skip
-        end_if_interrupted(certificates)
+        end_if_interrupted(certificates.stopped)
         for number, (arm, policy) in enumerate(zip(self.arms_named, policies, strict=True)):
             self.policies[arm, stage] = policy
             self.returns[arm, stage] = self._returns(number, stage, policy)
@@ -328,7 +328,7 @@ class Work:
                 confidence=plan.confidence, budget=16 * plan.samples,
                 seed=plan.seed_for(COMPARED), progress=False,
             )  # fmt: skip
-            end_if_interrupted(comparison)
+            end_if_interrupted(comparison.stopped)
             if comparison.regression:
                 notes.append(
                     "the paired comparison shows that the policy of round "
@@ -341,7 +341,7 @@ class Work:
             samples=4 * plan.samples, seed=plan.seed_for(FINAL), attack_simulations=0,
             tie=plan.p, progress=False, remember=self.cache.remember,
         )  # fmt: skip
-        end_if_interrupted(final)
+        end_if_interrupted(final.stopped)
         return Hardening(
             problem=self.untrained.name,
             table=pd.DataFrame(self.rows),

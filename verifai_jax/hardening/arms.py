@@ -10,7 +10,7 @@ take the same number of environment steps, wherever an episode begins.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -26,18 +26,6 @@ from verifai_jax.sweeps.training_runs import RunCheckpoint
 
 STARTS = 4096
 """Episodes that a function gets to train on: enough that each of 256 neighbourhoods has some."""
-
-
-class Arms(Protocol):
-    """Trainings that differ in where their episodes begin."""
-
-    def mix(self, stage: int, mixtures: Sequence[Mixture]) -> None:
-        """Say, for each arm, what the episodes are drawn from on the way to a stage."""
-        ...
-
-    def policies(self, stage: int) -> list[Any]:
-        """Return the policy of each arm at a stage, trained if it is not cached."""
-        ...
 
 
 class TaskArms:
@@ -63,9 +51,11 @@ class TaskArms:
         self._reached = -1
 
     def mix(self, stage: int, mixtures: Sequence[Mixture]) -> None:
+        """Say, for each arm, what the episodes are drawn from on the way to a stage."""
         self._mixes[stage] = mixtures
 
     def policies(self, stage: int) -> list[Any]:
+        """Return the policy of each arm at a stage, trained if it is not cached."""
         names = [f"training/{stage}/{arm}" for arm in self.names]
         stored = [self._cache.get(name) for name in names]
         if any(arrays is None for arrays in stored):
@@ -113,6 +103,7 @@ class FunctionArms:
             self._runs.runs[number] = replace(run, key=f"{run.key}-{arm}")
 
     def mix(self, stage: int, mixtures: Sequence[Mixture]) -> None:
+        """Draw, for each arm, the episodes on the way to a stage."""
         for number, mixture in enumerate(mixtures):
             key = jax.random.fold_in(jax.random.key(self._seed), stage)
             own, points = jax.vmap(mixture.episode)(*jax.random.split(key, (2, STARTS)))
@@ -123,6 +114,7 @@ class FunctionArms:
             ]
 
     def policies(self, stage: int) -> list[Any]:
+        """Return the policy of each arm at a stage, trained if it is not cached."""
         numbers = range(len(self._runs.runs))
         self._runs.train(numbers, stage, further=True)
         for error in self._runs.errors.values():

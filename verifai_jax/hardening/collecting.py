@@ -10,7 +10,7 @@ first: they fail as often as the policy does, where the attack's are of the wors
 one that no policy can master.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -79,7 +79,7 @@ def collect(
     sampled = np.asarray(space.points_at(space.sample(jax.random.key(seed), table)))
     tried = np.concatenate([earlier, sampled, space.points(failing.iloc[spread])])
     run = falsify(problem, PointList(tried), len(tried), seed=seed, progress=False)
-    end_if_interrupted(run)
+    end_if_interrupted(run.stopped)
     simulations, confirmed = run.simulations, run.table.counterexamples
     if shrunk and len(confirmed):
         worst = np.linspace(0, len(confirmed) - 1, shrunk).astype(int)
@@ -88,7 +88,7 @@ def collect(
                 small = shrink(run, int(row), budget=SHRINKING, others=False, progress=False)
             except ValueError:
                 continue  # No nominal features, or a failure of its own random key alone.
-            end_if_interrupted(small)
+            end_if_interrupted(small.stopped)
             add(small.u[None], "shrunk")
             simulations += small.simulations
     if len(confirmed):
@@ -111,12 +111,7 @@ def collect(
     return Collected(np.concatenate(points), np.array(sources, np.str_), kept, simulations)
 
 
-class _Stopped(Protocol):
-    @property
-    def stopped(self) -> str | None: ...
-
-
-def end_if_interrupted(result: _Stopped) -> None:
+def end_if_interrupted(stopped: str | None) -> None:
     """Raise again the Ctrl-C that a result ended early by: part of it is no round's number."""
-    if result.stopped == "interrupted":
+    if stopped == "interrupted":
         raise KeyboardInterrupt

@@ -81,7 +81,7 @@ class Distance(NamedTuple):
 
 
 class _Follows(abc.ABC, Generic[Said]):
-    """A monitor that says something of rows of numbers, and so of runs and of their samples."""
+    """A monitor that judges rows of numbers, and so runs and their samples."""
 
     _columns: "_Columns"
 
@@ -95,7 +95,7 @@ class _Follows(abc.ABC, Generic[Said]):
 
 @dataclass(frozen=True)
 class PredictiveMonitor(_Follows[Forecast]):
-    """Foretells violations; made by `predictive_monitor`.
+    """A monitor that predicts violations; made by `predictive_monitor`.
 
     - `horizon`: seconds that it looks ahead.
     - `slack`: by how much a prediction is too high in at most a share `alpha` of runs.
@@ -136,7 +136,7 @@ def predictive_monitor(
     model: Model | None = None,
     seed: int = 0,
 ) -> PredictiveMonitor:
-    """Learn to foretell a violation of a requirement within the next seconds.
+    """Learn to predict a violation of a requirement within the next seconds.
 
     **Arguments:**
 
@@ -187,7 +187,7 @@ def _quadratic() -> Any:
 
 @dataclass(frozen=True)
 class DomainMonitor(_Follows[Distance]):
-    """Tells inputs that are unlike all that was tested; made by `domain_monitor`.
+    """A monitor that recognises inputs unlike all tested ones; made by `domain_monitor`.
 
     - `reach`: distance beyond which it raises an alarm.
     """
@@ -221,7 +221,7 @@ def domain_monitor(
     lags: Sequence[int] = (0,),
     seed: int = 0,
 ) -> DomainMonitor:
-    """Learn which samples were tested, to tell later ones that are unlike any of them.
+    """Learn which samples were tested, to recognise later ones that are unlike them.
 
     **Arguments:**
 

@@ -104,7 +104,7 @@ def _vectors(source: str, name: str, column: Any) -> np.ndarray:
         for entry in cell:
             if entry is not None and not isinstance(entry, bool | int | float):
                 raise ValueError(
-                    f"column {name!r} of {source} holds lists that are no vectors of numbers; in "
+                    f"column {name!r} of {source} holds lists that are not vectors of numbers; in "
                     f"row {row} there is {_brief(entry)}"
                 )
     truths = any(isinstance(entry, bool) for cell in rows for entry in cell)

@@ -30,7 +30,7 @@ def leaves_of(formulas: Sequence[Formula]) -> tuple[Formula, ...]:
 def deciding_instant(
     formulas: Sequence[Formula], trace: Trace, end: End = "hold"
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """Find what decides the least robustness of formulas on one trace.
+    """Find the predicate and the instant that decide the least robustness of formulas on one trace.
 
     **Arguments:**
 

@@ -264,8 +264,8 @@ def dense_gradient(
 ) -> dict[str, float]:
     """Compute the slope of the robustness in each parameter `?name`, ends of intervals included.
 
-    Between samples the robustness is piecewise linear in times, which it is not at the samples, so
-    a quotient of differences is the slope; where it has a kink, the mean of both sides.
+    Between samples the robustness is piecewise linear in the times of intervals, so a quotient of
+    differences is the slope; at a kink it is the mean of both sides.
 
     **Arguments:**
 

@@ -182,7 +182,7 @@ def explain_error(error: Exception, text: str) -> FormulaSyntaxError:
         width, found = 1, f"{text[position]!r}"
     if found == "'='":
         return FormulaSyntaxError(
-            "'=' is no comparison: write == for equal, >= or <=", text, position
+            "'=' is not a comparison: write == for equal, >= or <=", text, position
         )
     if found == "')'" and text[:position].count("(") == text[:position].count(")"):
         return FormulaSyntaxError("there is no '(' for this ')'", text, position)

@@ -1,4 +1,4 @@
-"""Suspicious formulas: whether they say what somebody means.
+"""Checks for formulas that may not say what their author means.
 
     found = lint("always (speed > 120 -> eventually[0, 5] brake > 0)", ["drive-1.csv"])
     print(found)                    # the left side never holds in the recording; ...
@@ -49,7 +49,7 @@ def lint(
     units: Mapping[str, str] | None = None,
     end: End = "hold",
 ) -> Findings:
-    """Find what is suspicious about formulas: whether they say what somebody means.
+    """Find parts of formulas that may not say what their author means.
 
     **Arguments:**
 

@@ -68,7 +68,7 @@ class PythonMachine:
         return out
 
     def ahead(self, steps: int, leaf: float | None) -> np.ndarray:
-        """Return what further steps would give `[steps, formulas]`; the state stays.
+        """Return the results `[steps, formulas]` of further steps without changing the state.
 
         **Arguments:**
 
@@ -113,7 +113,7 @@ def _joins(sign: int) -> tuple[Join, Join]:
 
 
 def _first(op: Op, top: float) -> Memory:
-    """Return what an operation keeps before any sample; blocks come first, then what runs."""
+    """Return the memory of an operation before any sample: blocks first, then running values."""
     top *= op.sign
     return {
         "delay": [op.number] * op.n + [0], "window": [-top] * op.n + [0, -top],
@@ -228,7 +228,7 @@ _STEPS: dict[str, Callable[..., float]] = {
 def _counted(
     count: Count, machine: PythonMachine, columns: Sequence[int]
 ) -> Callable[[Sequence[float]], float]:
-    """Return what counts the seconds in which a formula held, sample by sample."""
+    """Return the function that counts the seconds in which a formula held, sample by sample."""
     last = deque([-1.0] * count.n, maxlen=count.n)
     held = unknown = 0
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Simulated(Protocol):
-    """A problem, which is of a room above this one: its traces are those of simulations."""
+    """A problem (of a room above this one), whose traces are those of simulations."""
 
     name: str
     formulas: Mapping[str, Formula]

@@ -264,7 +264,7 @@ def _file_tables(path: Path, time: str, episode: int | None) -> list[Table]:
         return readers[ending]()
     except UnicodeDecodeError as error:
         raise ValueError(
-            f"{path} cannot be read: the names of its columns are no UTF-8 ({error}); save it as "
+            f"{path} cannot be read: the names of its columns are not UTF-8 ({error}); save it as "
             "UTF-8"
         ) from None
     except (pyarrow.ArrowInvalid, OSError) as error:

@@ -1,4 +1,4 @@
-"""A file of requirements: what people demand, with the formulas that stand for it.
+"""Files of requirements: demands in words, with formulas.
 
     read_requirements("requirements.toml")              # tables [[requirement]]
     read_requirements("requirements.yaml")              # a list `requirements`
@@ -46,7 +46,7 @@ FIELDS: tuple[str, ...] = (
 
 @dataclass(frozen=True)
 class Requirement:
-    """A demand with an identifier, and the formula that stands for it.
+    """A demand with an identifier, and its formula.
 
     - `id`: by which tables and reports name it.
     - `formula`: what is required; None if a problem has the formula, or if it is not written yet.
@@ -196,7 +196,7 @@ def _tables(
         text = path.read_text(encoding="utf-8")
         whole: object = tomllib.loads(text) if kind == "TOML" else read_yaml(text)
     except ValueError as error:
-        raise ValueError(f"{path} is no {kind}: {error}") from None
+        raise ValueError(f"{path} is not {kind}: {error}") from None
     if not isinstance(whole, dict):
         raise ValueError(f"{path} must have a list `requirements`; got {type(whole).__name__}")
     listed = "requirements" if "requirements" in whole else "requirement"
@@ -265,7 +265,7 @@ def read_reqif(path: Path, fields: Sequence[str]) -> list[dict[str, object]]:
     """
     root = read_xml(path.read_bytes(), str(path))
     if _tag(root) != "REQ-IF":
-        raise ValueError(f"{path} is no ReqIF: its first element is {_tag(root)}, not REQ-IF")
+        raise ValueError(f"{path} is not ReqIF: its first element is {_tag(root)}, not REQ-IF")
     names = {
         str(each.get("IDENTIFIER")): _field(each.get("LONG-NAME", ""))
         for each in root.iter()

@@ -1,4 +1,4 @@
-"""Recordings on an even clock, with nothing of them passed over.
+"""Recordings on an even clock that keep every recorded sample.
 
 resample(Trace({"x": xs}, times=ts), dt=0.1, method="hold")
 

@@ -39,7 +39,7 @@ def missing_case(walk: str, node: object) -> MissingCaseError:
 
 
 class Node(ForUsers):
-    """A node that is equal to another of the same kind with equal fields."""
+    """A node of a tree, which is compared by its kind and its fields."""
 
     _internal = frozenset((
         "asked", "below", "children", "compared", "depth", "first_look_ahead", "interval",
@@ -245,7 +245,8 @@ class Tree(Node):
         return max([latest, *below])
 
     def asked(self, dt: float = 0.0) -> dict["Tree", tuple[float, float]]:
-        """Return from when to when each part is asked if it is asked at 0 itself, in seconds.
+        """Return the interval of time in which each part is evaluated if the whole is at 0, in
+        seconds.
 
         **Arguments:**
 
@@ -292,7 +293,8 @@ class Tree(Node):
         return "" if self.timeless else self.operator.side
 
     def span(self, dt: float) -> tuple[float, float]:
-        """Return the first and the last second from an instant on at which its operator looks.
+        """Return the first and the last second, relative to an instant, at which its operator
+        looks.
 
         **Arguments:**
 

@@ -49,7 +49,7 @@ COMPARISONS = {
 
 @dataclass(frozen=True)
 class Operator:
-    """All that is known of an operator but its meaning, which its node in `formula` has.
+    """The description of an operator; its meaning is that of its node in `formula`.
 
     - `words`: the words and symbols that are read as it, the one that names it first.
     - `latex`: symbol in LaTeX.
@@ -58,8 +58,8 @@ class Operator:
     - `side`: where it looks from an instant on, or nothing for a Boolean connective.
     - `timed`: whether it takes an interval.
     - `symbol`: what is printed instead of the first word.
-    - `dual`: word of the operator by whose help a negation moves inwards, as in `!always f`, which
-      is `eventually !f`; nothing where no node is the dual.
+    - `dual`: the operator to which a negation turns it when it moves inwards: `!always f` is
+      `eventually !f`; empty without a dual node.
     """
 
     words: tuple[str, ...]

@@ -218,7 +218,7 @@ def load_detector(path: str | Path) -> Detector:
         if isinstance(error, DetectorFileError):
             raise
         raise DetectorFileError(
-            f"{path} is no detector that save_detector wrote: {error}"
+            f"{path} is not a detector that save_detector wrote: {error}"
         ) from error
 
 

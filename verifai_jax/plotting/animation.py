@@ -53,7 +53,7 @@ def animate(
     size: Sequence[int] | None = None,
     fps: float | None = None,
 ) -> Animation:
-    """Draw a simulation as a GIF, in real time where it has not too many frames.
+    """Draw a simulation as a GIF, in real time unless it has too many frames.
 
     The problem's `draw(axes, trace, sample, features)` draws one frame. Without it, MuJoCo draws a
     system that has a MuJoCo model (`vj.mujoco`, `vj.brax`), and an environment of Gymnasium draws
@@ -69,7 +69,7 @@ def animate(
     - `fps`: frames a second; chosen when left out.
 
     **Raises:** `ValueError` for any other problem without `draw`, for a path that does not end in
-    `.gif`, a camera where there is no MuJoCo model, and sizes that are none; `UnknownNameError` for
+    `.gif`, a camera without a MuJoCo model, and invalid sizes; `UnknownNameError` for
     a camera that the model lacks; `mujoco_scene.NoRenderer` where MuJoCo cannot draw.
     """
     _check_gif(path)

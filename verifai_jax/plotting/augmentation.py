@@ -77,12 +77,12 @@ def plot_montage(
 
     - `result`: the result.
     - `path`: file that the picture is written to, if given.
-    - `arm`, `seed`: which arm of which seed.
+    - `arm`, `seed`: the arm, and the seed of its training.
     - `count`: images at most.
 
     **Returns:** the figure.
 
-    **Raises:** `ValueError` for inputs that are no images, or an arm that added nothing.
+    **Raises:** `ValueError` for inputs that are not images, or an arm that added nothing.
     """
     check_count("count", count)
     examples = result.examples(arm, seed)

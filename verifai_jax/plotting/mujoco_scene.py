@@ -247,8 +247,8 @@ def _arrows(motion: Motion, data: Any, sample: int) -> list[tuple[np.ndarray, np
 def _gl() -> Any:
     """Return the class of OpenGL contexts to draw with.
 
-    MuJoCo chooses one when it is imported, for a screen unless `MUJOCO_GL` says otherwise. By now
-    it is imported, so where there is no screen its EGL is taken directly.
+    MuJoCo chooses one when it is imported: for a screen, unless `MUJOCO_GL` names another. It is
+    already imported here, so without a screen its EGL class is used directly.
     """
     screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if sys.platform == "linux" and not os.environ.get("MUJOCO_GL") and not screen:

@@ -72,15 +72,15 @@ def policy(
       size of one with `stack=`.
     - `normalise`: how observations are scaled first: the file of `VecNormalize.save`, or
       `(mean, scale)`.
-    - `action`: what the outputs mean, where the file does not say it: `"argmax"`; `"clip"`,
+    - `action`: the meaning of the outputs, if the file does not state it: `"argmax"`; `"clip"`,
       `"scale"` or `"tanh"` with `low=` and `high=`; `"positive"`; `"outputs"` (default).
     - `low`, `high`: bounds of the action.
-    - `activation`: the activation of an MLP, after each of its layers but the last.
+    - `activation`: the activation of an MLP, after every layer except the last.
     - `network(weights, observation) -> outputs`: of other weights; `weights` by their names.
     - `layers`: names of the layers of an MLP, in order; otherwise in the order of their names.
     - `output`: the output of an ONNX graph with several outputs, the one that is the action.
-    - `memory`: the memory of an ONNX graph, `{input: output}` of what it remembers; found by its
-      shapes where None.
+    - `memory`: the memory of an ONNX graph, `{input: output}` of its recurrent values; by default
+      found by their shapes.
     - `stack`: observations that the policy sees at once, the newest last.
     - `batched`: a Python function takes a batch of observations.
 
@@ -88,7 +88,7 @@ def policy(
     the `rl.Policy` of an `.npz`.
 
     **Raises:** `FileNotFoundError`; `PolicyError` for a file that is damaged or not supported, and
-    for options that it does not need. Nothing of a file is executed.
+    for unused options. Nothing in a file is executed.
     """
     check_count("stack", stack)
     if isinstance(source, Policy | OwnPolicy):

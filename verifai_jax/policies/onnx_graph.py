@@ -198,10 +198,10 @@ def read_onnx(
         )
     except Exception as error:
         raise PolicyError(
-            f"{what} is no model of ONNX, or a damaged one: {one_line(str(error))}"
+            f"{what} is not an ONNX model, or is damaged: {one_line(str(error))}"
         ) from error
     if not graph.output or not opset:
-        raise PolicyError(f"{what} is no model of ONNX: it has no outputs, or names no operators")
+        raise PolicyError(f"{what} is not an ONNX model: it has no outputs, or names no operators")
     arrays = {t.name: _tensor(t, path, what) for t in graph.initializer}
     fed = [i for i in graph.input if i.name not in arrays]
     nodes = _nodes(graph, opset, {*arrays, *(i.name for i in fed)}, path, what)
@@ -256,7 +256,7 @@ def read_graph(
         start = tuple(jnp.asarray(arrays[one]) for one, _ in memory) or None
         output = str(data["output"])
     except Exception as error:
-        raise PolicyError(f"{what} is damaged: its graph is none ({error!r})") from error
+        raise PolicyError(f"{what} is damaged: its graph is not valid ({error!r})") from error
     rest = {n: a for n, a in arrays.items() if n not in dict(memory)}
     for name, array in arrays.items():
         if array.dtype.kind not in "fiub" or np.any(np.isnan(array)):
@@ -363,7 +363,7 @@ def _external(tensor: Any, path: Path | None) -> np.ndarray:
     said = {entry.key: entry.value for entry in tensor.external_data}
     name = said.get("location", "")
     if path is None or not name or Path(name).name != name:
-        raise ValueError(f"it is kept in {name!r}, which is no file beside the model")
+        raise ValueError(f"it is kept in {name!r}, which is not a file next to the model")
     dtype = package.helper.tensor_dtype_to_np_dtype(tensor.data_type)
     count = int(np.prod(tensor.dims, dtype=object)) * dtype.itemsize
     offset, length = int(said.get("offset", 0)), int(said.get("length", count))

@@ -44,7 +44,7 @@ def read_sb3(data: bytes, what: str) -> Policy:
     archive = open_archive(data, what)
     if "data" not in archive.namelist() or "policy.pth" not in archive.namelist():
         raise PolicyError(
-            f"{what} is no model of Stable-Baselines3: it has no data and policy.pth. Name an "
+            f"{what} is not a model of Stable-Baselines3: it has no data and policy.pth. Name an "
             "archive of torch.save .pt"
         )
     try:
@@ -68,7 +68,7 @@ def read_normaliser(data: bytes, what: str) -> Normaliser:
     record = read_pickle(data, what)
     state = record.state if isinstance(record, Record) else None
     if not isinstance(state, Mapping) or "obs_rms" not in state:
-        raise PolicyError(f"{what} is no file of VecNormalize.save: it has no obs_rms")
+        raise PolicyError(f"{what} is not a file of VecNormalize.save: it has no obs_rms")
     statistics = state["obs_rms"]
     values = statistics.state if isinstance(statistics, Record) else None
     if not isinstance(values, Mapping):
@@ -79,7 +79,7 @@ def read_normaliser(data: bytes, what: str) -> Normaliser:
     epsilon, clip = (_number(state.get(name), name, what) for name in ("epsilon", "clip_obs"))
     scale = np.sqrt(np.asarray(variance, float) + epsilon)
     if not np.all(np.isfinite(mean)) or not np.all(scale > 0):
-        raise PolicyError(f"{what} has a mean or variance that is no scale")
+        raise PolicyError(f"{what} has a mean or variance that cannot be a scale")
     return Normaliser(jnp.asarray(mean, np.float32), jnp.asarray(scale, np.float32), clip)
 
 
@@ -88,7 +88,7 @@ def _number(value: object, name: str, what: str) -> float:
     try:
         return float(value)  # pyright: ignore[reportArgumentType]
     except (TypeError, ValueError):
-        raise PolicyError(f"{what} is damaged: its {name} is no number") from None
+        raise PolicyError(f"{what} is damaged: its {name} is not a number") from None
 
 
 def _unpickled(entry: Any, what: str) -> Any:

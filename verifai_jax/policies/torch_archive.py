@@ -40,7 +40,7 @@ def open_archive(data: bytes, what: str) -> zipfile.ZipFile:
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
     except Exception as error:
-        raise PolicyError(f"{what} is no archive, or a damaged one: {error}") from error
+        raise PolicyError(f"{what} is not an archive, or is damaged: {error}") from error
     size = sum(entry.file_size for entry in archive.infolist())
     if size > MAX_BYTES:
         raise PolicyError(
@@ -76,7 +76,7 @@ def read_state(data: bytes, what: str) -> dict[str, np.ndarray]:
     archive = open_archive(data, what)
     pickles = [n for n in archive.namelist() if n.rpartition("/")[2] == "data.pkl"]
     if len(pickles) != 1:
-        raise PolicyError(f"{what} is no file of torch.save: it has no data.pkl")
+        raise PolicyError(f"{what} is not a file of torch.save: it has no data.pkl")
     folder = pickles[0].rpartition("/")[0]
     content = read_pickle(read_member(archive, pickles[0], what), what)
     found: dict[str, np.ndarray] = {}

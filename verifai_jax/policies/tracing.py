@@ -118,7 +118,7 @@ class _Translation:
         self.arrays, self.nodes = arrays, list[Node]()
 
     def name(self, value: Value) -> str:
-        """Return the name of a value, of a known array that of a constant with its content."""
+        """Return the name of a value; for a known array, that of the constant with its content."""
         if isinstance(value, str):
             return value
         array = np.asarray(value)

@@ -242,14 +242,14 @@ class Problem(InNotebook):
         **Arguments:**
 
         - `faults`: the faults of `vj.faults`, in the order in which those of one channel apply.
-          What varies of each is a feature under its name, whose nominal value is the weakest,
-          shortest and latest fault.
+          The numbers of a fault that vary are a feature with the name of the fault; its nominal
+          value is the weakest, shortest and latest fault.
         - `by_simulator`: whether the simulator applies them itself, as `vj.faults.on_host` helps
           it to; for `remote`, and for a `blackbox` of one's own.
 
         **Raises:** `UnknownNameError` for a channel that the system does not have, with the nearest
         one; `ValueError` for a name that exists already, a fault that a channel cannot have, and
-        for a system without a loop that is known.
+        a system whose loop is not known.
         """
         function = lazy_import("verifai_jax.faults.injection", "with_faults")
         return function(self, faults, by_simulator)

@@ -1,7 +1,7 @@
 """The report on a failure table: what each fault does, how probable that is, and its replay."""
 
 from verifai_jax.core.text import format_percent, format_seconds
-from verifai_jax.failure_table.result import Effect, FailureTable, severity_text
+from verifai_jax.failure_table.result import Effect, FailureTable
 from verifai_jax.problem.problem import Problem
 from verifai_jax.reports.claims import Claim, claims_json
 from verifai_jax.reports.markup import bullets, paragraph, picture, preformatted, table
@@ -51,7 +51,7 @@ def failure_table_page(found: FailureTable, about: About, problem: Problem | Non
              "high", "verdict"]  # fmt: skip
     rows = [
         (
-            each.name, severity_text(each), each.broken,
+            each.name, each.severity_text, each.broken,
             format_seconds(each.delay, 3) if each.broken else "", each.shown_by,
             f"{each.probability:z.2g}", f"{each.low:z.2g}", f"{each.high:z.2g}",
             each.verdict or "no failure found",

@@ -94,7 +94,7 @@ def failures(run: Run, studies: Studies, about: About) -> Section:
         return Section(
             "failures",
             "Failures",
-            (paragraph("The run claims no failure, so that there is none to show."),),
+            (paragraph("The run claims no failure, so there is none to show."),),
         )
     claimed = run.table.counts.claimed
     more = f" Of {claimed:,} failures {len(shown)} are shown." if claimed > len(shown) else ""

@@ -49,7 +49,7 @@ def read_result(
     commands = {"estimate": _estimate, "compare": lambda each: _comparison(each, space)}
     if not isinstance(data, dict) or data.get("command") not in commands:
         raise ValueError(
-            f"{file} is no result of verifai-jax estimate --json or verifai-jax compare --json"
+            f"{file} is not a result of verifai-jax estimate --json or verifai-jax compare --json"
         )
     try:
         return commands[data["command"]](data)

@@ -112,8 +112,8 @@ def sweep_page(sweep: Sweep, about: About) -> Page:
             (
                 bullets(
                     [
-                        "High return is no safety: a policy without the verdict safe is not shown "
-                        "to be safe.",
+                        "A high return is not safety: a policy without the verdict safe is not "
+                        "shown to be safe.",
                         f"{len(statuses):,} policies did not end properly.",
                         *([] if record.complete else ["The sweep was cut off before its end."]),
                         "An attack finds counterexamples and enters no interval.",

@@ -357,7 +357,7 @@ def _read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             arrays = {name: file[name] for name in file.files}
         about = json.loads(str(arrays.pop("about")))
         if not isinstance(about, dict):
-            raise ValueError("what it says about itself is no object")
+            raise ValueError("its description of itself is not an object")
         return arrays, about
     except FileNotFoundError:
         raise

@@ -100,11 +100,11 @@ def scenic(
 def _soft_domains(
     domains: Mapping[str, Domain], constraint: Constraint, sampling: Sampling
 ) -> dict[str, Domain]:
-    """Return the features of soft requirements, weighted so that each is on with Scenic's share.
+    """Return the features of soft requirements, weighted so that each is on as often as in Scenic.
 
-    Scenic switches them once a scene, before it refuses anything. Where a point with its switches
-    is refused as a whole, a requirement that is on would come too rarely: its weight makes up for
-    it. The weights are fitted on samples (iterative proportional fitting of the switches).
+    Scenic switches them once a scene, before it refuses anything. Here a point is refused together
+    with its switches, so a requirement that is on would come too rarely; its weight corrects that.
+    The weights are fitted on samples (iterative proportional fitting of the switches).
     """
     names = list(sampling.soft)
     even = {**domains, **{name: Categorical(False, True) for name in names}}

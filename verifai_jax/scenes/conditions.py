@@ -177,7 +177,7 @@ class _Evaluation:
             region = region.region
         polygonal = hasattr(region, "polygons") and not is_random(region)
         if region is None or not polygonal:
-            raise Unsupported("containment in a region that is no fixed polygon")
+            raise Unsupported("containment in a region that is not a fixed polygon")
         if isinstance(thing, Body) and "width" in thing.names:
             box = rectangle_of(thing)
             return box_inside(box, edges_of(region.polygons), is_convex(region.polygons))
@@ -242,7 +242,7 @@ def _compared(op: ast.AST, one: Any, other: Any) -> Any:
         return held if isinstance(op, ast.Eq) else _not(held)
     for value in (one, other):
         if isinstance(value, Yaw | Vec | Body | Choice | tuple | str) or value is None:
-            raise Unsupported("a comparison of what is no number in a requirement")
+            raise Unsupported("a comparison of something other than numbers in a requirement")
     return OPERATORS[type(op)](one, other)
 
 

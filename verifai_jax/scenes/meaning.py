@@ -299,4 +299,4 @@ def as_output(value: Any) -> Any:
         return float(value)
     if is_number(value):
         return value
-    raise Unsupported(f"a value that is no number ({type(value).__name__})")
+    raise Unsupported(f"a value that is not a number ({type(value).__name__})")

@@ -203,7 +203,7 @@ def _contained(requirement: Any) -> Check:
         *("PolygonalFootprintRegion", "PolygonalRegion", "RectangularRegion"),
         *("CircularRegion", "SectorRegion"),
     ):
-        raise Unsupported(f"a container that is no fixed polygon ({kind_of(container)})")
+        raise Unsupported(f"a container that is not a fixed polygon ({kind_of(container)})")
     edges, convex = edges_of(polygons), is_convex(polygons)
     if len(edges) > 2000:
         raise Unsupported(f"a container of {len(edges)} edges")

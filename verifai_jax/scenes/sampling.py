@@ -195,7 +195,7 @@ class Sampling:
         return region.orient(vectors.Vector(x, y, region.z))
 
     def refusal(self, values: Any, features: Mapping[str, Any]) -> str | None:
-        """Return why Scenic's own checker refuses a scene; None if it accepts it."""
+        """Return the reason why Scenic's own checker refuses a scene; None for an accepted one."""
         with LOCK, _seeded_generators(0):
             self.activate(features)
             return self.scenario.checker.checkRequirements(values)

@@ -69,15 +69,8 @@ def anytime_interval(
     n = simulations
 
     def border(k: int, end: float) -> float:
-        mixture = (
-            math.lgamma(k + 0.5) + math.lgamma(n - k + 0.5) - math.lgamma(n + 1) - math.log(math.pi)
-        )
-        limit = mixture + math.log(1 - confidence)
-        return _border(
-            k / n,
-            end,
-            lambda rate: _log_power(rate, k) + _log_power(1 - rate, n - k) >= limit,
-        )
+        limit = log_mixture(k, n) + math.log(1 - confidence)
+        return _border(k / n, end, lambda rate: float(log_likelihood(k, n, rate)) >= limit)
 
     low, high = border(failures, 0.0), border(failures + undecided, 1.0)
     return Rate(failures, n, low, high, confidence, at_any_time=True, undecided=undecided)
@@ -142,7 +135,7 @@ def evidence_below(failures: Counts, simulations: Counts, rate: Counts) -> Float
 
     k, n, q = (np.asarray(value, np.float64) for value in (failures, simulations, rate))
     with np.errstate(divide="ignore", invalid="ignore"):
-        null = _log_likelihood(k, n, q)
+        null = log_likelihood(k, n, q)
         part = np.log(betainc(k + 0.5, n - k + 1, q)) + betaln(k + 0.5, n - k + 1)
         spread = math.log(1 - ATOM) + part - np.log(2 * np.sqrt(q))
         atom = np.where(k == 0, math.log(ATOM), -np.inf)
@@ -165,7 +158,7 @@ def evidence_above(failures: Counts, simulations: Counts, rate: Counts) -> Float
 
     k, n, q = (np.asarray(value, np.float64) for value in (failures, simulations, rate))
     with np.errstate(divide="ignore", invalid="ignore"):
-        null = _log_likelihood(k, n, q)
+        null = log_likelihood(k, n, q)
         part = np.log(betaincc(k + 0.5, n - k + 0.5, q)) + betaln(k + 0.5, n - k + 0.5)
         whole = np.log(betaincc(0.5, 0.5, q)) + betaln(0.5, 0.5)
         evidence = part - whole - null
@@ -206,16 +199,13 @@ def _border(within: float, outside: float, inside: Callable[[float], bool]) -> f
     return outside
 
 
-def _log_power(base: float, exponent: int) -> float:
-    """Compute the logarithm of `base ** exponent`, for a base in [0, 1]."""
-    if exponent == 0:
-        return 0.0
-    return exponent * math.log(base) if base > 0 else -math.inf
+def log_mixture(k: int, n: int) -> float:
+    """Compute the logarithm of the likelihood, mixed over a Beta(1/2, 1/2) prior."""
+    half = math.lgamma(k + 0.5) + math.lgamma(n - k + 0.5) - math.lgamma(n + 1)
+    return half - math.log(math.pi)
 
 
-def _log_likelihood(
-    k: Float[np.ndarray, "*#n"], n: Float[np.ndarray, "*#n"], q: Float[np.ndarray, "*#n"]
-) -> Float[np.ndarray, "*n"] | np.float64:
+def log_likelihood(k: Counts, n: Counts, q: Counts) -> Float[np.ndarray, "*n"] | np.float64:
     """Compute the logarithm of the probability of one sequence with `k` failures."""
     from scipy.special import xlog1py, xlogy
 

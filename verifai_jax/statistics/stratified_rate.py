@@ -19,14 +19,17 @@ nuisance parameter, JASA 89, 1994).
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from verifai_jax.core.checks import check_fraction
 from verifai_jax.statistics.binomial import exact_interval
-from verifai_jax.statistics.confidence_sequences import anytime_interval
+from verifai_jax.statistics.confidence_sequences import (
+    anytime_interval,
+    log_likelihood,
+    log_mixture,
+)
 
 MAX_OUTCOMES = 50_000
 """Outcomes up to which all are enumerated, which takes about a second; where there are more, the
@@ -41,13 +44,6 @@ STEPS = 12
 """Halvings until an end of the interval is found."""
 SHARE_ERROR = 0.02
 """Part of the error that is spent on the share, where it is estimated as well."""
-
-
-class Stratum(NamedTuple):
-    """Trials of one stratum: `failures` and `trials`."""
-
-    failures: int
-    trials: int
 
 
 @dataclass(frozen=True)
@@ -112,21 +108,18 @@ def stratified_rate(
     share or a confidence out of range.
     """
     check_fraction("confidence", confidence)
-    counts = [Stratum(*first), Stratum(*second)]
-    for stratum, open_ones in zip(counts, undecided, strict=True):
-        if not 0 <= stratum.failures <= stratum.failures + open_ones <= stratum.trials:
+    counts = [first, second]
+    for (failed, trials), open_ones in zip(counts, undecided, strict=True):
+        if not 0 <= failed <= failed + open_ones <= trials:
             raise ValueError(
                 "a stratum needs 0 <= failures, and failures and undecided trials together at most "
-                f"its trials; got {stratum.failures}, {open_ones} and {stratum.trials}"
+                f"its trials; got {failed}, {open_ones} and {trials}"
             )
-    trials = counts[0].trials + counts[1].trials
+    trials = first[1] + second[1]
     if not trials:
         raise ValueError("a rate needs at least one trial; got none")
-    worst = [
-        Stratum(s.failures + open_ones, s.trials)
-        for s, open_ones in zip(counts, undecided, strict=True)
-    ]
-    failures, maximum = (sum(s.failures for s in some) for some in (counts, worst))
+    worst = [(k + open_ones, n) for (k, n), open_ones in zip(counts, undecided, strict=True)]
+    failures, maximum = (sum(k for k, _ in some) for some in (counts, worst))
     pooled = exact_interval(failures, maximum, trials, confidence)
     if at_any_time:
         rate = anytime_interval(failures, trials, confidence, maximum - failures)
@@ -139,9 +132,9 @@ def stratified_rate(
             _end([_Test(counts, s, error, allocated, at_any_time) for s in shares], -1),
             _end([_Test(worst, s, error, allocated, at_any_time) for s in shares], 1),
         )
-    known = [s.failures / max(s.trials - o, 1) for s, o in zip(counts, undecided, strict=True)]
+    known = [k / max(n - open_, 1) for (k, n), open_ in zip(counts, undecided, strict=True)]
     estimate = (1 - middle) * known[0] + middle * known[1]
-    if not all(s.trials for s in counts):
+    if not (first[1] and second[1]):
         estimate = failures / trials
     estimate = min(max(estimate, ends[0]), ends[1])
     return StratifiedRate(estimate, *ends, confidence, trials, pooled, at_any_time)
@@ -174,7 +167,7 @@ class _Test:
 
     def __init__(
         self,
-        observed: Sequence[Stratum],
+        observed: Sequence[tuple[int, int]],
         share: float,
         error: float,
         allocated: bool,
@@ -182,7 +175,7 @@ class _Test:
     ) -> None:
         self.observed, self.share, self.error = tuple(observed), share, error
         self.at_any_time = at_any_time
-        self.n = sum(stratum.trials for stratum in observed)
+        self.n = sum(trials for _, trials in observed)
         if at_any_time:
             return
         self.seconds = self._numbers(allocated)
@@ -195,7 +188,7 @@ class _Test:
         """Return the numbers of trials in the second stratum that might have come about."""
         from scipy.stats import binom
 
-        own = np.array([self.observed[1].trials])
+        own = np.array([self.observed[1][1]])
         self.chance = np.ones(1)
         ends = binom.ppf(LEFT_OUT, self.n, self.share), binom.isf(LEFT_OUT, self.n, self.share)
         numbers = np.arange(int(ends[0]), int(ends[1]) + 1)
@@ -244,7 +237,7 @@ class _Test:
         q1 = np.linspace(*self._range(rate), 4001)
         q0 = self._other(rate, q1)
         evidence = sum(
-            _jeffreys(*stratum) - _log_likelihood(*stratum, q)
+            log_mixture(*stratum) - log_likelihood(*stratum, q)
             for stratum, q in zip(self.observed, (q0, q1), strict=True)
         )
         return float(np.min(evidence))
@@ -290,19 +283,10 @@ class _Test:
         q1 = (low + high) / 2
         q0 = self._other(rate, q1)
         f0, f1 = k0 / np.maximum(n0, 1), k1 / np.maximum(n1, 1)
-        free = _log_likelihood(k0, n0, f0) + _log_likelihood(k1, n1, f1)
-        bound = _log_likelihood(k0, n0, q0) + _log_likelihood(k1, n1, q1)
+        free = log_likelihood(k0, n0, f0) + log_likelihood(k1, n1, f1)
+        bound = log_likelihood(k0, n0, q0) + log_likelihood(k1, n1, q1)
         root = np.sqrt(np.clip(2 * (free - bound), 0.0, 1e12))
         return np.sign((1 - self.share) * f0 + self.share * f1 - rate) * root
-
-
-Number = Int[np.ndarray, "*#n"] | int
-
-
-def _log_likelihood(k: Number, n: Number, q: Float[np.ndarray, "*#n"]) -> Float[np.ndarray, "*n"]:
-    from scipy.special import xlog1py, xlogy
-
-    return xlogy(k, q) + xlog1py(n - k, -q)
 
 
 def _binomial(n: int, q: Float[np.ndarray, " m"]) -> Float[np.ndarray, "n m"]:
@@ -311,10 +295,4 @@ def _binomial(n: int, q: Float[np.ndarray, " m"]) -> Float[np.ndarray, "n m"]:
 
     k = np.arange(n + 1)[:, None]
     ways = gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)
-    return np.exp(ways + _log_likelihood(k, n, q))
-
-
-def _jeffreys(k: int, n: int) -> float:
-    """Return the logarithm of the likelihood, mixed over a Beta(1/2, 1/2) prior."""
-    half = math.lgamma(k + 0.5) + math.lgamma(n - k + 0.5) - math.lgamma(n + 1)
-    return half - math.log(math.pi)
+    return np.exp(ways + log_likelihood(k, n, q))

@@ -61,7 +61,7 @@ class Cache:
         except (OSError, DamagedError) as error:
             raise CacheError(f"{self.path} cannot be read: {error}") from error
         if damaged and not self._log.names():
-            raise CacheError(f"{self.path} is no cache: it is a file of another kind, or damaged")
+            raise CacheError(f"{self.path} is not a cache: it is another kind of file, or damaged")
         if damaged:
             log.warning("%s is damaged: what cannot be read of it is computed anew", self.path)
 

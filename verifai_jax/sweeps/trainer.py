@@ -415,7 +415,7 @@ def _cast(present: object, value: object, name: str) -> object:
         return float(value)
     if isinstance(present, str | None):
         return value
-    raise ValueError(f"{name} is no single value and cannot be swept; it is {present!r}")
+    raise ValueError(f"{name} is not a single value and cannot be swept; it is {present!r}")
 
 
 def whole_number(value: object, name: str) -> int:

@@ -101,7 +101,7 @@ class FeatureParameters:
         check_names("parameter", names, domains)
         for name in names:
             if name not in varied:
-                raise ValueError(f"{name} does not vary, so it is no parameter to choose")
+                raise ValueError(f"{name} does not vary, so it cannot be chosen")
         self.problem = problem
         self.names = tuple(name for name in domains if name in names)
         sizes = [(name, domain.size) for name, domain in domains.items()]

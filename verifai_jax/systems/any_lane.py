@@ -1,4 +1,4 @@
-"""Work of a step that is left out where no lane of a batch needs it."""
+"""Work of a step that is skipped when no lane of a batch needs it."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, PyTree
 def in_any_lane(condition: Any) -> Any:
     """Return the condition, and in a batch whether it holds in any lane.
 
-    It is common to all lanes, so that what it decides stays a branch under `jax.vmap`.
+    All lanes share the result, so a branch on it stays a branch under `jax.vmap`.
     """
     return condition
 
@@ -26,13 +26,13 @@ def _(_: int, batched: Any, conditions: Any) -> tuple[Any, bool]:
 def changed_if_needed(
     change: Callable[..., Any], needed: Bool[Array, ""], value: PyTree, *others: PyTree
 ) -> Any:
-    """Return `change(value, *others)`, or `value` as it is where no lane of a batch needs it.
+    """Return `change(value, *others)`, or `value` unchanged where no lane of a batch needs it.
 
-    Where a lane needs no change, `change` has to return its value. Derivatives are those of
-    `change`, which may have one there.
+    In a lane that needs no change, `change` must return `value`. Derivatives are those of `change`,
+    also in such a lane.
     """
     if jax.default_backend() != "cpu":
-        # There the host would wait at each step to learn whether there is a pass.
+        # On an accelerator the host would wait at each step for the condition.
         return change(value, *others)
 
     @jax.custom_jvp

@@ -102,7 +102,7 @@ def trace_matrix(
             gaps.append(Gap("missing", "formula", each.id, text))
     for each in evidence:
         if each.problem not in names:
-            text = f"{each.name} is about {each.problem!r}, which is none of the problems"
+            text = f"{each.name} is about {each.problem!r}, which is not one of the problems"
             gaps.append(Gap("missing", "problem", each.name, text))
     order = {name: index for index, name in enumerate(demanded)}
     rows.sort(key=lambda row: order.get(row.requirement, len(order)))

@@ -22,6 +22,9 @@ REACH = 0.45
 """Where a box is sampled, as a share of its width from the middle: inside, not on its faces."""
 NO_INFLUENCE = 1e-6
 """Change of the robustness along a coordinate, as a share of the greatest, that is no influence."""
+APART = 4
+"""Coordinates along which a box without bounds is halved at once: those of its halves, which would
+have none either, would be looked at in vain."""
 CANDIDATES = 4096
 """Failing points that are confirmed when the budget is spent, those of the largest boxes first."""
 
@@ -99,14 +102,18 @@ class BranchAndBound:
         kept[rows[split]] = False
         for name in ("state", "lowest", "highest", "witness", "confirmed"):
             getattr(self.boxes, name)[rows] = getattr(some, name)
-        along, then = self.influence(some, robustness, moves, can)
-        halves = some[split].halves(along[split], self.enclosure)
-        # Halves of what has no bounds would have none either: another look would be in vain.
+        order, alike = self.influence(some, robustness, moves, can)
+        self.boxes = self.boxes[kept]
         wild = np.zeros(len(some), bool)
         wild[worth] = np.isinf(some.lowest[worth]) & np.isinf(some.highest[worth])
-        again = np.tile((wild & can[np.arange(len(some)), then] & (along != then))[split], 2)
-        quarters = halves[again].halves(np.tile(then[split], 2)[again], self.enclosure)
-        self.boxes = self.boxes[kept].with_more(halves[~again]).with_more(quarters)
+        for those, often in ((split & ~wild, 1), (split & wild, APART)):
+            parts, own = some[those], np.flatnonzero(those)
+            for k in range(min(often, order.shape[1])):
+                cut = alike[own, k]
+                halves = parts[cut].halves(order[own[cut], k], self.enclosure)
+                parts = parts[~cut].with_more(halves)
+                own = np.concatenate([own[~cut], own[cut], own[cut]])
+            self.boxes = self.boxes.with_more(parts)
 
     def star(self, some: Boxes) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
         """Simulate the middle of boxes, and both sides of it along each coordinate.
@@ -135,8 +142,8 @@ class BranchAndBound:
 
     def influence(
         self, some: Boxes, robustness: np.ndarray, moves: np.ndarray, can: np.ndarray
-    ) -> Int[np.ndarray, "2 n"]:
-        """Return the coordinate along which each box is to be split, and the next one.
+    ) -> tuple[Int[np.ndarray, "n dim"], Bool[np.ndarray, "n dim"]]:
+        """Return the coordinates of each box, the best to split first, and which are half as good.
 
         It is the one that changes the robustness most. As far as bounds are wider than what
         simulations see, it is the widest one that changes it at all, or one that moves the signals,
@@ -153,8 +160,10 @@ class BranchAndBound:
         width = _relative(some.high - some.low)
         score = (1 - loose) * (change + 0.1 * width)
         score += loose * (width * np.where(change > NO_INFLUENCE, 1.0, 0.1) + _relative(moves) / 2)
-        order = np.argsort(-np.where(can, score, -1.0), axis=1, kind="stable")
-        return order[:, [0, min(1, order.shape[1] - 1)]].T
+        score = np.where(can, score, -1.0)
+        order = np.argsort(-score, axis=1, kind="stable")
+        score = np.take_along_axis(score, order, axis=1)
+        return order, (score >= score[:, :1] / 2) & (score >= 0)
 
     def confirm(self) -> None:
         """Find out which failing points of open boxes fail for certain."""

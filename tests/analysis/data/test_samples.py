@@ -185,7 +185,7 @@ def test_a_float32_choice_is_the_choice():
     space = FeatureSpace({"dt": Categorical(0.1, 0.2)})
     frame = pd.DataFrame({"dt": np.array([0.2, 0.1], np.float32)})
     assert Samples.of(frame, space=space).codes()[:, 0].tolist() == [1, 0]
-    with pytest.raises(ValueError, match=r"'dt' holds 0.3, which is none of its choices 0.1, 0.2"):
+    with pytest.raises(ValueError, match=r"holds 0.3, which is not one of its choices 0.1, 0.2"):
         Samples.of(pd.DataFrame({"dt": [0.3]}), space=space).codes()
 
 

@@ -124,8 +124,11 @@ def test_a_handshake_that_waits_does_not_keep_the_server_busy():
             {"certificate": "none.pem"},
             "certificate must be a PEM file; there is no file 'none.pem'",
         ),
-        ({"certificate": HERE / "localhost.crt"}, "no certificate and its private key in PEM form"),
-        ({"certificate": __file__}, "no certificate and its private key in PEM form"),
+        (
+            {"certificate": HERE / "localhost.crt"},
+            "not a certificate and its private key",
+        ),
+        ({"certificate": __file__}, "not a certificate and its private key"),
         ({"private_key": HERE / "localhost.pem"}, "private_key belongs to a certificate"),
     ],
 )
@@ -136,4 +139,4 @@ def test_files_that_are_no_certificate_are_named(options, said):
 
 def test_a_file_that_is_no_certificate_is_named_to_a_client(capsys):
     assert remote_client.main(["--certificate", __file__, f"{__file__}:simulate"]) == 1
-    assert "is no certificate in a PEM file" in capsys.readouterr().err
+    assert "is not a certificate in a PEM file" in capsys.readouterr().err

@@ -52,7 +52,7 @@ class Column:
         if (codes == -2).any():
             stray = as_scalar(entries.iloc[int(np.argmax(codes == -2))])
             raise ValueError(
-                f"column {self.name!r} holds {stray!r}, which is none of its choices "
+                f"column {self.name!r} holds {stray!r}, which is not one of its choices "
                 f"{', '.join(map(repr, self.choices))}"
             )
         return codes

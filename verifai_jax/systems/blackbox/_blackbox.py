@@ -203,7 +203,7 @@ class VectorisedBlackBox(System):
 
     @property
     def exact_step(self) -> bool:
-        """True for a simulator that says that its step is part of the system."""
+        """True if the simulator declares its step to be part of the system."""
         return as_system(self.function).exact_step
 
     @property

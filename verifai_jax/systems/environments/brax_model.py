@@ -221,7 +221,7 @@ def with_finer_step(env: Env, factor: int | Int[Array, ""], name: str) -> Any:
         return other
     frames, backend = getattr(other, "_n_frames", None), getattr(other, "_backend", None)
     if frames is None or not hasattr(getattr(other, "sys", None), "opt"):
-        raise ValueError(f"{name} is no PipelineEnv of Brax, whose step is known")
+        raise ValueError(f"{name} is not a PipelineEnv of Brax, whose step is known")
     if backend not in ("generalized", "mjx"):
         raise ValueError(
             f"{name} on Brax's backend {backend!r}: its constraints are as stiff as its step makes "

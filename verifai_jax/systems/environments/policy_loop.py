@@ -163,7 +163,7 @@ class PolicyLoop(System):
             link.check(features)
 
     def why_error(self, features: Features) -> str | None:
-        """Say which delay or fault has a number that it may not have."""
+        """Return a message that names a delay or fault with an invalid number."""
         return first_refusal(self.links, features, self.name)
 
     def passing(self, features: Features) -> Passing:

@@ -92,18 +92,18 @@ class FMUSimulation:
                 moving[variable] = course
             else:
                 constant[variable] = float(value)
-        instance, about = self._instance(), self.description
+        instance, only_once = self._instance(), self.description.only_once
         try:
             trace = self._simulated(instance, constant, moving, features)
         except BaseException:
             # An instance that failed is in no state to be used again, nor to be given back.
             instance.failed = True
-            if not about.only_once:
+            if not only_once:
                 _instances.pop(self._key, None)
             raise
         # Some that ended their simulation still think so when they are reset.
-        doubtful = trace.valid is not None and not about.keeps_states
-        if not about.only_once and (doubtful or not self.reuse):
+        doubtful = trace.valid is not None and not instance.new_state
+        if not only_once and (doubtful or not self.reuse):
             _instances.pop(self._key).free()
         return trace
 

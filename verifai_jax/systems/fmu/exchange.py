@@ -46,7 +46,7 @@ class _EventInfo(Structure):
 class ExchangeInstance(Instance):
     """An instance of an FMU for model exchange; arguments and errors are those of `Instance`."""
 
-    _running = _prepared_for_states = False
+    _running = _sized = False
 
     def begin(self, values: Mapping[str, float], duration: float) -> None:
         """Set start values, and initialize; after an earlier simulation the instance is reset."""
@@ -54,7 +54,7 @@ class ExchangeInstance(Instance):
         super().begin(values, duration)
         self._running, self._ended = True, False
         self._inputs, self._time, self._longest = dict(values), 0.0, duration / MIN_STEPS
-        if not self._prepared_for_states:
+        if not self._sized:
             self._prepare(*self._sizes())
         self._solver: Any = self._integrator() if self._size else None
         self._settle()
@@ -76,7 +76,7 @@ class ExchangeInstance(Instance):
         self._get_indicators = self._prepared("GetEventIndicators", indicators, c_size_t(count))
         ask = (kind(True), byref(self._asks), byref(self._ends))
         self._complete = self._prepared("CompletedIntegratorStep", *ask)
-        self._prepared_for_states = True
+        self._sized = True
 
     def set(self, values: Mapping[str, float]) -> None:
         """Set variables by name; a change of an input is an event."""
@@ -105,10 +105,12 @@ class ExchangeInstance(Instance):
             if event or self._asks.value or self._time >= self._next:
                 events += 1
                 if events > MAX_EVENTS:
-                    raise self._chatters("events in a step of communication")
+                    raise self._stopped(
+                        f"has more than {MAX_EVENTS:,} events in a step of communication"
+                    )
                 self._call("EnterEventMode")
                 self._settle()
-        raise self._unsolved(end)
+        raise self._stopped(f"takes more than {MAX_STEPS:,} steps of the integrator")
 
     def _integrate(self, end: float) -> bool:
         """Take one step of the integrator at most, and return whether an indicator has changed.
@@ -140,7 +142,7 @@ class ExchangeInstance(Instance):
         solver.integrate(begin + self._longest, step=True)
         self._reached = solver.t
         if not solver.successful():
-            raise self._unsolved(begin + self._longest)
+            raise self._stopped("cannot be integrated further")
 
     def _go(self, time: float) -> None:
         """Take the FMU to a time that the integrator has reached."""
@@ -215,7 +217,7 @@ class ExchangeInstance(Instance):
             if not self._event() or self._ended:
                 break
         else:
-            raise self._chatters("rounds of one event")
+            raise self._stopped(f"has more than {MAX_EVENTS:,} rounds of one event")
         self._call("EnterContinuousTimeMode")
         if self._size:
             self._get_states()
@@ -246,17 +248,8 @@ class ExchangeInstance(Instance):
             self._call(f"GetNumberOf{kind}", byref(number))
         return found[0].value, found[1].value
 
-    def _unsolved(self, end: float) -> FMUError:
-        return FMUError(
-            f"{self.description.file.name} cannot be integrated from {self._time:z.6g} to "
-            f"{end:z.6g} s{self._said()}"
-        )
-
-    def _chatters(self, events: str) -> FMUError:
-        return FMUError(
-            f"{self.description.file.name} has more than {MAX_EVENTS:,} {events} at "
-            f"{self._time:z.6g} s{self._said()}"
-        )
+    def _stopped(self, why: str) -> FMUError:
+        return FMUError(f"{self.description.file.name} {why} at {self._time:z.6g} s{self._said()}")
 
 
 def _shared(count: int) -> tuple[Any, Float[np.ndarray, " n"]]:

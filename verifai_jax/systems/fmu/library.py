@@ -110,10 +110,10 @@ class Instance:
         answers = () if self._two else (*(byref(self._flags, i) for i in range(3)), byref(last))
         more = (c_int if self._two else c_bool)(1), *answers
         self._do_step = self._prepared("DoStep", self._clock, self._span, *more)
-        self._begun, self.failed, self._new_state = False, False, c_void_p()
+        self._begun, self.failed, self.new_state = False, False, c_void_p()
         if description.keeps_states:
             with suppress(FMUError):
-                self._call(f"GetFMU{self._state}", byref(self._new_state))
+                self._call(f"GetFMU{self._state}", byref(self.new_state))
 
     def begin(self, values: Mapping[str, float], duration: float) -> None:
         """Set start values, and initialize, from the state that a new instance has."""
@@ -166,12 +166,12 @@ class Instance:
 
         A reset may forget something, as that the FMU ended its simulation; a saved state does not.
         """
-        if self._new_state:
+        if self.new_state:
             try:
-                self._call(f"SetFMU{self._state}", self._new_state)
+                self._call(f"SetFMU{self._state}", self.new_state)
                 return
             except FMUError:
-                self._new_state = c_void_p()
+                self.new_state = c_void_p()
         if not self.failed:
             self._call("Terminate")
         self._call("Reset")

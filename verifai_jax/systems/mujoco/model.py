@@ -204,7 +204,7 @@ def _spec(mujoco: ModuleType, source: ModelSource) -> Any:
         return mujoco.MjSpec.from_file(str(source))
     except ValueError as error:
         where = "MJCF text" if "<" in str(source) else str(source)
-        raise ValueError(f"{where} is no MuJoCo model: {error}") from error
+        raise ValueError(f"{where} is not a MuJoCo model: {error}") from error
 
 
 def _add_contact_sensor(

@@ -271,5 +271,5 @@ def _pick(path: str, array: str, where: np.ndarray, index: str | None) -> Locati
         return Location(array, where[[number]], (), path)
     except (IndexError, ValueError):
         raise ValueError(
-            f"{path!r}: [{index}] is no part of it; its indices are 0 to {where.size - 1}"
+            f"{path!r}: [{index}] is not part of it; its indices are 0 to {where.size - 1}"
         ) from None

@@ -240,7 +240,7 @@ def _addresses(host: str, port: int) -> list[Any]:
             kind = socket.SOCK_STREAM
             resolved = socket.getaddrinfo(name, port, type=kind, flags=socket.AI_PASSIVE)
         except OSError as error:
-            raise ValueError(f"host {host!r} is no address of this machine: {error}") from error
+            raise ValueError(f"host {host!r} is not an address of this machine: {error}") from error
         addresses += [p for p in resolved if p[4] not in [other[4] for other in addresses]]
     return addresses
 

@@ -335,7 +335,7 @@ def server_context(certificate: File, private_key: File | None) -> ssl.SSLContex
         context.load_cert_chain(certificate, key, password="")
     except (ssl.SSLError, OSError) as error:
         raise ValueError(
-            f"{str(certificate)!r} and {str(key)!r} are no certificate and its private key in PEM "
-            f"form, without a password: {error}"
+            f"{str(certificate)!r} and {str(key)!r} are not a certificate and its private key in "
+            f"PEM form, without a password: {error}"
         ) from error
     return context
