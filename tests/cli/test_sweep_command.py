@@ -48,7 +48,7 @@ SMALL = ("--configurations", 3, "--samples", 64, "--no-pictures")
 @pytest.mark.thorough
 def test_sweep_and_what_it_writes(call, tmp_path):
     output = call("specs/drift.py:safe", *SMALL, "--seed", 2)
-    assert output.startswith("safe: 3 configurations")
+    assert "safe: 3 configurations" in output  # After a note, where it takes long.
     assert "rate" in output
     assert "nominal_return" in output
     folder = tmp_path / "sweeps" / "safe-1"

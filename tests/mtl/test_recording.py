@@ -162,7 +162,7 @@ def test_lists_that_make_no_vector_are_told(tmp_path):
     assert len(trace.notes) == 3
     with pytest.raises(ValueError, match=r"'a' of .* holds lists of different lengths \(1, 2\)"):
         read(tmp_path / "a.parquet", columns=["a"])
-    with pytest.raises(ValueError, match=r"no vectors of numbers; in row 1 there is \[1\.0\]"):
+    with pytest.raises(ValueError, match=r"not vectors of numbers; in row 1 there is \[1\.0\]"):
         read(tmp_path / "a.parquet", columns=["b"])
 
 

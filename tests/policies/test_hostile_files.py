@@ -36,7 +36,7 @@ def test_pickled_code_is_read_and_not_run(tmp_path):
     with pytest.raises(PolicyError, match="holds no tensors by name"):
         policy(tmp_path / "bad.pt", activation="tanh")
     (tmp_path / "scale.pkl").write_bytes(pickle.dumps(Harm(tmp_path / "ran")))
-    with pytest.raises(PolicyError, match=r"no file of VecNormalize\.save"):
+    with pytest.raises(PolicyError, match=r"not a file of VecNormalize\.save"):
         policy(lambda x: x, normalise=tmp_path / "scale.pkl")
     assert not (tmp_path / "ran").exists()
 
@@ -150,8 +150,8 @@ def test_tensors_are_read_from_the_folder_of_the_model_only(tmp_path):
     tensor = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[2])
     tensor.data_location = TensorProto.EXTERNAL
     for location, message in (
-        ("../secret.bin", "no file beside the model"),
-        ("/etc/passwd", "no file beside the model"),
+        ("../secret.bin", "not a file next to the model"),
+        ("/etc/passwd", "not a file next to the model"),
         ("weights.bin", "smaller than the model says"),
     ):
         del tensor.external_data[:]

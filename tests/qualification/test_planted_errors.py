@@ -50,7 +50,7 @@ PLANTED = {
     "E23": ("evaluation/verdicts.py", "finite &= jnp.all(jnp.isfinite(signal))", "finite &= True"),
     "E24": ("falsification/run.py", "undecided=undecided + without)", "undecided=undecided)"),
     "E25": (BINOMIAL, "tail = (1 - confidence) / 2", "tail = 1 - confidence"),
-    "E26": ("statistics/confidence_sequences.py", "limit = mixture + math.log(1 - confidence)", "limit = mixture + math.log(10 * (1 - confidence))"),
+    "E26": ("statistics/confidence_sequences.py", "limit = log_mixture(k, n) + math.log(1 - confidence)", "limit = log_mixture(k, n) + math.log(10 * (1 - confidence))"),
     "E27": (BINOMIAL, "math.log1p(-confidence) / math.log1p(-rate) - 1e-9", "0.5 * math.log1p(-confidence) / math.log1p(-rate) - 1e-9"),
     "E28": ("estimation/intervals.py", "n, total = len(x), float(x.sum())", "x = 5 * x\n    n, total = len(x), float(x.sum())"),
     "E29": ("estimation/monte_carlo.py", "return upper_bound(self.failures + self.no_verdict, self.simulations, confidence)", "return upper_bound(self.failures, 1000 * self.simulations, confidence)"),

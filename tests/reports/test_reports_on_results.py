@@ -87,8 +87,8 @@ def test_what_a_command_wrote_as_json(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("no json", "no result of"),
-        ("{}", "no result of"),
+        ("no json", "not a result of"),
+        ("{}", "not a result of"),
         ('{"command": "estimate", "name": "x"}', "damaged: 'probability' is missing"),
         ('{"command": "compare", "baseline": "x", "candidates": []}', "damaged: 'candidates'"),
     ],

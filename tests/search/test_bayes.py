@@ -95,7 +95,7 @@ def test_a_space_of_few_points_is_searched_through():
     u, state = asked(Bayes(capacity=64, candidates=64, initial=4), cube, rho, 8, batch=4)
     cells = np.asarray(cube.cells(jnp.asarray(u)))
     assert len(np.unique(cells[:16], axis=0)) >= 11
-    assert int(state.verdicts) == 32
+    assert int(state.memory.verdicts) == 32
 
 
 @pytest.mark.slow
@@ -117,7 +117,7 @@ def test_what_is_kept():
     u = np.random.default_rng(0).permutation(200)[:, None].astype(np.float32) / 200
     for part in np.split(u, 4):
         state = tell(state, cube, Observations(part, 1 + part[:, 0], jnp.ones(50, bool)))
-    kept = np.sort(np.asarray(state.u[:, 0]))
+    kept = np.sort(np.asarray(state.memory.u[:, 0]))
     np.testing.assert_allclose(kept[:16], np.arange(16) / 200, atol=1e-6)
     # The others are from everywhere and from all times.
     assert kept[16] < 0.3

@@ -94,7 +94,7 @@ def test_the_region_grows_with_progress_shrinks_without_and_is_left():
         state = told(state, value)
     assert float(state.side) == pytest.approx(2 * SIDES[1])
     sides = []
-    while int(state.verdicts) > 0 and len(sides) < 40:
+    while int(state.memory.verdicts) > 0 and len(sides) < 40:
         state = told(state, 200.0)
         sides.append(float(state.side))
     # Eight points without progress are more than the four of two dimensions: half, every round.
@@ -102,14 +102,15 @@ def test_the_region_grows_with_progress_shrinks_without_and_is_left():
     # Left at last, with all that was known of it.
     assert len(sides) == 8
     assert sides[-1] == pytest.approx(SIDES[1])
-    assert not np.isfinite(state.score).any()
+    assert not np.isfinite(state.memory.score).any()
 
 
 def test_sides_follow_the_length_scales():
     cube = Cube((0, 0, 5, 3), ordered=(True, True, True, False))
     state = TINY.init(KEY, cube, 4)
     lengths = jnp.log(jnp.array([0.5, 2.0, 1.0, 1.0]))
-    state = state._replace(hyper=state.hyper._replace(lengths=lengths), side=jnp.float32(0.1))
+    hyper = state.memory.hyper._replace(lengths=lengths)
+    state = state._replace(memory=state.memory._replace(hyper=hyper), side=jnp.float32(0.1))
     low, high = trust_box(state, cube, jnp.full(4, 0.5))
     # 0.1 times 0.5 and 2; one cell to either side; any of the unordered ones.
     np.testing.assert_allclose(high - low, [0.05, 0.2, 0.6, 1.0], rtol=1e-5)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, PyTree
+from jaxtyping import Float
 
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.trace import Trace
@@ -76,7 +76,8 @@ def effect_of(
     domains = run.problem.space.domains
     healthy = {**again.features, **{name: domains[name].nominal for name in found.faults}}
     space = run.problem.space
-    one = {n: np.asarray(c)[0] for n, c in space.rows(_batch(space.coerce(healthy))).items()}
+    batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], space.coerce(healthy))
+    one = {name: np.asarray(column)[0] for name, column in space.rows(batch).items()}
     without = simulate_again(run.problem, one, run_keys(run.seed)[1], row, run.precision)
     shown_by, shown = _first_difference(again.trace, without.trace)
     return replace(
@@ -125,7 +126,3 @@ def _command(run: Run, row: int) -> str:
     if run.target is None:
         return f"vj.load({str(run.folder)!r}, problem).replay({row})"
     return shlex.join(["verifai-jax", "replay", str(Path(run.folder)), str(row)])
-
-
-def _batch(features: PyTree) -> PyTree:
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[None], features)

@@ -333,11 +333,11 @@ def resume(
       notes and its record say so.
     - all other arguments: as in `falsify`.
 
-    The table is that of an uninterrupted run with this budget and the same `batch`, bit for bit,
-    whatever the search. Where the earlier budget cut the last round of a search that learns, its
-    simulations are made again, with the others of the round. The default batch of a search that
-    learns depends on the budget: a run from the start has the same points only with the same
-    `batch`, and the notes of the resumed run say where the default would be another.
+    The table is that of an uninterrupted run with this budget and the same `batch` and `engine`,
+    bit for bit, whatever the search. Where the earlier budget cut the last round of a search that
+    learns, its simulations are made again, with the others of the round. The defaults of `engine`
+    and of the `batch` of a search that learns depend on the budget: a run from the start has the
+    same points only with the same `batch`, and notes say where the default would be another.
 
     **Returns:** the run with the earlier rows and the new ones.
 

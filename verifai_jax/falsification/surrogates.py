@@ -29,7 +29,8 @@ from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.semantics import Semantics
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import trace_model as models
-from verifai_jax.search.base import TraceOptions, draw_uniform, standard_normal
+from verifai_jax.search.base import TraceOptions
+from verifai_jax.search.draws import draw_uniform, standard_normal
 from verifai_jax.search.process_data import snap
 
 POOL = 512

@@ -1,6 +1,6 @@
 """Training that hardens a policy: train, attack, add what fails to the training, certify.
 
-result = vj.harden(study, rounds=4)
+result = vj.harden(study)
 print(result)                           # failure probability before and after, return lost, cost
 """
 

@@ -1,6 +1,6 @@
 """Train, attack, add what fails to the training, go on training, certify.
 
-    result = harden(study, rounds=4)                    # a Study: trainer, problem, p
+    result = harden(study)                              # a Study: trainer, problem, p
     result = harden(CartPoleTask(), balance_with, algorithm=PPO())
     print(result); result.policy
 
@@ -124,9 +124,10 @@ def harden(
 
     The policy is trained on the task's own episodes first. Then each round attacks it, confirms
     and shrinks what fails, and goes on training with a mixture of episodes: the task's own, the
-    prior of the problem's features, and neighbourhoods of all counterexamples so far, of shrunk
-    ones, and of samples within the rules of the error table. Each round's policy is certified. Of
-    the policies whose return is within `tolerance` of the first one's, the one that fails least is
+    prior of the problem's features, and neighbourhoods of failing samples of it, of counterexamples
+    of the attack, of shrunk ones, and of samples within the rules of the error table; those that
+    the policy has mastered make room for new ones. Each round's policy is certified. Of the
+    policies whose return is within `tolerance` of the first one's, the one that fails least is
     returned, and never one that a paired comparison shows to be worse than the first.
 
     All samples of a certificate are fresh: counterexamples of one round enter the training, and the

@@ -135,20 +135,13 @@ class Hardening(Drawn, InNotebook):
         if np.isfinite(self.returns["start"]).all():
             lines.append(f"  return lost: {self.lost()}")
         own = self.table.loc[self.table["arm"] == HARDENED]
-        added = [f"{count} of kind {source}" for source, count in self._sources.items()]
+        sources = self.added["source"].value_counts() if len(self.added) else {}
+        added = [f"{count} of kind {source}" for source, count in sources.items()]
         lines.append(
             f"  added {', '.join(added) or 'nothing'}; {max(own['steps']):,} environment "
             f"steps, {sum(own['cost']):,} simulations, {self.seconds:z.0f} s"
         )
         return "\n".join([*lines, *(f"  note: {note}" for note in self.notes)])
-
-    @property
-    def _sources(self) -> dict[str, int]:
-        if not len(self.added):
-            return {}
-        return {
-            str(name): int(count) for name, count in self.added["source"].value_counts().items()
-        }
 
     def _return(self, arm: str) -> str:
         returns = self.returns[arm]

@@ -67,6 +67,7 @@ _SEARCHES = {
     "descent": "Descent",
     "portfolio": "Portfolio",
 }
+_WRAPPERS = {"diverse": "Diverse", "likeliest": "Likeliest", "suggested": "Suggested"}
 
 
 def names() -> tuple[str, ...]:
@@ -123,17 +124,14 @@ def to_json(search: "Search") -> dict[str, Any] | None:
         whole = rest is not None and all(part is not None for _, part in parts)
         return {"split": parts, "rest": rest} if whole else None
     options = {f.name: getattr(search, f.name) for f in fields(cast(Any, search))}
-    if kind.__name__ in ("Diverse", "Likeliest", "Suggested"):
-        inner = to_json(options.pop("search"))
-        if inner is None:
-            return None
-        if kind.__name__ == "Diverse":
-            return {"diverse": inner, "options": options}
-        if kind.__name__ == "Likeliest":
-            return {"likeliest": inner}
-        del options["suggest"]
-        options["units"] = dict(options["units"])
-        return {"suggested": inner, "source": cast("Suggested", search).source, "options": options}
+    if kind.__name__ in _WRAPPERS.values():
+        described: dict[str, Any] = {kind.__name__.lower(): to_json(options.pop("search"))}
+        if kind.__name__ == "Suggested":
+            del options["suggest"]
+            options["units"] = dict(options["units"])
+            described["source"] = cast("Suggested", search).source
+        whole = described[kind.__name__.lower()] is not None
+        return described | ({"options": options} if options else {}) if whole else None
     for name, of in _SEARCHES.items():
         if kind.__name__ == of:
             return {"name": name, "options": options}
@@ -151,19 +149,14 @@ def from_json(data: Mapping[str, Any]) -> "Search":
         return Split(
             {name: from_json(part) for name, part in data["split"]}, from_json(data["rest"])
         )
-    if "diverse" in data:
-        from verifai_jax.search.diverse import Diverse
+    for name, kind in _WRAPPERS.items():
+        if name in data:
+            options = dict(data.get("options", {}), search=from_json(data[name]))
+            if kind == "Suggested":
+                from verifai_jax.search.suggested import Absent
 
-        return Diverse(from_json(data["diverse"]), **data.get("options", {}))
-    if "likeliest" in data:
-        from verifai_jax.search.likeliest import Likeliest
-
-        return Likeliest(from_json(data["likeliest"]))
-    if "suggested" in data:
-        from verifai_jax.search.suggested import Absent, Suggested
-
-        source = Absent(str(data.get("source", "a function")))
-        return Suggested(source, from_json(data["suggested"]), **data.get("options", {}))
+                options["suggest"] = Absent(str(data.get("source", "a function")))
+            return lazy_import(__name__, kind)(**options)
     if not isinstance(data.get("options"), Mapping):
         raise ValueError(f"this describes no search: {data!r}")
     options = {

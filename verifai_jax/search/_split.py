@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.errors import unknown_name
-from verifai_jax.search.base import Observations, Plan, Search, Wants
+from verifai_jax.search.base import Asked, Observations, Plan, Search, Wants
 
 
 @dataclass(frozen=True, init=False)
@@ -99,9 +99,7 @@ class Split(Search[tuple[PyTree, ...]]):
             for key, (search, _, part) in zip(keys, shares, strict=True)
         )
 
-    def ask(
-        self, state: tuple[PyTree, ...], cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], tuple[PyTree, ...]]:
+    def ask(self, state: tuple[PyTree, ...], cube: Cube, batch: int) -> Asked[tuple[PyTree, ...]]:
         u = jnp.zeros((batch, cube.dim), jnp.float32)
         states = []
         for its, (search, indices, part) in zip(state, self._shares(cube), strict=True):

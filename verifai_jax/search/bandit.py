@@ -27,9 +27,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, draw_columns, newest_first
+from verifai_jax.search.base import Asked, Observations, Search, check_options
+from verifai_jax.search.best_points import newest_first
+from verifai_jax.search.draws import draw_columns
 
 BISECTIONS = 20
 """Halvings of the interval that holds the common level of the bounds: the level is then known to
@@ -69,12 +70,8 @@ class Bandit(Search[BanditState]):
     exploration: float = 0.1
 
     def __post_init__(self) -> None:
-        check_count("buckets", self.buckets, 2)
-        check_count("depth", self.depth)
-        check_positive("optimism", self.optimism, finite=True)
-        check_fraction("best", self.best, one=True)
-        check_count("window", self.window)
-        check_fraction("exploration", self.exploration, one=True)
+        counts = {"buckets": 2, "depth": 1, "window": 1}
+        check_options(self, counts, ["best", "exploration"], ["optimism"])
         if self.buckets**self.depth > 10_000:
             raise ValueError(
                 "buckets**depth must be at most 10000; got "
@@ -90,9 +87,7 @@ class Bandit(Search[BanditState]):
             score=jnp.full(window, jnp.inf, jnp.float32),
         )
 
-    def ask(
-        self, state: BanditState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], BanditState]:
+    def ask(self, state: BanditState, cube: Cube, batch: int) -> Asked[BanditState]:
         key = jax.random.fold_in(state.key, state.round)
         chance, order, prior = draw_columns(key, batch, 1, cube.dim, cube.dim)
         # A Latin hypercube: in each coordinate one row in each of `batch` equal parts.

@@ -9,21 +9,20 @@ pytree, so that it can be jitted, scanned, saved and resumed. It knows nothing o
 """
 
 import abc
-import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Generic, Literal, NamedTuple, TypeVar
+from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.scipy.special import ndtri
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from verifai_jax.core.checks import check_count, check_fraction
+from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.clauses import CLAUSES, OUTCOME
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.notebook import ForUsers
+from verifai_jax.search.best_points import keep_best
 
 KIND = 1 << 16
 """Coverage ids of one kind: a coverage id is `kind * KIND + number`. An int32 has room for 32 768
@@ -69,6 +68,31 @@ class Observations(NamedTuple):
         return jnp.where(self.usable, jnp.maximum(self.rho, 0.0), jnp.inf)
 
 
+def check_options(
+    options: object,
+    counts: Mapping[str, int] | None = None,
+    shares: Sequence[str] = (),
+    sizes: Sequence[str] = (),
+) -> None:
+    """Check the options of a search, attributes of the same names.
+
+    **Arguments:**
+
+    - `options`: the search.
+    - `counts`: names of whole numbers, and the smallest value of each.
+    - `shares`: names of those in `(0, 1]`.
+    - `sizes`: names of those that are positive and finite.
+
+    **Raises:** `ValueError` that names the first one out of range.
+    """
+    for name, smallest in (counts or {}).items():
+        check_count(name, getattr(options, name), smallest)
+    for name in shares:
+        check_fraction(name, getattr(options, name), one=True)
+    for name in sizes:
+        check_positive(name, getattr(options, name), finite=True)
+
+
 @dataclass(frozen=True)
 class TraceOptions:
     """Options of a model of the traces, which the loop keeps for a search and descends on.
@@ -91,11 +115,7 @@ class TraceOptions:
     steps: int = 40
 
     def __post_init__(self) -> None:
-        check_count("initial", self.initial, 2)
-        check_fraction("share", self.share, one=True)
-        check_count("capacity", self.capacity, 16)
-        check_count("starts", self.starts)
-        check_count("steps", self.steps)
+        check_options(self, {"initial": 2, "capacity": 16, "starts": 1, "steps": 1}, ["share"])
 
 
 @dataclass(frozen=True)
@@ -202,6 +222,9 @@ that is fixed from the start; a search guided by coverage; a search guided by ro
 State = TypeVar("State")
 """The state of a search: a pytree of arrays."""
 
+Asked: TypeAlias = tuple[Float[Array, "batch d"], State]
+"""Points to simulate, and the state of the search after it proposed them."""
+
 
 class Search(ForUsers, abc.ABC, Generic[State]):
     """The contract; `verifai_jax.testing.check_search` tests it.
@@ -270,7 +293,7 @@ class Search(ForUsers, abc.ABC, Generic[State]):
         """Return the state before the first round; all randomness comes from `key`."""
 
     @abc.abstractmethod
-    def ask(self, state: State, cube: Cube, batch: int) -> tuple[Float[Array, "batch d"], State]:
+    def ask(self, state: State, cube: Cube, batch: int) -> Asked[State]:
         """Propose the next points to simulate."""
 
     @abc.abstractmethod
@@ -313,6 +336,45 @@ class Search(ForUsers, abc.ABC, Generic[State]):
         raise NotImplementedError(f"{type(self).__name__} uses no gradient")
 
 
+class PointSequence(Search[State]):
+    """A search whose points follow from the key alone, whatever comes of them."""
+
+    @property
+    def learns(self) -> bool:
+        return False
+
+    def tell(self, state: State, cube: Cube, observations: Observations) -> State:
+        return state
+
+
+class SlopeSearch(Search[State]):
+    """A search that follows the gradients of clauses, from points that are offered too.
+
+    Its state has the points `offered` as its next starts, and how `near` to failing they are.
+    """
+
+    @property
+    def wants(self) -> Wants:
+        return Wants(clauses=True, clause_gradients=True)
+
+    def check(self, cube: Cube) -> None:
+        """Raise `ValueError` unless there is a continuous coordinate to move in."""
+        if cube.dim and len(cube.continuous) == 0:
+            raise ValueError(
+                f"search {type(self).__name__.lower()} needs at least one continuous feature; all "
+                f"{cube.dim} unit coordinates of this space are discrete. Use 'cross_entropy'"
+            )
+
+    def warm_start(self, state: State, cube: Cube, observations: Observations) -> State:
+        """Start the first descents from the points nearest to failing, failures left out."""
+        its: Any = state
+        # Of the batch and of earlier points, whose robustness is infinite where there is none.
+        usable = observations.usable & (observations.rho >= 0)
+        near = jnp.where(usable, observations.rho, jnp.inf)
+        offered, near = keep_best(observations.u, near, its.offered, its.near)
+        return its._replace(offered=offered, near=near)
+
+
 Part = TypeVar("Part", bound=PyTree)
 """A state of a search, or a part of one."""
 
@@ -320,72 +382,3 @@ Part = TypeVar("Part", bound=PyTree)
 def choose(first: Bool[Array, ""], one: Part, two: Part) -> Part:
     """Return one of two states of the same form; what is the same in both is left alone."""
     return jax.tree.map(lambda a, b: a if a is b else jnp.where(first, a, b), one, two)
-
-
-def nearest_to_failing(
-    observations: Observations, offered: Float[Array, "k d"], near: Float[Array, " k"]
-) -> tuple[Float[Array, "k d"], Float[Array, " k"]]:
-    """Return the points nearest to failing, failures left out, of a batch and of those offered.
-
-    **Arguments:**
-
-    - `observations`: the batch.
-    - `offered`, `near`: earlier points and their robustness, infinite where there is none.
-    """
-    usable = observations.usable & (observations.rho >= 0)
-    return keep_best(observations.u, jnp.where(usable, observations.rho, jnp.inf), offered, near)
-
-
-def newest_first(
-    u: Float[Array, "n d"],
-    new: Float[Array, " n"],
-    points: Float[Array, "k d"],
-    score: Float[Array, " k"],
-) -> tuple[Float[Array, "n+k d"], Float[Array, " n+k"]]:
-    """Return the points of a round before those of a memory, with their scores.
-
-    **Arguments:**
-
-    - `u`, `new`: of the round; a score is infinite where there is nothing to learn.
-    - `points`, `score`: of the memory; a score is infinite where there is no point.
-    """
-    u = jnp.where(jnp.isinf(new)[:, None], 0.5, u)
-    return jnp.concatenate([u, points]), jnp.concatenate([new, score])
-
-
-def keep_best(
-    u: Float[Array, "n d"],
-    new: Float[Array, " n"],
-    points: Float[Array, "k d"],
-    score: Float[Array, " k"],
-) -> tuple[Float[Array, "k d"], Float[Array, " k"]]:
-    """Return the best points of a round and a memory, sorted; of equal ones the newest.
-
-    **Arguments:** as of `newest_first`.
-    """
-    points, scores = newest_first(u, new, points, score)
-    _, best = jax.lax.top_k(-scores, len(score))
-    return points[best], scores[best]
-
-
-def draw_uniform(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "*shape"]:
-    """Draw uniform numbers in `[0, 1)`: those of `jax.random.uniform`, compiled much sooner.
-
-    XLA spends seconds on the generator in more than one dimension, and again in each of its uses
-    where it is not kept.
-    """
-    flat = jax.random.uniform(key, (math.prod(shape),), jnp.float32)
-    return jax.lax.optimization_barrier(flat).reshape(shape)
-
-
-def draw_columns(
-    key: Key[Array, ""], rows: int, *widths: int
-) -> tuple[Float[Array, "rows width"], ...]:
-    """Draw blocks of uniform numbers in `[0, 1)` in one call, as each takes a while to compile."""
-    whole = draw_uniform(key, (rows, sum(widths)))
-    return tuple(jnp.split(whole, np.cumsum(widths[:-1]), axis=1))
-
-
-def standard_normal(uniform: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Map uniform numbers in `[0, 1)` to standard normal ones, finite at 0."""
-    return ndtri(jnp.maximum(uniform, np.float32(2**-25)))

@@ -26,18 +26,18 @@ import numpy as np
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float, Int, Key, UInt32
 
-from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, Wants, draw_uniform, standard_normal
-from verifai_jax.search.gaussian_process import Hyper, Posterior, TrainingData
+from verifai_jax.search.base import Asked, Observations, Search, Wants, check_options
+from verifai_jax.search.draws import draw_uniform, standard_normal
+from verifai_jax.search.gaussian_process import Posterior, TrainingData
 from verifai_jax.search.halton import halton_points
 from verifai_jax.search.improvement import APART, PARENTS, already_simulated, improving
 from verifai_jax.search.process_data import (
     LARGEST,
     NO_VERDICT,
+    ProcessMemory,
     encode,
     process_of,
-    rows_to_keep,
     scores,
     snap,
     training_data,
@@ -48,7 +48,7 @@ from verifai_jax.search.process_data import (
 # (tests/search/test_bayes.py).
 MAX_PATHS = 32  # functions drawn for a batch; larger batches take several points from each
 WAVES = 256  # random waves of such a function
-FIT_POINTS, FIT_STEPS = 192, 8
+FIT_STEPS = 8
 MARGIN = 0.1  # of the box around the best points, on each side
 REFITS = 20  # steps of its fit, from the first hyper-parameters on
 GREEDY = 0.1  # factor on its standard deviations: it is there to refine
@@ -60,14 +60,8 @@ class BayesState(NamedTuple):
     round: UInt32[Array, ""]
     proposals: UInt32[Array, ""]  # points, in all
     explored: UInt32[Array, ""]  # points of the prior among them
-    results: UInt32[Array, ""]  # rows, in all
-    u: Float[Array, "capacity d"]
-    score: Float[Array, " capacity"]  # as of `scores`; infinite where no point is
-    luck: Float[Array, " capacity"]  # says which points are kept
-    verdicts: Int[Array, ""]  # points with a verdict, in all
-    fitted: Int[Array, ""]  # of which the last fit knew
     stale: Int[Array, ""]  # points since the last failure or progress
-    hyper: Hyper
+    memory: ProcessMemory
 
 
 @dataclass(frozen=True)
@@ -102,10 +96,7 @@ class Bayes(Search[BayesState]):
                 "acquisition must be 'thompson' or 'expected_improvement'; "
                 f"got {self.acquisition!r}"
             )
-        check_count("capacity", self.capacity, 16)
-        check_count("candidates", self.candidates, 32)
-        check_count("initial", self.initial, 2)
-        check_fraction("exploration", self.exploration, one=True)
+        check_options(self, {"capacity": 16, "candidates": 32, "initial": 2}, ["exploration"])
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> BayesState:
         return BayesState(
@@ -113,27 +104,14 @@ class Bayes(Search[BayesState]):
             round=jnp.uint32(0),
             proposals=jnp.uint32(0),
             explored=jnp.uint32(0),
-            results=jnp.uint32(0),
-            u=jnp.full((self.capacity, cube.dim), 0.5, jnp.float32),
-            score=jnp.full(self.capacity, jnp.inf, jnp.float32),
-            luck=jnp.zeros(self.capacity, jnp.float32),
-            verdicts=jnp.int32(0),
-            fitted=jnp.int32(0),
             stale=jnp.int32(0),
-            hyper=process_of(cube).first(),
+            memory=ProcessMemory.nothing(self.capacity, cube),
         )
 
-    def ask(
-        self, state: BayesState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], BayesState]:
+    def ask(self, state: BayesState, cube: Cube, batch: int) -> Asked[BayesState]:
         key = jax.random.fold_in(state.key, state.round)
         row = jnp.arange(batch, dtype=jnp.uint32)
-        present = state.score <= LARGEST
-        spread = jnp.max(state.score, where=present, initial=0.0) > jnp.min(
-            state.score, where=present, initial=jnp.inf
-        )
-        # Without a difference between points there is nothing to learn from them.
-        informed = spread & (state.verdicts >= self.initial)
+        informed = state.memory.says_something(self.initial)
         # Where the process leads nowhere, more and more of the points are those of the prior.
         share = jnp.maximum(self.exploration, state.stale / (state.stale + PATIENCE))
         # Every tenth point, say, whatever the batch is; in integers, which do not drift.
@@ -166,40 +144,17 @@ class Bayes(Search[BayesState]):
         return jnp.where(prior[:, None], fresh, chosen), after
 
     def tell(self, state: BayesState, cube: Cube, observations: Observations) -> BayesState:
-        score = scores(observations)
-        usable = jnp.isfinite(score)
-        number = state.results + jnp.arange(len(score), dtype=jnp.uint32)
+        score, before = scores(observations), state.memory.score
         # Where no failure is near, what is left above the lowest counts, not above zero.
-        lowest, ordered = jnp.min(state.score), jnp.sort(state.score)
+        lowest, ordered = jnp.min(before), jnp.sort(before)
         middle = ordered[jnp.sum(ordered <= LARGEST) // 2]
         progress = jnp.min(score) < lowest - 0.01 * jnp.where(middle <= LARGEST, middle - lowest, 0)
         progress |= jnp.any(score == 0)
-        count, verdicts = (jnp.sum(each, dtype=jnp.int32) for each in (usable, score <= LARGEST))
-        # A Weyl sequence (in steps of the golden ratio): as good as random for choosing.
-        luck = (number * np.uint32(2654435769) >> 8).astype(jnp.float32) / 2**24
-        u = jnp.concatenate([jnp.where(usable[:, None], observations.u, 0.5), state.u])
-        score = jnp.concatenate([score, state.score])
-        luck = jnp.concatenate([luck, state.luck])
-        rows = rows_to_keep(score, luck, self.capacity)
-        state = state._replace(
-            results=state.results + np.uint32(len(usable)),
-            u=u[rows],
-            score=score[rows],
-            luck=luck[rows],
-            verdicts=state.verdicts + verdicts,
+        count = jnp.sum(jnp.isfinite(score), dtype=jnp.int32)
+        memory = state.memory.with_rows(observations.u, score)
+        return state._replace(
             stale=jnp.where(progress, 0, state.stale + count),
-        )
-        due = (state.verdicts >= self.initial) & (
-            4 * (state.verdicts - state.fitted) >= state.fitted
-        )
-        hyper = jax.lax.cond(due, lambda: self._fit(state, cube), lambda: state.hyper)
-        return state._replace(hyper=hyper, fitted=jnp.where(due, state.verdicts, state.fitted))
-
-    def _fit(self, state: BayesState, cube: Cube) -> Hyper:
-        some = rows_to_keep(state.score, state.luck, min(FIT_POINTS, self.capacity))
-        data = training_data(state.u, state.score, cube)
-        return process_of(cube).fit(
-            state.hyper, jax.tree.map(lambda leaf: leaf[some], data), FIT_STEPS
+            memory=memory.refitted(cube, self.initial, FIT_STEPS),
         )
 
     def _propose(
@@ -211,8 +166,8 @@ class Bayes(Search[BayesState]):
         anywhere: Float[Array, "half d"],
     ) -> Float[Array, "batch d"]:
         """Return the points that the acquisition function ranks first."""
-        process, data = process_of(cube), training_data(state.u, state.score, cube)
-        posterior, risk = process.condition(state.hyper, data), _risk(state, cube)
+        memory = state.memory
+        posterior, risk = memory.posterior(cube), _risk(memory, cube)
         drawing, placing = jax.random.split(key)
         half, d = anywhere.shape
         paths = min(batch, MAX_PATHS)
@@ -225,28 +180,28 @@ class Bayes(Search[BayesState]):
         width = 3 + 2 * d
         random = draw_uniform(placing, (half + 2 * children, width))
         first, later = random[:half], random[half:].reshape(2, *steps, width)
-        _, best = jax.lax.top_k(-state.score, PARENTS)
+        _, best = jax.lax.top_k(-memory.score, PARENTS)
         parent = best[jnp.minimum((first[:, 0] * PARENTS).astype(jnp.int32), PARENTS - 1)]
-        near = _near(state.u[parent], first, cube, jnp.array([0.5, 0.01]))
+        near = _near(memory.u[parent], first, cube, jnp.array([0.5, 0.01]))
         shared = jnp.concatenate([anywhere, near])
         if self.acquisition == "thompson":
             chosen = _minima(drawing, posterior, risk, cube, shared, later, paths)[:batch]
         else:
             chosen = improving(posterior, risk, cube, (0.0, 1.0), 1.0, shared, batch)
         # Where no failure is known every fourth point refines the best one.
-        refined = _refined(state, risk, cube, anywhere, batch)
+        refined = _refined(memory, risk, cube, anywhere, batch)
         row = jnp.arange(batch, dtype=jnp.uint32)
-        turn = (jnp.min(state.score) > 0) & ((state.proposals + row) % 4 == 0)
+        turn = (jnp.min(memory.score) > 0) & ((state.proposals + row) % 4 == 0)
         return jnp.where(turn[:, None], refined, chosen)
 
 
-def _risk(state: BayesState, cube: Cube) -> Callable[[Float[Array, "m d"]], Float[Array, " m"]]:
+def _risk(memory: ProcessMemory, cube: Cube) -> Callable[[Float[Array, "m d"]], Float[Array, " m"]]:
     """Return minus the log probability of a verdict as a function of points; zero if all had one.
 
     By another process, of zero for simulations with a verdict and one for those without.
     """
-    process, without = process_of(cube), state.score == NO_VERDICT
-    data = TrainingData(encode(state.u, cube), without * 1.0, jnp.isfinite(state.score))
+    process, without = process_of(cube), memory.score == NO_VERDICT
+    data = TrainingData(encode(memory.u, cube), without * 1.0, jnp.isfinite(memory.score))
     some, n = jnp.any(without), len(without)
     nothing = jnp.eye(n, dtype=jnp.float32), jnp.zeros(n, jnp.float32)
     # Where all simulations had a verdict nothing of this is computed.
@@ -267,7 +222,7 @@ def _risk(state: BayesState, cube: Cube) -> Callable[[Float[Array, "m d"]], Floa
 
 
 def _refined(
-    state: BayesState,
+    memory: ProcessMemory,
     risk: Callable[[Float[Array, "m d"]], Float[Array, " m"]],
     cube: Cube,
     anywhere: Float[Array, "half d"],
@@ -278,11 +233,11 @@ def _refined(
     Over the box around them, which shrinks with them, and by the values in it: so it tells
     values apart that are the same to the process of all points.
     """
-    process, count = process_of(cube), min(3 * (cube.dim + 2), len(state.score))
-    away = jnp.sum((state.u - state.u[jnp.argmin(state.score)]) ** 2, axis=1)
-    _, best = jax.lax.top_k(-jnp.where(state.score <= LARGEST, away, jnp.inf), count)
-    there = state.score[best] <= LARGEST
-    points = state.u[best]
+    process, count = process_of(cube), min(3 * (cube.dim + 2), len(memory.score))
+    away = jnp.sum((memory.u - memory.u[jnp.argmin(memory.score)]) ** 2, axis=1)
+    _, best = jax.lax.top_k(-jnp.where(memory.score <= LARGEST, away, jnp.inf), count)
+    there = memory.score[best] <= LARGEST
+    points = memory.u[best]
     low = jnp.min(points, axis=0, where=there[:, None], initial=1.0)
     high = jnp.max(points, axis=0, where=there[:, None], initial=0.0)
     margin = jnp.maximum(MARGIN * (high - low), APART)
@@ -290,7 +245,7 @@ def _refined(
     discrete = np.array(cube.levels) > 0
     low, high = jnp.where(discrete, 0.0, low), jnp.where(discrete, 1.0, high)
     box = (low, jnp.maximum(high - low, APART))
-    score = jnp.where(there, state.score[best] - jnp.min(state.score), jnp.inf)
+    score = jnp.where(there, memory.score[best] - jnp.min(memory.score), jnp.inf)
     x = jnp.where(discrete, encode(points, cube), (points - box[0]) / box[1])
     _, y, mask = training_data(points, score, cube)
     data = TrainingData(x, y, mask)

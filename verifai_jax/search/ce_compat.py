@@ -17,7 +17,8 @@ from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, draw_uniform
+from verifai_jax.search.base import Asked, Observations, Search
+from verifai_jax.search.draws import draw_uniform
 
 MAX_COMBINATIONS = 1024
 """Maximum number of combinations of the lengths of arrays: in a run of a thousand
@@ -90,9 +91,7 @@ class CECompat(Search[CECompatState]):
         sets = math.prod(cube.levels[i] for i in cube.lengths)
         return CECompatState(key, jnp.uint32(0), jnp.tile(jnp.asarray(prior), (sets, 1, 1)))
 
-    def ask(
-        self, state: CECompatState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], CECompatState]:
+    def ask(self, state: CECompatState, cube: Cube, batch: int) -> Asked[CECompatState]:
         key = jax.random.fold_in(state.key, state.round)
         pick, inside = draw_uniform(key, (2, batch, cube.dim))
         after = state._replace(round=state.round + 1)

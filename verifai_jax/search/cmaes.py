@@ -22,16 +22,16 @@ Additions for falsification:
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, draw_uniform, standard_normal
+from verifai_jax.search.base import Asked, Observations, Search, check_options, choose
+from verifai_jax.search.draws import draw_uniform, standard_normal
 from verifai_jax.search.evolution import (
     Evolution,
     rates,
@@ -63,8 +63,6 @@ FEW_COORDINATES = 5
 """Coordinates up to which the share of exploration is the given one. In more of them, a point of
 the prior is seldom near anything: with 5 % instead of 10 % in ten coordinates, CMA-ES needs 0.93
 times the simulations on Rosenbrock's function, and finds Rastrigin's as often."""
-
-Tree = TypeVar("Tree")
 
 
 class CMAESState(NamedTuple):
@@ -120,11 +118,8 @@ class CMAES(Search[CMAESState]):
     failures: int = 20
 
     def __post_init__(self) -> None:
-        for name in ("step", "small_step", "exploration", "min_std"):
-            check_fraction(name, getattr(self, name), one=True)
-        check_count("full_up_to", self.full_up_to, 0)
-        check_count("patience", self.patience)
-        check_count("failures", self.failures)
+        shares = "step", "small_step", "exploration", "min_std"
+        check_options(self, {"full_up_to": 0, "patience": 1, "failures": 1}, shares)
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> CMAESState:
         n, d = len(_plain(cube)), cube.dim
@@ -152,9 +147,7 @@ class CMAES(Search[CMAESState]):
             reserve_score=jnp.float32(jnp.inf),
         )
 
-    def ask(
-        self, state: CMAESState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], CMAESState]:
+    def ask(self, state: CMAESState, cube: Cube, batch: int) -> Asked[CMAESState]:
         prior = self._explores(state, cube, batch) | (state.generation == 0)
         number = state.explored + jnp.cumsum(prior).astype(jnp.uint32)
         fresh = halton_points(number, cube.dim, state.key)
@@ -178,7 +171,7 @@ class CMAES(Search[CMAESState]):
             failures=state.failures + jnp.sum(inside == 0, dtype=jnp.int32),
         )
         complete = state.filled * batch == len(state.score)
-        return _where(complete, self._next(state, cube), state)
+        return choose(complete, self._next(state, cube), state)
 
     def warm_start(self, state: CMAESState, cube: Cube, observations: Observations) -> CMAESState:
         """Begin with small steps at the best of these points."""
@@ -187,7 +180,7 @@ class CMAES(Search[CMAESState]):
         better = jnp.min(score, initial=jnp.inf) < state.best
         found = _with_reserve(state._replace(reserve_score=jnp.float32(jnp.inf)), u, score)
         begun = self._begin(found, cube, jnp.array(True), jnp.float32(self.small_step))
-        return _where(better, begun._replace(best=found.reserve_score), state)
+        return choose(better, begun._replace(best=found.reserve_score), state)
 
     def _explores(self, state: CMAESState, cube: Cube, batch: int) -> Bool[Array, " batch"]:
         """Return the rows from the prior: every tenth, say, whatever the batch; in integers."""
@@ -218,7 +211,7 @@ class CMAES(Search[CMAESState]):
 
     def _next(self, state: CMAESState, cube: Cube) -> CMAESState:
         """Learn from a whole generation, wait, or begin another run."""
-        following = _where(state.rest > 0, self._wait(state, cube), self._learn(state, cube))
+        following = choose(state.rest > 0, self._wait(state, cube), self._learn(state, cube))
         empty = jnp.full_like(state.score, jnp.inf)
         return following._replace(score=empty, filled=jnp.int32(0))
 
@@ -232,7 +225,7 @@ class CMAES(Search[CMAESState]):
         # A generation of the prior says where the run begins.
         placed = state.gaussian._replace(mean=weights @ points)
         moved = state.gaussian.learn(points, weights, reverse_recombination(state.score))
-        gaussian = _where(state.generation == 0, placed, moved)
+        gaussian = choose(state.generation == 0, placed, moved)
         gaussian = gaussian._replace(size=jnp.minimum(gaussian.size, 1.0))
         learned = state._replace(
             gaussian=gaussian.widened(_margins(cube)),
@@ -240,13 +233,13 @@ class CMAES(Search[CMAESState]):
             generation=state.generation + 1,
         )
         # Without differences between points there is nothing to learn.
-        learned = _where((lowest < worst) | (lowest == 0), learned, state)
+        learned = choose((lowest < worst) | (lowest == 0), learned, state)
         learned = learned._replace(
             best=jnp.minimum(lowest, state.best),
             stale=jnp.where(better, 0, state.stale + 1).astype(jnp.int32),
             length=state.length + 1,
         )
-        return _where(self._over(learned, cube), self._after(learned, cube), learned)
+        return choose(self._over(learned, cube), self._after(learned, cube), learned)
 
     def _over(self, state: CMAESState, cube: Cube) -> Bool[Array, ""]:
         """Return whether a run has failed often enough, or leads nowhere."""
@@ -275,7 +268,7 @@ class CMAES(Search[CMAESState]):
             fruitless=fruitless,
             rest=jnp.minimum(fruitless * state.length // 2, 1000),
         )
-        return _where(fruitful, next_run._replace(fruitless=fruitless), waiting)
+        return choose(fruitful, next_run._replace(fruitless=fruitless), waiting)
 
     def _wait(self, state: CMAESState, cube: Cube) -> CMAESState:
         """Advance after a generation of the prior between two runs."""
@@ -283,7 +276,7 @@ class CMAES(Search[CMAESState]):
         over = (waiting.rest == 0) | (waiting.reserve_score == 0)
         size = jnp.where(state.run % 2 == 0, self.step, self.small_step)
         begun = self._begin(waiting, cube, jnp.array(True), size)._replace(run=state.run)
-        return _where(over & jnp.isfinite(waiting.reserve_score), begun, waiting)
+        return choose(over & jnp.isfinite(waiting.reserve_score), begun, waiting)
 
     def _begin(
         self, state: CMAESState, cube: Cube, there: Bool[Array, ""], size: Float[Array, ""]
@@ -386,8 +379,3 @@ def _with_reserve(
         reserve=jnp.where(better, u[index], state.reserve),
         reserve_score=jnp.where(better, score[index], state.reserve_score),
     )
-
-
-def _where(condition: Bool[Array, ""], one: Tree, other: Tree) -> Tree:
-    """Choose one of two pytrees of the same structure."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)

@@ -17,14 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt32
 
-from verifai_jax.core.checks import check_count, check_fraction, check_positive
+from verifai_jax.core.checks import check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import KIND, Observations, Search, Wants, standard_normal
+from verifai_jax.search.base import KIND, Asked, Observations, Search, Wants, check_options
+from verifai_jax.search.draws import standard_normal
 
 # The shares and sizes below were chosen by hand; no comparison with other values is recorded.
-STEP = 0.1
-"""Standard deviation of small steps, in unit coordinates."""
-
+STEP = 0.1  # standard deviation of small steps, in unit coordinates
 MOVES = (0.35, 0.55, 0.75, 0.9)
 """Cumulative shares of mutations: a few coordinates, a stretch, all from one coordinate on, a
 splice; the rest are small steps."""
@@ -32,15 +31,9 @@ splice; the rest are small steps."""
 SHARES = (0.25, 0.5, 0.25, 0.25)
 """Shares of the kinds of ids: of features, of cells of behaviour, of verdicts, and others."""
 
-KINDS = len(SHARES)
-"""Number of kinds of coverage ids that the search distinguishes."""
-
-VERDICT = 2
-"""The kind of coverage ids of verdicts."""
-
-EDITED = 0.85
-"""Share of mutations that edit an item of an array, where there are such."""
-
+KINDS = len(SHARES)  # number of kinds of coverage ids that the search distinguishes
+VERDICT = 2  # the kind of coverage ids of verdicts
+EDITED = 0.85  # share of mutations that edit an item of an array, where there are such
 EDITS = (0.3, 0.38, 0.72, 0.8)
 """Cumulative shares of edits: putting an item in, another item in place of one, the same kind of
 item with one other number, taking one out; the rest are new items from one on."""
@@ -48,11 +41,8 @@ item with one other number, taking one out; the rest are new items from one on."
 APPENDED = 0.3
 """Share of edits at the end of an array, where what has happened before stays as it is."""
 
-EXTREME = 0.5
-"""Share of new items whose numbers are drawn towards the ends of their ranges."""
-
-LONGER = 0.5
-"""Share of mutations that make an array no shorter and perhaps longer."""
+EXTREME = 0.5  # share of new items whose numbers are drawn towards the ends of their ranges
+LONGER = 0.5  # share of mutations that make an array no shorter and perhaps longer
 
 
 class CoverageState(NamedTuple):
@@ -84,10 +74,9 @@ class Coverage(Search[CoverageState]):
     buckets: int = 512
 
     def __post_init__(self) -> None:
-        check_fraction("exploration", self.exploration, one=True)
+        check_options(self, {"buckets": 1}, ["exploration"])
         if self.rarity:
             check_positive("rarity", self.rarity, finite=True)
-        check_count("buckets", self.buckets)
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> CoverageState:
         return CoverageState(
@@ -98,9 +87,7 @@ class Coverage(Search[CoverageState]):
             hits=jnp.zeros(KINDS * self.buckets, jnp.float32),
         )
 
-    def ask(
-        self, state: CoverageState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], CoverageState]:
+    def ask(self, state: CoverageState, cube: Cube, batch: int) -> Asked[CoverageState]:
         d = cube.dim
         key = jax.random.fold_in(state.key, state.round)
         # One call for all random numbers: each costs a good part of a second to compile.

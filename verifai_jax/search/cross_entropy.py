@@ -22,15 +22,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt32
 
-from verifai_jax.core.checks import check_count, check_fraction, check_positive
+from verifai_jax.core.checks import check_fraction
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import (
-    Observations,
-    Search,
-    draw_columns,
-    keep_best,
-    standard_normal,
-)
+from verifai_jax.search.base import Asked, Observations, Search, check_options
+from verifai_jax.search.best_points import keep_best
+from verifai_jax.search.draws import draw_columns, standard_normal
 from verifai_jax.search.halton import halton_points
 
 MAX_CELLS = 32
@@ -86,13 +82,9 @@ class CrossEntropy(Search[CrossEntropyState]):
     patience: int = 6
 
     def __post_init__(self) -> None:
-        check_fraction("elite", self.elite, one=True)
-        check_count("min_elite", self.min_elite, 2)
+        counts = {"min_elite": 2, "patience": 1}
+        check_options(self, counts, ["elite", "exploration", "min_std"], ["widening"])
         check_fraction("focus", self.focus, zero=True, one=True)
-        check_fraction("exploration", self.exploration, one=True)
-        check_fraction("min_std", self.min_std, one=True)
-        check_count("patience", self.patience)
-        check_positive("widening", self.widening, finite=True)
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> CrossEntropyState:
         k = max(self.min_elite, int(np.ceil(self.elite * batch)))
@@ -106,9 +98,7 @@ class CrossEntropy(Search[CrossEntropyState]):
             highest=jnp.full((), -jnp.inf, jnp.float32),
         )
 
-    def ask(
-        self, state: CrossEntropyState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], CrossEntropyState]:
+    def ask(self, state: CrossEntropyState, cube: Cube, batch: int) -> Asked[CrossEntropyState]:
         key = jax.random.fold_in(state.key, state.round)
         fitted = self._draw(key, state, cube, batch)
         row = jnp.arange(batch, dtype=jnp.uint32)

@@ -25,28 +25,23 @@ best points of all, apart from where earlier ones began and ended.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Plan, Search, Wants, choose, nearest_to_failing
+from verifai_jax.search.base import Asked, Observations, Plan, SlopeSearch, check_options, choose
 from verifai_jax.search.clause_values import comparable_clauses
 from verifai_jax.search.curvature import Curvature, advance
 from verifai_jax.search.curvature import begin as begin_curvature
 from verifai_jax.search.halton import halton_points
 
 # The first two were chosen by hand; no comparison with other values is recorded.
-NEARER = 0.5
-"""Factor on the first step of a descent that starts from a good point."""
-
-CLEARLY = 0.995
-"""Share of the lowest value so far below which a new one is clearly lower."""
-
+NEARER = 0.5  # factor on the first step of a descent that starts from a good point
+CLEARLY = 0.995  # share of the lowest value so far below which a new one is clearly lower
 SMALLEST = 1e-5
 """Trust region, in unit coordinates, below which a descent ends: float32 has seven digits."""
 
@@ -71,7 +66,7 @@ class DescentState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Descent(Search[DescentState]):
+class Descent(SlopeSearch[DescentState]):
     """L-BFGS from many starts; discrete coordinates keep their start's value.
 
     **Arguments:**
@@ -97,25 +92,10 @@ class Descent(Search[DescentState]):
     hottest: float = 0.4
     coldest: float = 0.04
     patience: int = 10
-    wants: ClassVar[Wants] = Wants(clauses=True, clause_gradients=True)
 
     def __post_init__(self) -> None:
-        check_count("descents", self.descents)
-        check_count("steps", self.steps)
-        check_count("trial", self.trial)
-        check_fraction("rate", self.rate, one=True)
-        check_fraction("kept", self.kept, one=True)
-        check_positive("hottest", self.hottest, finite=True)
-        check_positive("coldest", self.coldest, finite=True)
-        check_count("patience", self.patience)
-
-    def check(self, cube: Cube) -> None:
-        """Raise `ValueError` unless there is a continuous coordinate to move in."""
-        if cube.dim and len(cube.continuous) == 0:
-            raise ValueError(
-                f"search descent needs at least one continuous feature; all {cube.dim} unit "
-                "coordinates of this space are discrete. Use 'cross_entropy'"
-            )
+        counts = {"descents": 1, "steps": 1, "trial": 1, "patience": 1}
+        check_options(self, counts, ["rate", "kept"], ["hottest", "coldest"])
 
     @property
     def rungs(self) -> tuple[int, ...]:
@@ -142,9 +122,7 @@ class Descent(Search[DescentState]):
             useless=jnp.int32(0),
         )
 
-    def ask(
-        self, state: DescentState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], DescentState]:
+    def ask(self, state: DescentState, cube: Cube, batch: int) -> Asked[DescentState]:
         fresh = state.step == 0
         number = state.starts + jnp.cumsum(fresh).astype(jnp.uint32)
         points = halton_points(number, cube.dim, state.key)
@@ -165,8 +143,7 @@ class Descent(Search[DescentState]):
         return Plan(jnp.int32(n), jnp.array(True), temperature[jnp.arange(batch) % n])
 
     def tell(self, state: DescentState, cube: Cube, observations: Observations) -> DescentState:
-        assert observations.clauses is not None, "the descent search needs clauses"
-        assert observations.clause_gradients is not None
+        assert observations.clause_gradients is not None, "the descent search needs clauses"
         n = len(state.step)
         observed = jax.tree.map(lambda each: each[:n], observations)
         clauses = comparable_clauses(observed)
@@ -209,13 +186,6 @@ class Descent(Search[DescentState]):
             useless=jnp.where(jnp.any(informative), 0, useless).astype(jnp.int32),
         )
 
-    def warm_start(
-        self, state: DescentState, cube: Cube, observations: Observations
-    ) -> DescentState:
-        """Start the first descents from the points nearest to failing, failures left out."""
-        offered, near = nearest_to_failing(observations, state.offered, state.near)
-        return state._replace(offered=offered, near=near)
-
     def _progress(self, step: Int[Array, " n"]) -> Float[Array, " n"]:
         return jnp.minimum(step / max(self.steps - 1, 1), 1.0).astype(jnp.float32)
 
@@ -254,23 +224,12 @@ When all began at 256, CC4 took 429 simulations instead of 357, at 64, SB3 took 
 IDLE = 100.0
 """Simulations without progress of the others after which the share of the descents is greatest."""
 
-MAX_SHARE = 0.6
-"""Greatest share of the budget of the descents."""
-
-PROGRESS = 0.99
-"""Share of the lowest robustness below which a new one is progress."""
-
-TRIED = 100.0
-"""Simulations that the descents spend before what they reach is compared."""
-
-TAKEN = 16
-"""Points that are remembered as starts and ends of descents."""
-
-APART = 0.1
-"""Distance in some coordinate from all of these at which a point is a new start."""
-
-MIN_SHARE = 0.02
-"""Share of the budget at least; all there is where gradients say nothing."""
+MAX_SHARE = 0.6  # greatest share of the budget of the descents
+PROGRESS = 0.99  # share of the lowest robustness below which a new one is progress
+TRIED = 100.0  # simulations that the descents spend before what they reach is compared
+TAKEN = 16  # points that are remembered as starts and ends of descents
+APART = 0.1  # distance in some coordinate from all of these at which a point is a new start
+MIN_SHARE = 0.02  # share of the budget at least; all there is where gradients say nothing
 
 
 class InteriorState(NamedTuple):

@@ -28,11 +28,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.clauses import OUTCOME
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.errors import unknown_name
-from verifai_jax.search.base import Observations, Search, Wants
+from verifai_jax.search.base import Observations, Search, Wants, check_options
 from verifai_jax.search.behaviour import SeenBehaviour, is_known
 from verifai_jax.search.clause_values import NOTHING
 from verifai_jax.search.wrapper import Learn, Wrapper
@@ -59,6 +58,13 @@ class DiverseState(NamedTuple):
     points: Float[Array, "batch d"]  # the best points away from the archive, to begin afresh from,
     rho: Float[Array, " batch"]  # with their own robustness; infinite where there is none
     seen: SeenBehaviour | None  # by behaviour alone
+
+
+class Points(NamedTuple):
+    """Points, and by behaviour what happened there."""
+
+    u: Float[Array, "n d"]
+    happened: Float[Array, "n outcome"] | None
 
 
 @dataclass(frozen=True)
@@ -91,11 +97,7 @@ class Diverse(Wrapper[DiverseState]):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_fraction("radius", self.radius, one=True)
-        check_fraction("min_radius", self.min_radius, one=True)
-        check_fraction("shrink", self.shrink, one=True)
-        check_count("patience", self.patience)
-        check_count("capacity", self.capacity)
+        check_options(self, {"patience": 1, "capacity": 1}, ["radius", "min_radius", "shrink"])
         if self.by not in MOVES:
             raise unknown_name("way of being diverse", self.by, MOVES)
         if self.min_radius > self.radius:
@@ -178,9 +180,11 @@ class Diverse(Wrapper[DiverseState]):
             size=state.size + size.astype(jnp.float32),
             verdicts=state.verdicts + jnp.sum(usable),
         )
-        state = self._archive(state, cube, u, happened, usable & (observations.rho < 0))
+        points = Points(u, happened if seen is not None else None)
+        state = self._archive(state, cube, points, usable & (observations.rho < 0))
         discovered = state.count > before
-        raised = self._raise(state, cube, u, happened, jnp.where(usable, observations.rho, jnp.inf))
+        rho = jnp.where(usable, observations.rho, jnp.inf)
+        raised = self._raise(state, cube, points, rho)
         nearest = jnp.min(raised, initial=jnp.inf).astype(jnp.float32)
         progress = discovered | (nearest < 0.98 * state.level) | ~jnp.isfinite(state.level)
         idle = jnp.where(progress, 0, state.idle + 1).astype(jnp.int32)
@@ -191,8 +195,7 @@ class Diverse(Wrapper[DiverseState]):
             radius=jnp.where(tired, smaller, state.radius).astype(jnp.float32),
             level=jnp.where(discovered | tired, jnp.inf, jnp.minimum(state.level, nearest)),
         )
-        rho = jnp.where(usable, observations.rho, jnp.inf)
-        state = self._remember(state, cube, u, happened, rho)
+        state = self._remember(state, cube, points, rho)
         # The best points of a fruitless period lead nowhere.
         state = state._replace(rho=jnp.where(tired, jnp.inf, state.rho))
 
@@ -205,15 +208,10 @@ class Diverse(Wrapper[DiverseState]):
         return state._replace(inner=inner)
 
     def _archive(
-        self,
-        state: DiverseState,
-        cube: Cube,
-        u: Float[Array, "n d"],
-        happened: Float[Array, "n outcome"] | None,
-        failing: Bool[Array, " n"],
+        self, state: DiverseState, cube: Cube, points: Points, failing: Bool[Array, " n"]
     ) -> DiverseState:
         """Archive the failures beyond the radius of all archived ones, the farthest first."""
-        seen = state.seen
+        (u, happened), seen = points, state.seen
         kept = jnp.zeros((self.capacity, 0)) if seen is None else seen.archive
         if seen is not None and happened is not None:
             failing &= is_known(happened)
@@ -234,7 +232,7 @@ class Diverse(Wrapper[DiverseState]):
             closer = jnp.minimum(far, between[:, 0])
             return archive, kept, count + fresh.astype(count.dtype), jnp.where(fresh, closer, far)
 
-        far = jnp.min(self._distances(state, cube, u, happened), axis=1)
+        far = jnp.min(self._distances(state, cube, points), axis=1)
         max_new = min(AT_ONCE, len(u))
         start = (state.archive, kept, state.count, far)
         archive, kept, count, _ = jax.lax.fori_loop(0, max_new, add, start)
@@ -243,27 +241,19 @@ class Diverse(Wrapper[DiverseState]):
         return state._replace(archive=archive, count=count, seen=seen)
 
     def _distances(
-        self,
-        state: DiverseState,
-        cube: Cube,
-        u: Float[Array, "n d"],
-        happened: Float[Array, "n outcome"] | None,
+        self, state: DiverseState, cube: Cube, points: Points
     ) -> Float[Array, "n capacity"]:
         """Return distances to all archived failures; infinite for empty rows of the archive."""
         known = jnp.arange(self.capacity) < state.count
-        if state.seen is None or happened is None:
-            return jnp.where(known, apart(cube, u, state.archive), jnp.inf)
-        return jnp.where(known, state.seen.unlike(happened, state.seen.archive), jnp.inf)
+        if state.seen is None or points.happened is None:
+            return jnp.where(known, apart(cube, points.u, state.archive), jnp.inf)
+        return jnp.where(known, state.seen.unlike(points.happened, state.seen.archive), jnp.inf)
 
     def _nearness(
-        self,
-        state: DiverseState,
-        cube: Cube,
-        u: Float[Array, "n d"],
-        happened: Float[Array, "n outcome"] | None,
+        self, state: DiverseState, cube: Cube, points: Points
     ) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
         """Return 1 at an archived failure, 0 from one and a half radii on; and its index."""
-        far = self._distances(state, cube, u, happened)
+        far = self._distances(state, cube, points)
         nearest = jnp.argmin(far, axis=1)
         distance = jnp.min(far, axis=1)
         return jnp.clip(1 - distance / (1.5 * state.radius), 0.0, 1.0), nearest
@@ -272,24 +262,19 @@ class Diverse(Wrapper[DiverseState]):
         return 2.0 * state.size / jnp.maximum(state.verdicts, 1.0) + 1e-6
 
     def _raise(
-        self,
-        state: DiverseState,
-        cube: Cube,
-        u: Float[Array, "n d"],
-        happened: Float[Array, "n outcome"] | None,
-        rho: Float[Array, " n"],
+        self, state: DiverseState, cube: Cube, points: Points, rho: Float[Array, " n"]
     ) -> Float[Array, " n"]:
         """Raise robustness near archived failures to that of safe points and beyond."""
-        near, _ = self._nearness(state, cube, u, happened)
+        near, _ = self._nearness(state, cube, points)
         return jnp.where(near > 0, jnp.maximum(rho, 0.0) + self._scale(state) * near, rho)
 
     def _deflate(self, state: DiverseState, cube: Cube, observations: Observations) -> Observations:
         usable = observations.usable
         u = jnp.where(usable[:, None], observations.u, 0.5)
-        happened = observations.outcomes if state.seen is not None else None
-        near, nearest = self._nearness(state, cube, u, happened)
+        points = Points(u, observations.outcomes if state.seen is not None else None)
+        near, nearest = self._nearness(state, cube, points)
         inside = usable & (near > 0)
-        raised = self._raise(state, cube, u, happened, observations.rho)
+        raised = self._raise(state, cube, points, observations.rho)
         rho = jnp.where(inside, raised, observations.rho)
         changed = observations._replace(rho=rho)
         if observations.gradient is None and observations.clauses is None:
@@ -321,25 +306,19 @@ class Diverse(Wrapper[DiverseState]):
         return changed
 
     def _remember(
-        self,
-        state: DiverseState,
-        cube: Cube,
-        u: Float[Array, "n d"],
-        happened: Float[Array, "n outcome"] | None,
-        rho: Float[Array, " n"],
+        self, state: DiverseState, cube: Cube, points: Points, rho: Float[Array, " n"]
     ) -> DiverseState:
         """Update the best points so far that are away from the archive."""
-        points = jnp.concatenate([u, state.points])
         values = jnp.concatenate([rho.astype(jnp.float32), state.rho])
-        seen = state.seen
+        seen, happened = state.seen, points.happened
         if seen is not None and happened is not None:
             happened = jnp.concatenate([happened, seen.best])
-        raised = self._raise(state, cube, points, happened, values)
-        score = jnp.where(jnp.isfinite(values), raised, jnp.inf)
+        both = Points(jnp.concatenate([points.u, state.points]), happened)
+        score = jnp.where(jnp.isfinite(values), self._raise(state, cube, both, values), jnp.inf)
         _, best = jax.lax.top_k(-score, len(state.rho))
         if seen is not None and happened is not None:
             state = state._replace(seen=seen._replace(best=happened[best]))
-        return state._replace(points=points[best], rho=values[best])
+        return state._replace(points=both.u[best], rho=values[best])
 
     def _restart(self, state: DiverseState, cube: Cube) -> PyTree:
         """Start the search inside afresh, from the remembered points alone."""
@@ -348,7 +327,7 @@ class Diverse(Wrapper[DiverseState]):
         known = jnp.isfinite(state.rho)
         happened = None if state.seen is None else state.seen.best
         rho = jnp.where(known, state.rho, 1.0)
-        raised = self._raise(state, cube, state.points, happened, rho)
+        raised = self._raise(state, cube, Points(state.points, happened), rho)
         observed = Observations(state.points, raised, known, outcomes=happened)
         return self.search.warm_start(inner, cube, observed)
 

@@ -18,15 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import (
-    Observations,
-    Search,
-    draw_columns,
-    keep_best,
-    standard_normal,
-)
+from verifai_jax.search.base import Asked, Observations, Search, check_options
+from verifai_jax.search.best_points import keep_best
+from verifai_jax.search.draws import draw_columns, standard_normal
 from verifai_jax.search.moves import all_or_some, has_fine_cells
 
 # Chosen by hand; no comparison with other values is recorded. With them the search is held to 4
@@ -79,14 +74,8 @@ class EpsilonGreedy(Search[EpsilonGreedyState]):
     doubt: float = 3.0
 
     def __post_init__(self) -> None:
-        check_fraction("epsilon", self.epsilon, one=True)
-        check_fraction("best", self.best, one=True)
-        check_count("min_best", self.min_best, 2)
-        check_positive("reach", self.reach, finite=True)
-        check_fraction("min_std", self.min_std, one=True)
-        check_count("begin", self.begin)
-        check_count("patience", self.patience)
-        check_positive("doubt", self.doubt, finite=True)
+        counts = {"min_best": 2, "begin": 1, "patience": 1}
+        check_options(self, counts, ["epsilon", "best", "min_std"], ["reach", "doubt"])
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> EpsilonGreedyState:
         k = max(self.min_best, int(np.ceil(self.best * batch)))
@@ -103,9 +92,7 @@ class EpsilonGreedy(Search[EpsilonGreedyState]):
             better=jnp.float32(0),
         )
 
-    def ask(
-        self, state: EpsilonGreedyState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], EpsilonGreedyState]:
+    def ask(self, state: EpsilonGreedyState, cube: Cube, batch: int) -> Asked[EpsilonGreedyState]:
         key = jax.random.fold_in(state.key, state.asks)
         d, k = cube.dim, len(cube.discrete)
         row, prior, noise, inherit, move, choice = draw_columns(key, batch, 5, d, d, d, d, k)

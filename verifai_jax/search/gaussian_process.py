@@ -14,14 +14,14 @@ covariance of independent noise and the target zero, which changes nothing.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jax.scipy.special import ndtri
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Key, PyTree
 
 VARIANCE = (-3.0, 4.0)
 """Range of the logarithm of the variance. Data have variance 1, whose logarithm is well inside."""
@@ -31,11 +31,12 @@ LENGTH = (-4.0, 8.0)
 few hundred points say nothing about what lies between them, to 3000 cubes, where a coordinate is of
 no influence."""
 
-NOISE = (-11.0, 0.0)
-"""Range of the logarithm of the noise, which keeps 32-bit factors finite."""
+NOISE = (-11.0, 0.0)  # range of the logarithm of the noise, which keeps 32-bit factors finite
+SMALLEST = 2.0**-24  # smallest uniform number above zero, where a normal quantile is infinite
 
-SMALLEST = 2.0**-24
-"""Smallest uniform number above zero, where a normal quantile is infinite."""
+
+Fitted = TypeVar("Fitted", bound=PyTree)
+"""Hyper-parameters: a pytree of arrays."""
 
 
 class Hyper(NamedTuple):
@@ -137,25 +138,7 @@ class GaussianProcess:
         def loss(hyper: Hyper) -> Float[Array, ""]:
             return -self.evidence(hyper, data) - self.log_prior(hyper)
 
-        def step(carry: tuple[Hyper, Hyper, Hyper], count: Array) -> tuple:
-            hyper, first, second = carry
-            gradient = jax.grad(loss)(hyper)
-            finite = jax.tree.map(lambda g: jnp.all(jnp.isfinite(g)), gradient)
-            ok = jnp.all(jnp.stack(jax.tree.leaves(finite)))
-            gradient = jax.tree.map(lambda g: jnp.where(ok, g, 0.0), gradient)
-            first = jax.tree.map(lambda m, g: 0.8 * m + 0.2 * g, first, gradient)
-            second = jax.tree.map(lambda v, g: 0.95 * v + 0.05 * g**2, second, gradient)
-
-            def update(h: Array, m: Array, v: Array) -> Array:
-                root = jnp.sqrt(v / (1 - 0.95**count)) + 1e-8
-                return h - rate * (m / (1 - 0.8**count)) / root
-
-            return (_bounded(jax.tree.map(update, hyper, first, second)), first, second), None
-
-        zero = jax.tree.map(jnp.zeros_like, hyper)
-        counts = jnp.arange(1, steps + 1, dtype=hyper.variance.dtype)
-        (fitted, _, _), _ = jax.lax.scan(step, (hyper, zero, zero), counts)
-        return fitted
+        return adam(loss, hyper, steps, rate, _bounded)
 
     def condition(self, hyper: Hyper, data: TrainingData) -> Posterior:
         """Condition the process on these observations."""
@@ -252,6 +235,40 @@ class GaussianProcess:
         """Return indices of the quantities and of the codes."""
         codes = np.array(self.unordered, bool)
         return np.flatnonzero(~codes), np.flatnonzero(codes)
+
+
+def adam(
+    loss: Callable[[Fitted], Array],
+    start: Fitted,
+    steps: int,
+    rate: float,
+    bounded: Callable[[Fitted], Fitted],
+) -> Fitted:
+    """Minimise a loss by Adam (Kingma, Ba, Adam: a method for stochastic optimization, ICLR 2015).
+
+    A step that is not finite is not taken, and `bounded` returns what a step leads to within its
+    range.
+    """
+
+    def step(carry: tuple[Fitted, Fitted, Fitted], count: Array) -> tuple:
+        value, first, second = carry
+        slope = jax.grad(loss)(value)
+        finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(slope)]
+        ok = jnp.all(jnp.stack(finite))
+        slope = jax.tree.map(lambda g: jnp.where(ok, g, 0.0), slope)
+        first = jax.tree.map(lambda m, g: 0.8 * m + 0.2 * g, first, slope)
+        second = jax.tree.map(lambda v, g: 0.95 * v + 0.05 * g**2, second, slope)
+
+        def update(h: Array, m: Array, v: Array) -> Array:
+            root = jnp.sqrt(v / (1 - 0.95**count)) + 1e-8
+            return h - rate * (m / (1 - 0.8**count)) / root
+
+        return (bounded(jax.tree.map(update, value, first, second)), first, second), None
+
+    zero = jax.tree.map(jnp.zeros_like, start)
+    counts = jnp.arange(1, steps + 1, dtype=jax.tree.leaves(start)[0].dtype)
+    (fitted, _, _), _ = jax.lax.scan(step, (start, zero, zero), counts)
+    return fitted
 
 
 def finite_factor(

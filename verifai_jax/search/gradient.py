@@ -23,26 +23,19 @@ already, the first box is smaller still.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from verifai_jax.core.checks import check_count, check_fraction, check_positive
+from verifai_jax.core.checks import check_positive
 from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import (
-    Observations,
-    Plan,
-    Search,
-    Wants,
-    choose,
-    draw_uniform,
-    nearest_to_failing,
-)
-from verifai_jax.search.clause_values import NOTHING
+from verifai_jax.search.base import Asked, Observations, Plan, SlopeSearch, check_options, choose
+from verifai_jax.search.clause_values import NOTHING, comparable_clauses
+from verifai_jax.search.draws import draw_uniform
 from verifai_jax.search.halton import halton_points
 from verifai_jax.search.linear_steps import HALVINGS, flip_weakest, minimax_direction
 
@@ -105,7 +98,7 @@ class GradientState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Gradient(Search[GradientState]):
+class Gradient(SlopeSearch[GradientState]):
     """Sequential linear programming on the clauses; discrete coordinates keep their start's value.
 
     **Arguments:**
@@ -131,15 +124,10 @@ class Gradient(Search[GradientState]):
     patience: int = 4
     temperatures: tuple[float, ...] = (0.002, 0.05, 0.2)
     coldest: float = 0.001
-    wants: ClassVar[Wants] = Wants(clauses=True, clause_gradients=True)
 
     def __post_init__(self) -> None:
-        check_count("descents", self.descents)
-        check_fraction("shrinks", self.shrinks, one=True)
-        check_fraction("min_radius", self.min_radius, one=True)
-        check_count("flips", self.flips, 0)
-        check_count("patience", self.patience)
-        check_positive("coldest", self.coldest, finite=True)
+        counts = {"descents": 1, "flips": 0, "patience": 1}
+        check_options(self, counts, ["shrinks", "min_radius"], ["coldest"])
         if self.shrinks == 1:
             raise ValueError("shrinks must be less than 1; got 1")
         object.__setattr__(self, "temperatures", tuple(self.temperatures))
@@ -147,14 +135,6 @@ class Gradient(Search[GradientState]):
             raise ValueError("temperatures must have at least one entry; got none")
         for temperature in self.temperatures:
             check_positive("temperatures", temperature, finite=True)
-
-    def check(self, cube: Cube) -> None:
-        """Raise `ValueError` unless there is a continuous coordinate to move in."""
-        if cube.dim and len(cube.continuous) == 0:
-            raise ValueError(
-                f"search gradient needs at least one continuous feature; all {cube.dim} unit "
-                "coordinates of this space are discrete. Use 'cross_entropy'"
-            )
 
     def at_once(self, batch: int) -> int:
         """Return the number of descents in batches of this size."""
@@ -187,9 +167,7 @@ class Gradient(Search[GradientState]):
             differentiates=jnp.array(False),
         )
 
-    def ask(
-        self, state: GradientState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], GradientState]:
+    def ask(self, state: GradientState, cube: Cube, batch: int) -> Asked[GradientState]:
         if not cube.dim:  # One point is all that there is.
             return jnp.zeros((batch, 0), jnp.float32), state._replace(rows=jnp.int32(batch))
         n = self.at_once(batch)
@@ -260,10 +238,7 @@ class Gradient(Search[GradientState]):
         n, batch = len(state.fresh), len(observations.rho)
         mine = jnp.arange(batch) < state.rows
         usable = observations.usable & mine
-        # A single clause is the robustness itself, whose scale does not change from trace to trace.
-        several = observations.clauses[:, 1] > NOTHING
-        first = jnp.where(several, observations.clauses[:, 0], observations.rho)
-        clauses = jnp.where(usable[:, None], observations.clauses.at[:, 0].set(first), 0.0)
+        clauses = jnp.where(mine[:, None], comparable_clauses(observations), 0.0)
         merit = jnp.where(usable, jnp.max(clauses, axis=1), jnp.inf)
         owner = (state.descent[None] == jnp.arange(n)[:, None]) & mine[None]
         # For each descent the best of its rows, the first of equally good ones.
@@ -333,13 +308,6 @@ class Gradient(Search[GradientState]):
             slow=jnp.where(visited & better, slow, state.slow).astype(jnp.int32),
         )
         return choose(state.differentiates, differentiated, undifferentiated)
-
-    def warm_start(
-        self, state: GradientState, cube: Cube, observations: Observations
-    ) -> GradientState:
-        """Start the first descents from the points nearest to failing, failures left out."""
-        offered, near = nearest_to_failing(observations, state.offered, state.near)
-        return state._replace(offered=offered, near=near)
 
     def start_from(
         self, state: GradientState, cube: Cube, observations: Observations

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Key, UInt32
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search
+from verifai_jax.search.base import Asked, PointSequence
 
 MAX_POINTS = 2**31 - 1
 """Maximum number of points of a grid: numbers of points are 32 bits, and sums of two of them
@@ -34,7 +34,7 @@ class GridState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Grid(Search[GridState]):
+class Grid(PointSequence[GridState]):
     """A grid with both ends of each continuous coordinate and the middle of each cell.
 
     Its points come once each, in a random order that the seed decides. So a budget below the size
@@ -51,7 +51,6 @@ class Grid(Search[GridState]):
     """
 
     points: int | tuple[int, ...] = 21
-    learns: ClassVar[bool] = False
     sequence: ClassVar[tuple[str, str]] = "grid", "in a random order over the whole of it"
 
     def __post_init__(self) -> None:
@@ -85,9 +84,7 @@ class Grid(Search[GridState]):
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> GridState:
         return GridState(jnp.uint32(0), jax.random.bits(key, (STEPS,), jnp.uint32))
 
-    def ask(
-        self, state: GridState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], GridState]:
+    def ask(self, state: GridState, cube: Cube, batch: int) -> Asked[GridState]:
         total = self.total(cube)
         number = state.index + jnp.arange(batch, dtype=jnp.uint32)
         number = permuted(jnp.minimum(number, np.uint32(total - 1)), total, state.keys)
@@ -112,9 +109,6 @@ class Grid(Search[GridState]):
         sizes = np.array(self._sizes(cube)[k:], np.int32)
         steps = digits[:, k:] / np.maximum(sizes - 1, 1).astype(np.float32)
         return u.at[:, cube.continuous].set(jnp.where(sizes > 1, steps, np.float32(0.5)))
-
-    def tell(self, state: GridState, cube: Cube, observations: Observations) -> GridState:
-        return state
 
     def _sizes(self, cube: Cube) -> tuple[int, ...]:
         """Return the number of values of each coordinate, the fastest first: discrete ones."""

@@ -8,7 +8,7 @@ the base.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,11 +17,10 @@ from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, draw_uniform
+from verifai_jax.search.base import Asked, PointSequence
+from verifai_jax.search.draws import draw_uniform
 
-BITS = 32
-"""Bits of the index of a point: JAX has no wider integers by default."""
-
+BITS = 32  # bits of the index of a point: JAX has no wider integers by default
 PLAIN_UP_TO = 8
 """Number of bases up to which the sequence is plain: in larger ones lines are visible."""
 
@@ -29,9 +28,7 @@ MAX_IN_LOOP = 2**14
 """Coordinates of points computed in a loop, which compiles in a third of the time; more run ten
 times as fast where the loop is written out."""
 
-MAX_SKIPPED_POINTS = 2**31
-"""Maximum number of skipped points, so that as many indices remain."""
-
+MAX_SKIPPED_POINTS = 2**31  # maximum number of skipped points, so that as many indices remain
 MAX_SKIPPED_BASES = 10_000
 """Maximum number of skipped bases: in bases beyond, which are
 over 100 000, the points of most runs have a single digit and lie on a line."""
@@ -43,7 +40,7 @@ class HaltonState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Halton(Search[HaltonState]):
+class Halton(PointSequence[HaltonState]):
     """Halton points, the first one with index 1; the same for any batch size, up to rounding.
 
     **Arguments:**
@@ -63,7 +60,6 @@ class Halton(Search[HaltonState]):
     scramble: bool | None = None
     skip_points: int = 0
     skip_bases: int = 0
-    learns: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if self.scramble is not None and not isinstance(self.scramble, bool):
@@ -80,17 +76,12 @@ class Halton(Search[HaltonState]):
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> HaltonState:
         return HaltonState(key, jnp.uint32(1 + self.skip_points))
 
-    def ask(
-        self, state: HaltonState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], HaltonState]:
+    def ask(self, state: HaltonState, cube: Cube, batch: int) -> Asked[HaltonState]:
         last = self.skip_bases + cube.dim
         scramble = last > PLAIN_UP_TO if self.scramble is None else self.scramble
         index = state.index + jnp.arange(batch, dtype=jnp.uint32)
         u = halton_points(index, cube.dim, state.key if scramble else None, self.skip_bases)
         return u, state._replace(index=state.index + batch)
-
-    def tell(self, state: HaltonState, cube: Cube, observations: Observations) -> HaltonState:
-        return state
 
 
 def halton_points(

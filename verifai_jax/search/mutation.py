@@ -22,15 +22,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt32
 
-from verifai_jax.core.checks import check_count, check_fraction
+from verifai_jax.core.checks import check_fraction
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import (
-    Observations,
-    Search,
-    draw_columns,
-    keep_best,
-    standard_normal,
-)
+from verifai_jax.search.base import Asked, Observations, Search, check_options
+from verifai_jax.search.best_points import keep_best
+from verifai_jax.search.draws import draw_columns, standard_normal
 
 # The numbers below were chosen by hand. Nine variants were compared on NN of the ARCH competition:
 # half to a sixth of the exploration, steps up to 0.2, eight and sixteen parents, patience of 80.
@@ -39,28 +35,16 @@ from verifai_jax.search.base import (
 PARENTS = 4
 """Best points that are mutated; each half as often as the one before. Of failures all are."""
 
-MIN_STEP = 0.02
-"""Smallest standard deviation of steps, in unit coordinates; they are log-uniform."""
-
-MAX_STEP = 0.6
-"""Largest standard deviation of steps, in unit coordinates."""
-
-MAX_EXPLORATION = 0.9
-"""Share of proposals that explore after many simulations without progress."""
-
-EVENLY = 0.1
-"""Share of exploration that samples the prior; it grows where nothing else helps."""
-
+MIN_STEP = 0.02  # smallest standard deviation of steps, in unit coordinates; they are log-uniform
+MAX_STEP = 0.6  # largest standard deviation of steps, in unit coordinates
+MAX_EXPLORATION = 0.9  # share of proposals that explore after many simulations without progress
+EVENLY = 0.1  # share of exploration that samples the prior; it grows where nothing else helps
 FEW = 4
 """Dimensions below which corners are few, and points that are spread find soon what descents find:
 more of exploration samples the prior, and the portfolio descends less before there is evidence."""
 
-SELDOM = 0.35
-"""Share of exploration in which signals change seldom."""
-
-SWINGING = 0.35
-"""Share of exploration in which signals swing to and fro."""
-
+SELDOM = 0.35  # share of exploration in which signals change seldom
+SWINGING = 0.35  # share of exploration in which signals swing to and fro
 TO_AND_FRO = 0.9
 """Share of control points, in such signals, on the other side of the middle than the one before."""
 
@@ -99,12 +83,8 @@ class Mutation(Search[MutationState]):
     patience: int = 400
 
     def __post_init__(self) -> None:
-        check_count("kept", self.kept, 6)
-        check_count("first", self.first)
-        check_fraction("exploration", self.exploration, one=True)
+        check_options(self, {"kept": 6, "first": 1, "idle": 1, "patience": 1}, ["exploration"])
         check_fraction("difference", self.difference, zero=True, one=True)
-        check_count("idle", self.idle)
-        check_count("patience", self.patience)
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> MutationState:
         return MutationState(
@@ -117,9 +97,7 @@ class Mutation(Search[MutationState]):
             highest=jnp.full((), -jnp.inf, jnp.float32),
         )
 
-    def ask(
-        self, state: MutationState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], MutationState]:
+    def ask(self, state: MutationState, cube: Cube, batch: int) -> Asked[MutationState]:
         d = cube.dim
         key = jax.random.fold_in(state.key, state.round)
         coins, values, cuts, masks, noise = draw_columns(key, batch, 16, d, d, d, d)

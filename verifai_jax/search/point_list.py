@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Origin, Search
+from verifai_jax.search.base import Asked, Origin, PointSequence
 
 
 class PointListState(NamedTuple):
@@ -17,7 +17,7 @@ class PointListState(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PointList(Search[PointListState]):
+class PointList(PointSequence[PointListState]):
     """Given points of the unit cube, one after the other; it ends with the last one.
 
     **Arguments:**
@@ -29,7 +29,6 @@ class PointList(Search[PointListState]):
     """
 
     points: Float[Array | np.ndarray, "n d"] | Sequence[Sequence[float]]
-    learns: ClassVar[bool] = False
     origin: ClassVar[Origin] = "given"
 
     def __post_init__(self) -> None:
@@ -51,14 +50,9 @@ class PointList(Search[PointListState]):
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> PointListState:
         return PointListState(jnp.int32(0))
 
-    def ask(
-        self, state: PointListState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], PointListState]:
+    def ask(self, state: PointListState, cube: Cube, batch: int) -> Asked[PointListState]:
         rows = jnp.minimum(state.index + jnp.arange(batch), len(self.points) - 1)
         return jnp.asarray(self.points)[rows], PointListState(state.index + batch)
-
-    def tell(self, state: PointListState, cube: Cube, observations: Observations) -> PointListState:
-        return state
 
     def __repr__(self) -> str:
         return f"PointList({len(self.points)} points)"

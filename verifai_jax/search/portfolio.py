@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Plan, Search, Wants, choose
+from verifai_jax.search.base import Asked, Observations, Plan, Search, Wants, choose
 from verifai_jax.search.clause_values import without_clauses
 from verifai_jax.search.cross_entropy import CrossEntropy, CrossEntropyState
 from verifai_jax.search.descent import (
@@ -41,9 +41,7 @@ from verifai_jax.search.gradient import Gradient, GradientState
 from verifai_jax.search.mutation import FEW, Mutation, MutationState
 from verifai_jax.search.wrapper import Wrapper
 
-GRADIENT, MUTATION, CROSS_ENTROPY = range(3)
-"""Numbers of the members."""
-
+GRADIENT, MUTATION, CROSS_ENTROPY = range(3)  # numbers of the members
 PRIOR_GAINS = 4.0, 2.5
 """Gains before there is evidence, of descents and of the other two together: as if descents had
 succeeded always. Chosen by hand; no comparison with other values is recorded."""
@@ -53,9 +51,7 @@ FILLED = 8
 in rounds of one simulation, where it draws from the prior alone. With a fifth in batches of 16
 five problems of choices and numbers took up to 1.5 times as many simulations."""
 
-PRIOR_COSTS = 4.0
-"""Cost of these gains, in simulations: few, so that evidence soon decides."""
-
+PRIOR_COSTS = 4.0  # cost of these gains, in simulations: few, so that evidence soon decides
 DISCOUNT = 0.98
 """Discount of evidence, for each simulation since: that of 50 simulations ago counts a third.
 Chosen by hand; no comparison with other values is recorded."""
@@ -187,9 +183,7 @@ class Portfolio(Search[PortfolioState]):
             return PortfolioStage(self, descends=True)
         return self
 
-    def ask(
-        self, state: PortfolioState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], PortfolioState]:
+    def ask(self, state: PortfolioState, cube: Cube, batch: int) -> Asked[PortfolioState]:
         before = state
         mutated, mutation = Mutation().ask(state.mutation, cube, batch)
         drawn, cross_entropy = self._cross_entropy(batch).ask(state.cross_entropy, cube, batch)

@@ -2,27 +2,32 @@
 
     process_of(cube)                                    # which coordinates are codes
     training_data(u, score, cube)                       # rows whose score is not finite are absent
+    memory.with_rows(u, score).refitted(cube, 12, 8)    # what two searches keep of their rounds
 
 All failures are equally good, and huge values do not hide the rest.
 """
 
+from typing import NamedTuple
+
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations
-from verifai_jax.search.gaussian_process import GaussianProcess, TrainingData
+from verifai_jax.search.gaussian_process import GaussianProcess, Hyper, Posterior, TrainingData
 
 CAP = 30.0
 """Quartiles of the robustness above which all values are the same to the process, so that a few
 huge ones do not hide the rest. Chosen by hand; no comparison with other values is recorded."""
 
-LARGEST = 1e30
-"""Robustness above which nothing differs: sums of such stay finite in float32."""
+LARGEST = 1e30  # robustness above which nothing differs: sums of such stay finite in float32
+NO_VERDICT = 2e30  # score of a simulation without a verdict
 
-NO_VERDICT = 2e30
-"""Score of a simulation without a verdict."""
+
+FIT_POINTS = 192
+"""Points that hyper-parameters are fitted to. Chosen by hand; no comparison is recorded."""
 
 
 def scores(observations: Observations) -> Float[Array, " n"]:
@@ -79,3 +84,77 @@ def rows_to_keep(
     rank = jnp.argsort(jnp.lexsort((luck, score)))
     best = (rank < count // 2) & jnp.isfinite(score)
     return jnp.argsort(jnp.where(best, -1.0, jnp.where(jnp.isfinite(score), luck, 2.0)))[:count]
+
+
+class ProcessMemory(NamedTuple):
+    """The points that a process knows, and its hyper-parameters."""
+
+    results: UInt32[Array, ""]  # rows, in all
+    u: Float[Array, "capacity d"]
+    score: Float[Array, " capacity"]  # as of `scores`; infinite where no point is
+    luck: Float[Array, " capacity"]  # says which points are kept
+    verdicts: Int[Array, ""]  # points with a verdict, in all
+    fitted: Int[Array, ""]  # of which the last fit knew
+    hyper: Hyper
+
+    @classmethod
+    def nothing(cls, capacity: int, cube: Cube) -> "ProcessMemory":
+        """Return the memory before the first round."""
+        return cls(
+            results=jnp.uint32(0),
+            u=jnp.full((capacity, cube.dim), 0.5, jnp.float32),
+            score=jnp.full(capacity, jnp.inf, jnp.float32),
+            luck=jnp.zeros(capacity, jnp.float32),
+            verdicts=jnp.int32(0),
+            fitted=jnp.int32(0),
+            hyper=process_of(cube).first(),
+        )
+
+    def emptied(self, cube: Cube) -> "ProcessMemory":
+        """Return the memory without its points; their rows are counted on."""
+        return ProcessMemory.nothing(len(self.score), cube)._replace(
+            results=self.results, u=self.u, luck=self.luck
+        )
+
+    def says_something(self, initial: int) -> Bool[Array, ""]:
+        """Return whether there are so many verdicts, and a difference to learn from."""
+        present = self.score <= LARGEST
+        lowest = jnp.min(self.score, where=present, initial=jnp.inf)
+        spread = jnp.max(self.score, where=present, initial=0.0) > lowest
+        return spread & (self.verdicts >= initial)
+
+    def with_rows(self, u: Float[Array, "n d"], score: Float[Array, " n"]) -> "ProcessMemory":
+        """Return the memory with the rows of a round, and without as many if it is full."""
+        usable = jnp.isfinite(score)
+        number = self.results + jnp.arange(len(score), dtype=jnp.uint32)
+        # A Weyl sequence (in steps of the golden ratio): as good as random for choosing.
+        luck = (number * np.uint32(2654435769) >> 8).astype(jnp.float32) / 2**24
+        verdicts = jnp.sum(score <= LARGEST, dtype=jnp.int32)
+        u = jnp.concatenate([jnp.where(usable[:, None], u, 0.5), self.u])
+        score = jnp.concatenate([score, self.score])
+        luck = jnp.concatenate([luck, self.luck])
+        rows = rows_to_keep(score, luck, len(self.score))
+        return self._replace(
+            results=self.results + np.uint32(len(usable)),
+            u=u[rows],
+            score=score[rows],
+            luck=luck[rows],
+            verdicts=self.verdicts + verdicts,
+        )
+
+    def refitted(self, cube: Cube, initial: int, steps: int) -> "ProcessMemory":
+        """Fit the hyper-parameters again, from the last ones on, when a quarter more is known."""
+
+        def fit() -> Hyper:
+            some = rows_to_keep(self.score, self.luck, min(FIT_POINTS, len(self.score)))
+            data = training_data(self.u, self.score, cube)
+            data = jax.tree.map(lambda leaf: leaf[some], data)
+            return process_of(cube).fit(self.hyper, data, steps)
+
+        due = (self.verdicts >= initial) & (4 * (self.verdicts - self.fitted) >= self.fitted)
+        hyper = jax.lax.cond(due, fit, lambda: self.hyper)
+        return self._replace(hyper=hyper, fitted=jnp.where(due, self.verdicts, self.fitted))
+
+    def posterior(self, cube: Cube) -> Posterior:
+        """Return the process given these points."""
+        return process_of(cube).condition(self.hyper, training_data(self.u, self.score, cube))

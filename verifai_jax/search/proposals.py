@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from verifai_jax.core.clauses import ABSENT, CLAUSES, OUTCOME
+from verifai_jax.core.clauses import ABSENT, CLAUSES
 from verifai_jax.core.compilation import Compilation
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Plan, Search
@@ -35,6 +35,11 @@ one point in ten is allowed, 32 asks leave a row refused in one of thirty cases.
 MAX_REFUSED = 2000
 """Asks in a row without a single accepted point, after which a run ends: in rounds of 16 these
 are 32 000 points, among which one allowed in ten thousand would be met."""
+
+FILLERS = {
+    "gradient": 0.0, "clauses": 0.0, "clause_gradients": 0.0, "coverage_ids": -1, "outcomes": np.nan
+}  # fmt: skip
+"""Entries of observations that say nothing, by the name of the part."""
 
 
 class ConstraintError(ValueError):
@@ -156,38 +161,23 @@ class Proposals:
             return
         if self.search.wants.no_verdict_rows:
             rho, valid = np.where(valid, rho, np.float32(np.nan)), np.ones(len(rho), bool)
-        observations = Observations(
-            u=self._points,
-            rho=self._spread(rho, np.nan),
-            valid=self._spread(valid, False),
-            gradient=None if gradient is None else self._spread(gradient, 0.0),
-        )
-        if self.search.wants.clauses:
-            none = np.zeros((len(rho), CLAUSES, self.cube.dim), np.float32)
-            if clauses is None:
-                # Every goal has one, whose value is the robustness.
-                clauses = np.full((len(rho), CLAUSES), ABSENT, np.float32)
-                clauses[:, 0] = rho
-            observations = observations._replace(
-                clauses=self._spread(clauses, 0.0),
-                clause_gradients=self._spread(
-                    none if clause_gradients is None else clause_gradients, 0.0
-                ),
-            )
-        if self.search.wants.coverage_ids:
-            whole = np.zeros((len(rho), 0), np.int32) if coverage_ids is None else coverage_ids
-            observations = observations._replace(coverage_ids=self._spread(whole, -1))
-        if self.search.wants.outcomes:
-            unknown = np.full((len(rho), OUTCOME), np.nan, np.float32)
-            known = unknown if outcomes is None else outcomes
-            observations = observations._replace(outcomes=self._spread(known, np.nan))
+        if self.search.wants.clauses and clauses is None:
+            # Every goal has one, whose value is the robustness.
+            clauses = np.full((len(rho), CLAUSES), ABSENT, np.float32)
+            clauses[:, 0] = rho
+        known = {
+            "gradient": gradient,
+            "clauses": clauses,
+            "clause_gradients": clause_gradients,
+            "coverage_ids": coverage_ids,
+            "outcomes": outcomes,
+        }
+        observations = self._observed(self._points, self._rows, rho, valid, known)
         self._state = self._program.tell(self._state, observations)
 
     def tell_refused(self) -> None:
         """Let the search know that no row of the last round could be simulated."""
-        gradient = np.zeros((0, self.cube.dim), np.float32) if self.search.wants.gradient else None
-        coverage_ids = np.zeros((0, self._coverage_ids), np.int32)
-        self.tell(np.zeros(0, np.float32), np.zeros(0, bool), gradient, coverage_ids=coverage_ids)
+        self.tell(np.zeros(0, np.float32), np.zeros(0, bool), None)
 
     def warm_start(
         self,
@@ -225,19 +215,41 @@ class Proposals:
             learn = getattr(self.search, verb)
             self._verbs[verb] = jax.jit(lambda state, rows: learn(state, self.cube, rows))
         for start in range(0, len(u), self.batch):
-            part, values = u[start : start + self.batch], rho[start : start + self.batch]
-            missing = self.batch - len(part)
-            observations = Observations(
-                u=np.pad(part.astype(np.float32), ((0, missing), (0, 0)), constant_values=0.5),  # pyright: ignore[reportArgumentType]
-                rho=np.pad(values.astype(np.float32), (0, missing), constant_values=np.nan),  # pyright: ignore[reportArgumentType]
-                valid=np.arange(self.batch) < len(part),  # pyright: ignore[reportArgumentType]
+            part = slice(start, start + self.batch)
+            rows = np.arange(len(u[part]))
+            points = self._spread(u[part].astype(np.float32), rows, 0.5)
+            values, known = rho[part].astype(np.float32), None
+            if outcomes is not None:
+                known = outcomes[part]
+            observations = self._observed(
+                points, rows, values, np.ones(len(rows), bool), {"outcomes": known}
             )
-            if self.search.wants.outcomes:
-                whole = np.full((self.batch, OUTCOME), np.nan, np.float32)
-                if outcomes is not None:
-                    whole[: len(part)] = outcomes[start : start + self.batch]
-                observations = observations._replace(outcomes=whole)  # pyright: ignore[reportArgumentType]
             self._state = self._verbs[verb](self._state, observations)
+
+    def _observed(
+        self,
+        points: Any,
+        rows: Int[np.ndarray, " m"],
+        rho: Float[np.ndarray, " m"],
+        valid: Bool[np.ndarray, " m"],
+        known: Mapping[str, Any],
+    ) -> Observations:
+        """Return the observations of a whole batch, of which these rows were simulated.
+
+        - `known`: further parts by name, which the search gets if it wants them; None for nothing.
+        """
+        form = self.search.wants.form(self.cube, len(rho), self._coverage_ids)
+        parts = {}
+        for name, values in known.items():
+            wanted = getattr(form, name)
+            if wanted is not None:
+                filler = FILLERS[name]
+                if values is None:
+                    values = np.full(wanted.shape, filler, wanted.dtype)
+                parts[name] = self._spread(values, rows, filler)
+        return Observations(
+            points, self._spread(rho, rows, np.nan), self._spread(valid, rows, False), **parts
+        )
 
     def begin_stage(self) -> bool:
         """Compile the parts of the search that take part in the next round, in the background.
@@ -386,12 +398,12 @@ class Proposals:
         anywhere = self._plan is not None and not bool(self._plan.differentiate)
         return self._repetition.avoid(np.asarray(points), wanted, anywhere, self.proposed)
 
-    def _spread(self, values: np.ndarray, filler: float) -> Any:
-        """Put values of the simulated rows into an array of all rows of the batch."""
+    def _spread(self, values: np.ndarray, rows: Int[np.ndarray, " m"], filler: float) -> Any:
+        """Put values of these rows into an array of all rows of the batch."""
         if len(values) == self.batch:
             return values
         whole = np.full((self.batch, *values.shape[1:]), filler, values.dtype)
-        whole[self._rows] = values
+        whole[rows] = values
         return whole
 
     def _give_up(self) -> NoReturn:

@@ -12,15 +12,15 @@ import importlib.util
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key, UInt32
+from jaxtyping import Array, Key, UInt32
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search
+from verifai_jax.search.base import Asked, PointSequence
 
 BITS = 32
 """Bits of the index of a point: JAX has no wider integers by default."""
@@ -36,7 +36,7 @@ class SobolState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Sobol(Search[SobolState]):
+class Sobol(PointSequence[SobolState]):
     """Sobol' points, the first one with index 0; the same for any batch size.
 
     The first `2^k` points, and each `2^k` after them, are the most even. Unscrambled, the first
@@ -53,7 +53,6 @@ class Sobol(Search[SobolState]):
     """
 
     scramble: bool = True
-    learns: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not isinstance(self.scramble, bool):
@@ -77,9 +76,7 @@ class Sobol(Search[SobolState]):
             directions, shift = _scramble(directions, random[1:]), random[0]
         return SobolState(directions, shift, jnp.uint32(0))
 
-    def ask(
-        self, state: SobolState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], SobolState]:
+    def ask(self, state: SobolState, cube: Cube, batch: int) -> Asked[SobolState]:
         index = state.index + jnp.arange(batch, dtype=jnp.uint32)
         gray = (index ^ (index >> 1))[:, None]
         digits = jnp.broadcast_to(state.shift, (batch, cube.dim))
@@ -88,9 +85,6 @@ class Sobol(Search[SobolState]):
         # A float32 in [0, 1) holds 24 digits.
         u = (digits >> 8).astype(jnp.float32) * np.float32(2**-24)
         return u, state._replace(index=state.index + batch)
-
-    def tell(self, state: SobolState, cube: Cube, observations: Observations) -> SobolState:
-        return state
 
 
 @lru_cache(maxsize=8)

@@ -18,9 +18,8 @@ from typing import Any, NoReturn, TypeAlias
 
 from jaxtyping import PyTree
 
-from verifai_jax.core.checks import check_count
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Search
+from verifai_jax.search.base import Search, check_options
 from verifai_jax.search.portfolio import Portfolio
 from verifai_jax.search.wrapper import Wrapper
 
@@ -77,11 +76,7 @@ class Suggested(Wrapper[PyTree]):
                 "of it; give one that does, such as Portfolio(), or simulate them alone with "
                 "falsify(first=...)"
             )
-        check_count("times", self.times)
-        check_count("every", self.every)
-        check_count("points", self.points)
-        check_count("rows", self.rows, 0)
-        check_count("worst", self.worst, 0)
+        check_options(self, {"times": 1, "every": 1, "points": 1, "rows": 0, "worst": 0})
         if not isinstance(self.units, Mapping):
             raise TypeError(f"units must be texts by the name of a feature; got {self.units!r}")
 

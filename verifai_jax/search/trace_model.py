@@ -23,26 +23,20 @@ from jax.scipy.linalg import cho_solve
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float, Key
 
-from verifai_jax.search.gaussian_process import SMALLEST, finite_factor, matern
+from verifai_jax.search.gaussian_process import SMALLEST, adam, finite_factor, matern
 
 # The numbers without another reason were chosen by hand; no comparison with other values is
 # recorded.
-COMPONENTS = 24
-"""Maximum number of principal components."""
-NEGLIGIBLE = 1e-5
-"""Share of the variance below which a component is left out."""
-WAVES = 256
-"""Random waves of the Matern part of a drawn function."""
-PRODUCTS = 256
-"""Random products of its quadratic part."""
-STEPS = 40
-"""Steps of Adam in a fit."""
+COMPONENTS = 24  # maximum number of principal components
+NEGLIGIBLE = 1e-5  # share of the variance below which a component is left out
+WAVES = 256  # random waves of the Matern part of a drawn function
+PRODUCTS = 256  # random products of its quadratic part
+STEPS = 40  # steps of Adam in a fit
+RATE = 0.1  # its rate
 PARTS = np.array([0.0, 0.0, -2.0, -1.0], np.float32)
 """Prior means of the logarithms of the variances: constant, linear, quadratic, Matern."""
-NOISE = -8.0
-"""Prior mean of the logarithm of the noise's variance."""
-MIN_NOISE = -10.0
-"""Minimum of it, which keeps 32-bit factors finite."""
+NOISE = -8.0  # prior mean of the logarithm of the noise's variance
+MIN_NOISE = -10.0  # minimum of it, which keeps 32-bit factors finite
 
 
 class TraceHyper(NamedTuple):
@@ -118,25 +112,7 @@ def fit(
         prior += jnp.sum((hyper.parts - PARTS) ** 2) / 8 + (hyper.noise - NOISE) ** 2 / 8
         return surprise + prior
 
-    def step(carry: tuple[TraceHyper, ...], number: Array) -> tuple[tuple[TraceHyper, ...], None]:
-        hyper, first, second = carry
-        gradient = jax.grad(loss)(hyper)
-        finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient)]
-        ok = jnp.all(jnp.stack(finite))
-        gradient = jax.tree.map(lambda leaf: jnp.where(ok, leaf, 0.0), gradient)
-        first = jax.tree.map(lambda m, g: 0.8 * m + 0.2 * g, first, gradient)
-        second = jax.tree.map(lambda v, g: 0.95 * v + 0.05 * g**2, second, gradient)
-
-        def update(value: Array, m: Array, v: Array) -> Array:
-            root = jnp.sqrt(v / (1 - 0.95**number)) + 1e-8
-            return value - 0.1 * (m / (1 - 0.8**number)) / root
-
-        return (_bounded(jax.tree.map(update, hyper, first, second)), first, second), None
-
-    zero = jax.tree.map(jnp.zeros_like, hyper)
-    numbers = jnp.arange(1, STEPS + 1, dtype=jnp.float32)
-    (fitted, _, _), _ = jax.lax.scan(step, (hyper, zero, zero), numbers)
-    return fitted
+    return adam(loss, hyper, STEPS, RATE, _bounded)
 
 
 def condition(

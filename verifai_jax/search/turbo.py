@@ -20,29 +20,27 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from verifai_jax.core.checks import check_count, check_positive
+from verifai_jax.core.checks import check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, Wants, draw_uniform
-from verifai_jax.search.gaussian_process import Hyper
+from verifai_jax.search.base import Asked, Observations, Search, Wants, check_options, choose
+from verifai_jax.search.draws import draw_uniform
 from verifai_jax.search.halton import halton_points
 from verifai_jax.search.process_data import (
     LARGEST,
     NO_VERDICT,
+    ProcessMemory,
     encode,
     process_of,
-    rows_to_keep,
     scores,
     snap,
-    training_data,
 )
 
 MAX_PATHS = 32
 """Functions drawn for a batch; larger batches take several points from each. As in `bayes`."""
 WAVES = 256
 """Random waves of such a function. As in `bayes`."""
-FIT_POINTS, FIT_STEPS = 192, 12
-"""Points that hyper-parameters are fitted to, and steps of Adam in a fit. Chosen by hand; no
-comparison with other values is recorded."""
+FIT_STEPS = 12
+"""Steps of Adam in a fit. Chosen by hand; no comparison with other values is recorded."""
 COORDINATES = 20
 """Coordinates in which a candidate differs from the best point, on average; that of the paper."""
 SIDES = (2.0**-7, 0.8, 1.6)
@@ -58,16 +56,10 @@ class TuRBOState(NamedTuple):
     key: Key[Array, ""]
     round: UInt32[Array, ""]
     explored: UInt32[Array, ""]  # points of the prior so far
-    results: UInt32[Array, ""]  # rows, in all
-    u: Float[Array, "capacity d"]  # since the last restart, as all that follows
-    score: Float[Array, " capacity"]  # robustness, 0 for all failures; infinite where no point is
-    luck: Float[Array, " capacity"]
-    verdicts: Int[Array, ""]  # points with a verdict
-    fitted: Int[Array, ""]  # of which the last fit knew
+    memory: ProcessMemory  # points since the last restart, as all that follows
     side: Float[Array, ""]  # of the box
     successes: Int[Array, ""]  # rounds with progress in a row
     failures: Int[Array, ""]  # points without, in a row
-    hyper: Hyper
 
 
 @dataclass(frozen=True)
@@ -95,10 +87,7 @@ class TuRBO(Search[TuRBOState]):
     patience: float = 1.0
 
     def __post_init__(self) -> None:
-        check_count("capacity", self.capacity, 16)
-        check_count("candidates", self.candidates, 32)
-        check_count("initial", self.initial, 2)
-        check_count("successes", self.successes)
+        check_options(self, {"capacity": 16, "candidates": 32, "initial": 2, "successes": 1})
         check_positive("patience", self.patience)
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> TuRBOState:
@@ -106,26 +95,14 @@ class TuRBO(Search[TuRBOState]):
             key=key,
             round=jnp.uint32(0),
             explored=jnp.uint32(0),
-            results=jnp.uint32(0),
-            u=jnp.full((self.capacity, cube.dim), 0.5, jnp.float32),
-            score=jnp.full(self.capacity, jnp.inf, jnp.float32),
-            luck=jnp.zeros(self.capacity, jnp.float32),
-            verdicts=jnp.int32(0),
-            fitted=jnp.int32(0),
+            memory=ProcessMemory.nothing(self.capacity, cube),
             side=jnp.float32(SIDES[1]),
             successes=jnp.int32(0),
             failures=jnp.int32(0),
-            hyper=process_of(cube).first(),
         )
 
-    def ask(
-        self, state: TuRBOState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], TuRBOState]:
-        present = jnp.isfinite(state.score)
-        lowest = jnp.min(state.score, where=present, initial=jnp.inf)
-        spread = jnp.max(state.score, where=present, initial=0.0) > lowest
-        # Without a difference between points there is nothing to learn from them.
-        informed = spread & (state.verdicts >= self.initial)
+    def ask(self, state: TuRBOState, cube: Cube, batch: int) -> Asked[TuRBOState]:
+        informed = state.memory.says_something(self.initial)
         # Points of the prior are numbered on, whether or not a round uses them.
         rows = jnp.arange(1, batch + 1, dtype=jnp.uint32)
         fresh = halton_points(state.explored + rows, cube.dim, state.key)
@@ -147,8 +124,8 @@ class TuRBO(Search[TuRBOState]):
         """Return minima of functions drawn from the posterior, over candidates of the box."""
         process, d = process_of(cube), cube.dim
         drawing, placing = jax.random.split(key)
-        posterior = process.condition(state.hyper, training_data(state.u, state.score, cube))
-        best = state.u[jnp.argmin(state.score)]
+        memory = state.memory
+        posterior, best = memory.posterior(cube), memory.u[jnp.argmin(memory.score)]
         low, high = trust_box(state, cube, best)
         count = max(self.candidates, 2 * batch)
         random = draw_uniform(placing, (count, 2 * d))
@@ -158,7 +135,7 @@ class TuRBO(Search[TuRBOState]):
         candidates = snap(jnp.where(moves, low + (high - low) * position, best), cube)
         paths = process.paths(posterior, drawing, min(batch, MAX_PATHS), WAVES)
         terms = process.basis(posterior, paths, encode(candidates, cube))
-        known = jnp.max(terms[:, WAVES:], axis=1) > KNOWN * jnp.exp(state.hyper.variance)
+        known = jnp.max(terms[:, WAVES:], axis=1) > KNOWN * jnp.exp(memory.hyper.variance)
         values = (terms @ paths.weights).T  # [paths, candidates]
 
         def choose(
@@ -173,19 +150,15 @@ class TuRBO(Search[TuRBOState]):
         return candidates[chosen]
 
     def tell(self, state: TuRBOState, cube: Cube, observations: Observations) -> TuRBOState:
-        score = scores(observations)
+        score, memory = scores(observations), state.memory
         # One without a verdict is taken for the worst, so that the region stays away from it.
-        seen = jnp.concatenate([score, state.score])
+        seen = jnp.concatenate([score, memory.score])
         worst = jnp.max(seen, where=seen <= LARGEST, initial=-jnp.inf)
         worst = jnp.where(worst >= 0, worst, jnp.inf)
         score = jnp.where(score == NO_VERDICT, worst, score)
-        usable = jnp.isfinite(score)
-        count = jnp.sum(usable, dtype=jnp.int32)
-        number = state.results + jnp.arange(len(score), dtype=jnp.uint32)
-        # A Weyl sequence (in steps of the golden ratio): as good as random for choosing.
-        luck = (number * np.uint32(2654435769) >> 8).astype(jnp.float32) / 2**24
-        started = state.verdicts >= self.initial
-        progress = jnp.min(score) < (1 - PROGRESS) * jnp.min(state.score)
+        count = jnp.sum(jnp.isfinite(score), dtype=jnp.int32)
+        started = memory.verdicts >= self.initial
+        progress = jnp.min(score) < (1 - PROGRESS) * jnp.min(memory.score)
         successes = jnp.where(progress & started, state.successes + 1, 0)
         failures = jnp.where(progress | ~started, 0, state.failures + count)
         # A round without a verdict is neither.
@@ -194,39 +167,20 @@ class TuRBO(Search[TuRBOState]):
         narrower = failures >= max(4, math.ceil(self.patience * cube.dim))
         side = jnp.where(wider, jnp.minimum(2 * state.side, SIDES[2]), state.side)
         side = jnp.where(narrower, side / 2, side)
-        u = jnp.concatenate([jnp.where(usable[:, None], observations.u, 0.5), state.u])
-        score = jnp.concatenate([score, state.score])
-        luck = jnp.concatenate([luck, state.luck])
-        rows = rows_to_keep(score, luck, self.capacity)
         state = state._replace(
-            results=state.results + np.uint32(len(usable)),
-            u=u[rows],
-            score=score[rows],
-            luck=luck[rows],
-            verdicts=state.verdicts + count,
+            memory=memory.with_rows(observations.u, score),
             side=side,
             successes=jnp.where(wider, 0, successes),
             failures=jnp.where(narrower, 0, failures),
         )
-        state = _restarted(state, cube, side < SIDES[0])
-        due = (state.verdicts >= self.initial) & (
-            4 * (state.verdicts - state.fitted) >= state.fitted
-        )
-        hyper = jax.lax.cond(due, lambda: self._fit(state, cube), lambda: state.hyper)
-        return state._replace(hyper=hyper, fitted=jnp.where(due, state.verdicts, state.fitted))
+        # Where the region has become too small it is forgotten, and its points.
+        state = choose(side < SIDES[0], _begun(state, state.memory.emptied(cube)), state)
+        return state._replace(memory=state.memory.refitted(cube, self.initial, FIT_STEPS))
 
     def warm_start(self, state: TuRBOState, cube: Cube, observations: Observations) -> TuRBOState:
         # Points that it did not ask for say nothing of the region.
         warmed = self.tell(state, cube, observations)
-        return warmed._replace(
-            side=jnp.float32(SIDES[1]), successes=jnp.int32(0), failures=jnp.int32(0)
-        )
-
-    def _fit(self, state: TuRBOState, cube: Cube) -> Hyper:
-        some = rows_to_keep(state.score, state.luck, min(FIT_POINTS, self.capacity))
-        data = training_data(state.u, state.score, cube)
-        data = jax.tree.map(lambda leaf: leaf[some], data)
-        return process_of(cube).fit(state.hyper, data, FIT_STEPS)
+        return _begun(warmed, warmed.memory)
 
 
 def trust_box(
@@ -237,7 +191,7 @@ def trust_box(
     Sides are in proportion to the length scales, with the volume of a cube. A discrete coordinate
     can always reach the cells next to its own, and one without an order all of its cells.
     """
-    lengths = state.hyper.lengths
+    lengths = state.memory.hyper.lengths
     width = state.side * jnp.exp(lengths - jnp.mean(lengths))
     levels, ordered = np.array(cube.levels), np.array(cube.ordered)
     cells = np.where(levels > 0, np.where(ordered, 3 / np.maximum(levels, 1), 2.0), 0.0)
@@ -245,17 +199,7 @@ def trust_box(
     return jnp.clip(best - width / 2, 0.0, 1.0), jnp.clip(best + width / 2, 0.0, 1.0)
 
 
-def _restarted(state: TuRBOState, cube: Cube, restart: Bool[Array, ""]) -> TuRBOState:
-    """Forget the region and its points where it has become too small."""
-    empty = state._replace(
-        score=jnp.full_like(state.score, jnp.inf),
-        verdicts=jnp.int32(0),
-        fitted=jnp.int32(0),
-        side=jnp.float32(SIDES[1]),
-        successes=jnp.int32(0),
-        failures=jnp.int32(0),
-        hyper=process_of(cube).first(),
-    )
-    return jax.tree.map(
-        lambda new, old: new if new is old else jnp.where(restart, new, old), empty, state
-    )
+def _begun(state: TuRBOState, memory: ProcessMemory) -> TuRBOState:
+    """Return the state with a region of the first size."""
+    none, side = jnp.int32(0), jnp.float32(SIDES[1])
+    return state._replace(memory=memory, side=side, successes=none, failures=none)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, UInt32
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search
+from verifai_jax.search.base import Asked, PointSequence
 
 
 class UniformState(NamedTuple):
@@ -17,23 +17,17 @@ class UniformState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Uniform(Search[UniformState]):
+class Uniform(PointSequence[UniformState]):
     """Independent uniform points; point `i` depends on the key and `i` alone, not on the batch."""
 
-    learns: ClassVar[bool] = False
     samples_prior: ClassVar[bool] = True
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> UniformState:
         return UniformState(key, jnp.uint32(0))
 
-    def ask(
-        self, state: UniformState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], UniformState]:
+    def ask(self, state: UniformState, cube: Cube, batch: int) -> Asked[UniformState]:
         index = state.index + jnp.arange(batch, dtype=jnp.uint32)
         return uniform_points(state.key, index, cube.dim), state._replace(index=state.index + batch)
-
-    def tell(self, state: UniformState, cube: Cube, observations: Observations) -> UniformState:
-        return state
 
 
 def uniform_points(

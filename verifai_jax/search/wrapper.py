@@ -18,7 +18,7 @@ from typing import Any, TypeAlias, cast
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Origin, Plan, Search, State, Wants
+from verifai_jax.search.base import Asked, Observations, Origin, Plan, Search, State, Wants
 
 Learn: TypeAlias = Callable[[PyTree, Cube, Observations], PyTree]
 """A way to learn of the search inside: its `tell`, `warm_start` or `start_from`."""
@@ -101,7 +101,7 @@ class Wrapper(Search[State]):
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> State:
         return self.search.init(key, cube, batch)
 
-    def ask(self, state: State, cube: Cube, batch: int) -> tuple[Float[Array, "batch d"], State]:
+    def ask(self, state: State, cube: Cube, batch: int) -> Asked[State]:
         u, inner = self.search.ask(self.inner_state(state), cube, batch)
         return u, self.with_inner_state(state, inner)
 

@@ -1,0 +1,37 @@
+"""Memory of the best points so far, of which the newest of equal ones comes first."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def newest_first(
+    u: Float[Array, "n d"],
+    new: Float[Array, " n"],
+    points: Float[Array, "k d"],
+    score: Float[Array, " k"],
+) -> tuple[Float[Array, "n+k d"], Float[Array, " n+k"]]:
+    """Return the points of a round before those of a memory, with their scores.
+
+    **Arguments:**
+
+    - `u`, `new`: of the round; a score is infinite where there is nothing to learn.
+    - `points`, `score`: of the memory; a score is infinite where there is no point.
+    """
+    u = jnp.where(jnp.isinf(new)[:, None], 0.5, u)
+    return jnp.concatenate([u, points]), jnp.concatenate([new, score])
+
+
+def keep_best(
+    u: Float[Array, "n d"],
+    new: Float[Array, " n"],
+    points: Float[Array, "k d"],
+    score: Float[Array, " k"],
+) -> tuple[Float[Array, "k d"], Float[Array, " k"]]:
+    """Return the best points of a round and a memory, sorted; of equal ones the newest.
+
+    **Arguments:** as of `newest_first`.
+    """
+    points, scores = newest_first(u, new, points, score)
+    _, best = jax.lax.top_k(-scores, len(score))
+    return points[best], scores[best]
