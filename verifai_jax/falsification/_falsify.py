@@ -30,27 +30,11 @@ from verifai_jax.falsification.running import Ending, Running
 from verifai_jax.falsification.silent_mistakes import notes_before
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.falsification.validation import (
-    AUTO,
-    adapt_search,
-    as_wanted,
-    batch_size,
-    can_be_slow,
-    check_first,
-    check_gradient,
-    check_guide,
-    check_objective,
-    check_rule,
-    check_same_guide,
-    check_same_space,
-    check_search,
-    earlier_rows,
-    new_folder,
-    points_of,
-    recorded_search,
-    rows_of_first,
-    slow_search,
+    AUTO, adapt_search, as_wanted, batch_size, can_be_slow, check_first, check_gradient,
+    check_guide, check_objective, check_rule, check_same_guide, check_same_space, check_search,
+    earlier_rows, new_folder, points_of, recorded_search, rows_of_first, slow_search,
     with_objective,
-)
+)  # fmt: skip
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.search.suggested import without_suggestions
