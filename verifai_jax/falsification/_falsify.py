@@ -30,11 +30,27 @@ from verifai_jax.falsification.running import Ending, Running
 from verifai_jax.falsification.silent_mistakes import notes_before
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.falsification.validation import (
-    AUTO, adapt_search, as_wanted, batch_size, can_be_slow, check_first, check_gradient,
-    check_guide, check_objective, check_rule, check_same_guide, check_same_space, check_search,
-    earlier_rows, new_folder, points_of, recorded_search, rows_of_first, slow_search,
+    AUTO,
+    adapt_search,
+    as_wanted,
+    batch_size,
+    can_be_slow,
+    check_first,
+    check_gradient,
+    check_guide,
+    check_objective,
+    check_rule,
+    check_same_guide,
+    check_same_space,
+    check_search,
+    earlier_rows,
+    new_folder,
+    points_of,
+    recorded_search,
+    rows_of_first,
+    slow_search,
     with_objective,
-)  # fmt: skip
+)
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.search.suggested import without_suggestions
@@ -47,9 +63,6 @@ if TYPE_CHECKING:
     from verifai_jax.features.given import Rows
     from verifai_jax.statistics.stopping import StoppingRule
     from verifai_jax.verification import Verification
-
-LOOSE = 8
-"""Share of the budget, as its inverse, for the boxes that a proof leaves, at most."""
 
 
 @suggests_options
@@ -173,14 +186,11 @@ def falsify(
         cheaply.check_same_features(problem, cheap)
         if first is not None:
             raise ValueError("give either first, or a cheap model that finds what comes first")
-        found = falsify(
-            cheap, budget=min(cheaply.TIMES * budget, cheaply.MAX_CHEAP), seed=seed, confirm=False,
-            precision=precision, progress=False,
-        )  # fmt: skip
+        options = {"seed": seed, "precision": precision, "confirm": False, "progress": False}
+        found = falsify(cheap, budget=cheaply.budget_for(budget), **options)
         first = cheaply.gravest_rows(found, cheap, budget)
     elif proved is not None and first is None and search.learns and stop_when is None:
-        first = proved.loosest(problem, max(1, budget // LOOSE))
-        first = first if len(first) else None
+        first = proved.loosest(problem, budget)
     given = check_first(problem, first, stop_when, precision)
     callbacks = check_callbacks(callbacks)
     earlier = earlier_rows(warm_start, problem)
@@ -318,10 +328,9 @@ def resume(
     - all other arguments: as in `falsify`.
 
     The table is that of an uninterrupted run with this budget and the same `batch` and `engine`,
-    bit for bit, whatever the search. Where the earlier budget cut the last round of a search that
-    learns, its simulations are made again, with the others of the round. The defaults of `engine`
-    and of the `batch` of a search that learns depend on the budget: a run from the start has the
-    same points only with the same `batch`, and notes say where the default would be another.
+    bit for bit: the last round of a search that learns is simulated again where the earlier budget
+    cut it. The defaults of `engine` and of the `batch` of such a search depend on the budget, and
+    notes say where that of `batch` would be another for a run from the start.
 
     **Returns:** the run with the earlier rows and the new ones.
 

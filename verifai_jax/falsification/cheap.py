@@ -47,6 +47,11 @@ def check_same_features(slow: Problem, cheap: Problem) -> None:
         raise ProblemError("a cheap model has its features in the same order as the slow one")
 
 
+def budget_for(budget: int) -> int:
+    """Return the simulations of a cheap model for a budget of the slow one."""
+    return min(TIMES * budget, MAX_CHEAP)
+
+
 def gravest_rows(run: Run, cheap: Problem, budget: int) -> "pd.DataFrame":
     """Choose rows of a run: its gravest failure, then failures that are far from those before.
 

@@ -27,6 +27,8 @@ from verifai_jax.verification.boxes import BROKEN, OUTSIDE, PROVED, Boxes
 from verifai_jax.verification.rest import Rest, RestSpace
 
 KIND = "verification"
+LOOSE = 8
+"""Share of a search's budget, as its inverse, for the boxes that a proof leaves, at most."""
 DISCRETE = (
     "the system in discrete time as it is simulated, in real arithmetic and with the rounding of "
     "{precision}; no differential equation"
@@ -229,7 +231,7 @@ class Verification(Drawn, InNotebook):
         share = format_percent(self.proved.mass)
         return f"{share} of the prior is proved and not simulated; all rates are of the rest"
 
-    def loosest(self, problem: Problem, count: int) -> pd.DataFrame:
+    def loosest(self, problem: Problem, budget: int) -> pd.DataFrame | None:
         """Return rows of what is not proved for a search to begin with, where bounds are loosest.
 
         They are points that fail as simulated, and then middles of boxes: those first of which the
@@ -238,14 +240,17 @@ class Verification(Drawn, InNotebook):
         **Arguments:**
 
         - `problem`: that of `rest`.
-        - `count`: rows at most.
+        - `budget`: simulations of the search, of which these take an eighth at most.
+
+        **Returns:** the rows; None if nothing is left.
         """
         boxes = self.boxes[~np.isin(self.boxes.state, (PROVED, OUTSIDE))]
         boxes = boxes[np.lexsort((-boxes.mass, boxes.lowest, ~boxes.has_witness))]
         known, middle = boxes.has_witness[:, None], boxes.low / 2 + boxes.high / 2
         points = np.where(known, boxes.witness, middle).astype(np.float32)
-        points = points[problem.space.accepts_points(points)][:count]
-        return pd.DataFrame(problem.space.rows(problem.space.features_at(points)))
+        points = points[problem.space.accepts_points(points)][: max(1, budget // LOOSE)]
+        rows = pd.DataFrame(problem.space.rows(problem.space.features_at(points)))
+        return rows if len(rows) else None
 
     def rest(self, problem: Problem, precision: str = "float32") -> Problem:
         """Return the problem without what is proved, for searches that spend nothing there.
