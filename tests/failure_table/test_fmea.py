@@ -167,7 +167,7 @@ def test_the_report_names_each_row_with_its_command(table, tmp_path):
         table["single_bias"].command
         in claims[[e.name for e in table].index("single_bias")]["evidence"]
     )
-    assert "2 of 3 faults and pairs break the property; 2 of these are confirmed." in page
+    assert "2 of 4 faults and pairs break the property; 2 of these are confirmed." in page
 
 
 @pytest.mark.thorough

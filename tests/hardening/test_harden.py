@@ -59,7 +59,7 @@ def numbers(result):
         result.table.drop(columns="seconds"),
         result.added,
         leaves,
-        str(result.comparison.candidates),
+        str(result.comparison and result.comparison.candidates),
     )
 
 
@@ -222,7 +222,7 @@ def test_where_everything_fails_the_budget_ends_it():
     result = harden(TASK, staying_below(-100.0), **{**SMALL, "rounds": 1})
     assert (result.stopped, result.safe, len(result.table)) == ("budget", False, 2)
     assert list(result.table["failure_rate"]) == [1.0, 1.0]
-    assert set(result.added["source"]) == {"counterexample", "shrunk"}  # There is no rule.
+    assert set(result.added["source"]) == {"sample", "counterexample", "shrunk"}  # No rule.
     assert result.times_safer == 1
     assert result.after.rate is not None
     assert result.after.rate.low > 0.9
