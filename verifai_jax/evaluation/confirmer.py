@@ -128,7 +128,7 @@ class Confirmer:
         in_precision(precision)
         self.problem, self.precision, self.seed, self.max_rows = problem, precision, seed, max_rows
         self.executor, self.target = executor, target
-        self.others = {} if engines is None else engines_for(problem, engines)
+        self.others = engines_for(problem, engines)
         self.examined, self.band, self.worst = 0, 0.0, np.inf
         self.wavers = self.flips = self._came_again = False
         self.check_names: tuple[str, ...] = ()

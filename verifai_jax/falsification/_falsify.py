@@ -167,7 +167,7 @@ def falsify(
     started = time.perf_counter()
     check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
     as_wanted(engine)
-    ends_early = stop_after is not None or stop_when is not None
+    ends = Ending(started, budget, max_seconds, stop_after, stop_when)
     of_rest: tuple[str, ...] = ()
     if proved is not None:
         from verifai_jax.verification.result import as_verification
@@ -197,7 +197,7 @@ def falsify(
     in_precision(precision)
 
     def batch_for(search: Search) -> int:
-        alone = not (ends_early or max_seconds is not None or problem.black_box)
+        alone = ends.only_budget and not problem.black_box
         small = 16 if diverse else 64 if search.wants.likelihood else None
         return batch_size(batch, search, budget, stop_after, alone, small)
 
@@ -215,13 +215,12 @@ def falsify(
     if diverse:
         by = "inputs" if diverse is True else diverse
         search = searches.Diverse(search, capacity=max(256, stop_after or 0), by=by)
-    ends = Ending(started, budget, max_seconds, stop_after, stop_when)
     with new_folder(folder) as path:
         table = ErrorTable(tuple(problem.space.columns), path)
         rounds = Rounds(
             problem, search, size, seed, table, precision, path, confirm, executor, target, given,
             suggests=asking is not None, budget=budget,
-            engine=as_wanted(engine, ends_early or search.learns),
+            engine=as_wanted(engine, portable=ends.may_be_early or search.learns),
         )  # fmt: skip
         if asking is not None:
             rounds.ask(replace(asking, search=search))

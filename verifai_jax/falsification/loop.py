@@ -186,10 +186,10 @@ class Rounds:
         return Batch(points, "search", self.learning.proposals.cut)
 
     def _begin_prefetching(self, limit: int) -> "Prefetch | None":
-        """Begin to simulate rounds ahead, up to so many rows; None where that is not done.
+        """Begin to simulate rounds ahead, up to so many rows, or return None to simulate in turn.
 
-        In this process it is not where the run may end before its budget, nor where simulations are
-        kept for another process, by the thread that began.
+        In this process rounds are simulated in turn if the run may end before its budget, and if
+        the thread that began keeps simulations for another process.
         """
         done, proposals = len(self.table), self.learning.proposals
         here = self.only_budget_ends and limit > done + self.batch and present() is None

@@ -64,7 +64,12 @@ class Ending(NamedTuple):
     @property
     def only_budget(self) -> bool:
         """True where nothing ends the run before its budget."""
-        return self.stop_after is None and self.stop_when is None and self.max_seconds is None
+        return not self.may_be_early and self.max_seconds is None
+
+    @property
+    def may_be_early(self) -> bool:
+        """True where what simulations give may end the run before its budget."""
+        return self.stop_after is not None or self.stop_when is not None
 
     @property
     def seconds(self) -> float:

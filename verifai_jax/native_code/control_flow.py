@@ -150,7 +150,7 @@ def until_settled(
 ) -> list[Value]:
     """Write a loop or branch, again as long as more of its values turn out to differ.
 
-    - `changed`: the values that a branch begins with, of which it may change its own.
+    - `changed`: the values that a branch begins with. It may change those that nothing else uses.
     """
     mark = t.code.mark()
     while True:

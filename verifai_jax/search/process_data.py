@@ -24,8 +24,6 @@ huge ones do not hide the rest. Chosen by hand; no comparison with other values 
 
 LARGEST = 1e30  # robustness above which nothing differs: sums of such stay finite in float32
 NO_VERDICT = 2e30  # score of a simulation without a verdict
-
-
 FIT_POINTS = 192
 """Points that hyper-parameters are fitted to. Chosen by hand; no comparison is recorded."""
 

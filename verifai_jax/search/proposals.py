@@ -218,12 +218,9 @@ class Proposals:
             part = slice(start, start + self.batch)
             rows = np.arange(len(u[part]))
             points = self._spread(u[part].astype(np.float32), rows, 0.5)
-            values, known = rho[part].astype(np.float32), None
-            if outcomes is not None:
-                known = outcomes[part]
-            observations = self._observed(
-                points, rows, values, np.ones(len(rows), bool), {"outcomes": known}
-            )
+            values, valid = rho[part].astype(np.float32), np.ones(len(rows), bool)
+            known = {"outcomes": None if outcomes is None else outcomes[part]}
+            observations = self._observed(points, rows, values, valid, known)
             self._state = self._verbs[verb](self._state, observations)
 
     def _observed(
