@@ -48,7 +48,7 @@ ROUND, FINAL, COMPARED, ATTACK, RETURNS = range(5)
 CERTIFIED = ("failures", "simulations", "failure_rate", "failure_low", "failure_high", "verdict",
              "attack_failures", "cost")  # fmt: skip
 """Columns of a certificate that the table has."""
-OWN_STEP, MOST_OWN = 0.25, 0.75
+OWN_STEP, OWN_LIMIT = 0.25, 0.75
 """Share of episodes that become the task's own in a round after which an arm does not keep the
 return, and that cease to be after one that does; and how many are its own at most."""
 TABLE, SHRUNK = 512, 4
@@ -293,7 +293,7 @@ class Work:
         rate, mixtures = certificates[0].rate.estimate if certificates[0].rate else 0.0, []
         for arm, count in zip(self.arms_named, (len(self.points), 0), strict=False):
             change = -OWN_STEP if self._keeps_return(arm, stage) else OWN_STEP
-            own = self.own[arm] = max(plan.own, min(self.own[arm] + change, MOST_OWN))
+            own = self.own[arm] = max(plan.own, min(self.own[arm] + change, OWN_LIMIT))
             # The more of the prior fails, the more of its episodes begin at failures anyway.
             wanted = plan.failing * (1 - own) / max(1 - plan.own, 1e-9)
             failing = min(max((wanted - (1 - own) * rate) / max(1 - rate, 1e-9), 0.0), wanted)
