@@ -56,7 +56,8 @@ def test_results_show_themselves(problem, run):
 
 
 def test_results_of_every_verb_show_themselves():
-    from verifai_jax import analysis, compositional, counterexamples, failure_modes, synthesis
+    from verifai_jax import analysis, synthesis
+    from verifai_jax.analysis import counterexamples
     from verifai_jax.core.notebook import InNotebook
     from verifai_jax.estimation.certification.result import Certificate
     from verifai_jax.estimation.comparison.result import Transfer
@@ -69,8 +70,8 @@ def test_results_of_every_verb_show_themselves():
 
     verbs = [vj.Estimate, vj.Modes, vj.Comparison, vj.Trials, vj.Certificates, vj.Augmentation]
     verbs += [vj.Synthesis, vj.Repair, vj.Confirmation, vj.Confirmations, vj.FuzzRun]
-    verbs += [counterexamples.Explained, counterexamples.Shrunk, failure_modes.Mode]
-    verbs += [compositional.Compositional, synthesis.Repair, vj.mtl.Explanation, vj.mtl.Mined]
+    verbs += [counterexamples.Explained, counterexamples.Shrunk, vj.Mode]
+    verbs += [vj.perception.Compositional, synthesis.Repair, vj.mtl.Explanation, vj.mtl.Mined]
     verbs += [vj.mtl.Judgement, Transfer, Hardening, vj.Study, Certificate]
     verbs += [analysis.Clusters, analysis.Diverse, analysis.FrequentPatterns, analysis.Neighbours]
     verbs += [CheckOutcome, SequenceEstimate, HyperparameterImportance, Score, FailureTable]
