@@ -36,6 +36,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+FEW = 64
+"""Batches in memory up to which they are read one by one: to make one batch of them copies each."""
+
+
 class TableView(InNotebook):
     """Rows by number, those of closed segments first, then batches in memory.
 
@@ -248,7 +252,8 @@ class TableView(InNotebook):
 
     def _memory(self) -> Iterator[tuple[Int[np.ndarray, " n"], Columns]]:
         """Yield numbers and columns of the rows in memory, in blocks."""
-        self._join()
+        if len(self._batches) > FEW:
+            self._join()
         maximum = segments.SEGMENT_ROWS
         for first, batch in self._batches:
             for begin in range(first, first + length(batch), maximum):

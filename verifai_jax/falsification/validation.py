@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from verifai_jax.statistics.stopping import StoppingRule
 
 
-MAX_AT_ONCE = 32_768
+MAX_AT_ONCE = 131_072
 """Simulations of a round at most, by default; more are no faster."""
 
 

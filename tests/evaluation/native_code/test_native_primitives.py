@@ -158,6 +158,26 @@ def test_binary_functions_and_comparisons():
     check(function, 2, "binary", 1)
 
 
+def test_what_does_not_change_in_a_loop_divides_by_its_reciprocal():
+    def f(row, *_):
+        return lax.scan(lambda x, n: (x + n, x / row[1]), row[0], jnp.arange(3.0))[1]
+
+    # Numbers near the largest have a reciprocal that is too small to be normal.
+    rows = rows_of(2)
+    check(f, 2, "f9a", 1, rows[np.abs(rows[:, 1]) < 1e37])
+
+
+def test_bounds_that_are_constants():
+    def f(row, *_):
+        x, y = row
+        return (
+            jnp.maximum(0.5, x), jnp.minimum(x, -0.5), jnp.clip(y, -1, 1), lax.clamp(-1.0, x, y),
+            jnp.maximum(jnp.nan, x), jnp.minimum(x, y), jnp.maximum(x, y),
+        )  # fmt: skip
+
+    check(f, 2, "f9b")
+
+
 def test_whole_numbers():
     rows = np.random.default_rng(1).integers(-9, 9, (256, 2)).astype(np.float32)
 

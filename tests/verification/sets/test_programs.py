@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import verifai_jax as vj
 from verifai_jax.verification.sets import Form, Interpreter, MissingRule
 
 BOXES, POINTS = 8, 40
@@ -72,7 +71,10 @@ PROGRAMS = {
         jax.lax.scan(lambda c, k: (c + jnp.sin(c) * 0.1, c[k % 3]), x, jnp.arange(9))[1],
         jax.lax.scan(lambda c, y: (c * 0.9 + y, c), 0.0, x, reverse=True),
     ),
-    "angles": lambda x: (jnp.arctan2(x[0], x[1]), jnp.mod(x + 7, 2 * jnp.pi), vj.sin_cos(9 * x[0])),
+    "angles": lambda x: (jnp.arctan2(x[0], x[1]), jnp.mod(x + 7, 2 * jnp.pi)),
+    "quarter turns": lambda x: jnp.where(
+        (jnp.round(9 * x[0]).astype(jnp.int32) & 1) != 0, -jnp.sin(x), jnp.cos(x)
+    ),
     "interpolation": lambda x: jnp.interp(x[0], jnp.array([-1.0, 0, 2]), jnp.array([0.0, 3, 1])),
 }  # fmt: skip
 

@@ -108,6 +108,10 @@ class Code:
         names = ((m[0], now if m[1] in "imw" else 0) for m in _MADE.finditer(text))
         return min(now, max((self._depths.get(*each) for each in names), default=0))
 
+    def is_older(self, one: Element, other: Element) -> bool:
+        """Return whether a number that is no constant is known in fewer loops than another."""
+        return one.value is None and self._depth_of(one.text) < self._depth_of(other.text)
+
     def _piece_of(self, depth: int) -> Piece:
         return self.piece if depth == len(self._before) else self._before[depth]
 

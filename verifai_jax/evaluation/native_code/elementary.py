@@ -66,8 +66,12 @@ FUNCTIONS = {
     "nextafter": "next_number({}, {})",
     "is_finite": "finite({})",
     "clamp": "lesser({2}, greater({0}, {1}))",
+    "max of bounds": "greater_than_bound({}, {})",
+    "min of bounds": "lesser_than_bound({}, {})",
+    "clamp of bounds": "lesser_than_bound({2}, greater_than_bound({0}, {1}))",
 }
-"""Functions of the prelude, whose operands are all vectors or all single numbers."""
+"""Functions of the prelude, whose operands are all vectors or all single numbers. Bounds are
+constants: the first operand, or the first and the last."""
 
 COMPARISONS = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
 

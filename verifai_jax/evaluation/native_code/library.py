@@ -8,7 +8,6 @@ library(rows, key, first, temperatures, numbers)    # [n, count] of bits
 import ctypes
 import platform
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 
@@ -16,7 +15,6 @@ import numpy as np
 from jaxtyping import Float, UInt32
 
 from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.cores import available_cores
 from verifai_jax.core.machine_code import (
     Program,
     Unavailable,
@@ -25,11 +23,11 @@ from verifai_jax.core.machine_code import (
     library_folder,
 )
 from verifai_jax.core.remembered import remembered_as
-from verifai_jax.evaluation.native_code.source import PRELUDE
+from verifai_jax.evaluation.native_code.source import OTHERS, PRELUDE
 
 FLAGS = (
     "-std=c++11", "-march=native", "-ffp-contract=fast",
-    "-fno-math-errno", "-fno-trapping-math", "-fno-exceptions", "-fno-rtti",
+    "-fno-math-errno", "-fno-trapping-math", "-fno-exceptions", "-fno-rtti", "-pthread",
 )  # fmt: skip
 """Not `-ffast-math`, which takes NaN for a number. XLA contracts to fused operations, too."""
 LONG = 8000
@@ -55,7 +53,7 @@ class Library:
         self._run = loaded.run
         pointer, whole = ctypes.c_void_p, ctypes.c_long
         self._run.argtypes = [
-            pointer, pointer, ctypes.c_int, pointer, pointer, whole, whole, whole, pointer,
+            pointer, pointer, ctypes.c_int, pointer, pointer, whole, whole, ctypes.c_int, pointer,
         ]  # fmt: skip
 
     def __call__(
@@ -72,25 +70,14 @@ class Library:
         key, numbers = np.ascontiguousarray(key, np.uint32), np.ascontiguousarray(numbers)
         temperatures = np.ascontiguousarray(temperatures, np.float32)
         out = np.empty((self.count, len(rows)), np.uint32)
-        pointers = [a.ctypes.data for a in (rows, key, temperatures, numbers, out)]
-
-        def run(begin: int) -> int:
-            end = min(begin + size, len(rows))
-            given, inputs = pointers[:2], pointers[2:4]
-            return self._run(*given, first, *inputs, begin, end, len(rows), pointers[4])
-
         blocks = -(-len(rows) // self._width)
         size = -(-blocks // (threads * PARTS if threads > 1 else 1)) * self._width
-        begins = range(0, len(rows), size) if len(rows) else range(0)
-        each = map(run, begins) if len(begins) < 2 else _threads().map(run, begins)
-        if any(each):
+        inputs = [each.ctypes.data for each in (rows, key, temperatures, numbers)]
+        others = min(threads, blocks, OTHERS + 1) - 1
+        given, more, to = inputs[:2], inputs[2:], out.ctypes.data
+        if len(rows) and self._run(*given, first, *more, len(rows), size, others, to):
             raise MemoryError("there is no memory for the arrays of a native program")
         return out.T
-
-
-@cache
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(available_cores(), "native")
 
 
 def library_name(fingerprint: str | None) -> str:

@@ -84,6 +84,9 @@ template <class T> INLINE T greater(T a, T b) { T m = choose(truth(a > b), a, b)
   return choose(truth(a != a), a, m); }
 template <class T> INLINE T lesser(T a, T b) { T m = choose(truth(a < b), a, b);
   return choose(truth(a != a), a, m); }
+/* The same where the first one is no NaN. */
+template <class T> INLINE T greater_than_bound(T bound, T x) { return greater(bound, x); }
+template <class T> INLINE T lesser_than_bound(T bound, T x) { return lesser(bound, x); }
 /* Instructions that do the same, where a compiler does not find them: they give b for NaN. */
 #if defined(__AVX512F__) && defined(__clang__)
 #define EXTREME(which, a, b) __builtin_ia32_##which##ps512(a, b, 4)
@@ -92,9 +95,17 @@ template <class T> INLINE T lesser(T a, T b) { T m = choose(truth(a < b), a, b);
 #elif defined(__AVX__)
 #define EXTREME(which, a, b) __builtin_ia32_##which##ps256(a, b)
 #endif
+#if defined(__AVX512F__) && !defined(__clang__)
+#define EXTREME_OR_NAN(which, a, b) __builtin_ia32_##which##ps512_mask(a, b, a, \
+  __builtin_ia32_cmpps512_mask(a, a, 7, (unsigned short)-1, 4), 4)
+#elif defined(EXTREME)
+#define EXTREME_OR_NAN(which, a, b) choose(a != a, a, EXTREME(which, a, b))
+#endif
 #if defined(EXTREME)
-INLINE F greater(F a, F b) { return choose(a != a, a, EXTREME(max, a, b)); }
-INLINE F lesser(F a, F b) { return choose(a != a, a, EXTREME(min, a, b)); }
+INLINE F greater(F a, F b) { return EXTREME_OR_NAN(max, a, b); }
+INLINE F lesser(F a, F b) { return EXTREME_OR_NAN(min, a, b); }
+INLINE F greater_than_bound(F bound, F x) { return EXTREME(max, bound, x); }
+INLINE F lesser_than_bound(F bound, F x) { return EXTREME(min, bound, x); }
 #endif
 INLINE F absolute(F x) { return (F)((U)x & 0x7fffffffu); }
 INLINE float absolute(float x) { return __builtin_fabsf(x); }
@@ -157,7 +168,14 @@ INLINE float ordinary_ratio(float x, float y) { return x / y; }
 /* x / y with the reciprocal of y: rounded as the division is, but for numbers near the largest. */
 INLINE F divided(F x, F y, F reciprocal) {
   F q = x * reciprocal, better = q + (x - q * y) * reciprocal;
-  return choose(better == better, better, q); }
+#if defined(__AVX512F__) && !defined(__clang__)
+  /* Where q is NaN, infinite or zero it is the result: four bits for each kind of number. */
+  return __builtin_ia32_fixupimmps512_mask(
+    better, q, wide(0x00110111), 0, (unsigned short)-1, 4);
+#else
+  return choose(better == better, better, q);
+#endif
+}
 INLINE float root(float x) { return __builtin_sqrtf(x); }
 INLINE F root(F x) {
   F r; float *to = (float *)&r; const float *from = (const float *)&x;

@@ -25,6 +25,8 @@ from verifai_jax.evaluation.native_code.values import (
 
 PRELUDE = Path(__file__).with_name("prelude.hpp").read_text()
 """The beginning of every program."""
+OTHERS = 255
+"""Threads of a batch at most, but for the one that calls."""
 CACHE = 2**18
 """Bytes of a core's cache that the arrays of a block should fit into."""
 
@@ -63,7 +65,8 @@ def translate(program: Program) -> str:
     lines, arena = t.code.body()
     vectors = next((k for k in (4, 2) if arena * k * 64 <= CACHE * (4 // k)), 1)
     body = "\n".join(lines)
-    function = _FUNCTION.replace("@arena", str(arena)).replace("@body", body)
+    function = _FUNCTION.replace("@arena", str(arena)).replace("@others", str(OTHERS))
+    function = function.replace("@body", body)
     head = f"#define K {vectors}\nenum {{ PAIR = {min(vectors, 2)} }};"
     return "\n".join([head, PRELUDE, _HEAD, *t.code.globals, function])
 
@@ -76,6 +79,7 @@ def one(element: Element) -> np.ndarray:
 
 
 _HEAD = r"""
+#include <pthread.h>
 extern "C" int posix_memalign(void **, __SIZE_TYPE__, __SIZE_TYPE__);
 extern "C" void free(void *);
 INLINE F column(const float *from, long step, long at, long end) {
@@ -97,8 +101,8 @@ INLINE void give(U bits, unsigned *to, long at, long end) {
 _FUNCTION = r"""
 extern "C" int width() { return K * W; }
 /* Rows `begin` to `end` of a total; each result in a row of its own. 1: there is no memory. */
-extern "C" int run(const float *rows, const unsigned *key, int first, const float *temperatures,
-                   const float *numbers, long begin, long end, long total, unsigned *out) {
+static int part(const float *rows, const unsigned *key, int first, const float *temperatures,
+                const float *numbers, long begin, long end, long total, unsigned *out) {
   F *arena = 0;
   if (@arena && posix_memalign((void **)&arena, 64, (long)K * @arena * sizeof(F))) return 1;
 #if defined(__x86_64__)
@@ -114,5 +118,33 @@ extern "C" int run(const float *rows, const unsigned *key, int first, const floa
 #endif
   free(arena);
   return 0;
+}
+struct Batch {
+  const float *rows; const unsigned *key; int first; const float *temperatures, *numbers;
+  long total, size, next; unsigned *out; int failed; };
+static void *take_parts(void *of) {
+  Batch *b = (Batch *)of;
+  for (long begin; (begin = __atomic_fetch_add(&b->next, b->size, __ATOMIC_RELAXED)) < b->total;) {
+    long end = begin + b->size < b->total ? begin + b->size : b->total;
+    if (part(b->rows, b->key, b->first, b->temperatures, b->numbers, begin, end, b->total, b->out))
+      __atomic_store_n(&b->failed, 1, __ATOMIC_RELAXED);
+  }
+  return 0; }
+/* All rows, in parts of this size, by this thread and by so many others. */
+extern "C" int run(const float *rows, const unsigned *key, int first, const float *temperatures,
+                   const float *numbers, long total, long size, int others, unsigned *out) {
+  Batch batch = {rows, key, first, temperatures, numbers, total, size, 0, out, 0};
+  pthread_t threads[@others];
+  pthread_attr_t attributes;
+  int count = 0;
+  if (others > 0 && !pthread_attr_init(&attributes)) {
+    pthread_attr_setstacksize(&attributes, 1 << 24);
+    while (count < others && !pthread_create(&threads[count], &attributes, take_parts, &batch))
+      count++;
+    pthread_attr_destroy(&attributes);
+  }
+  take_parts(&batch);
+  while (count) pthread_join(threads[--count], 0);
+  return batch.failed;
 }
 """

@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike
 
 from verifai_jax.core.jaxprs import called, run_through
 from verifai_jax.evaluation.native_code import elementary
-from verifai_jax.evaluation.native_code.code import Code
+from verifai_jax.evaluation.native_code.code import Code, widened
 from verifai_jax.evaluation.native_code.values import (
     DTYPES,
     KEY,
@@ -195,11 +195,25 @@ class Translator:
         if name in ("max", "min") and operands[1].value is not None:
             # A constant that comes first is no NaN, which the compiler then need not look for.
             operands = operands[::-1]
-        text = self.text(name, params, operands, kind)
-        return self.code.define(text, kind, all(each.uniform for each in operands))
+        uniform = all(each.uniform for each in operands)
+        older = name == "div" and kind == "f" and self.code.is_older(operands[1], operands[0])
+        if older and not uniform:
+            # The reciprocal is taken before the loop.
+            by = self.code.define(f"1.f / {operands[1].text}", "f", operands[1].uniform)
+            text = f"divided({', '.join(map(widened, (*operands, by)))})"
+        else:
+            text = self.text(name, params, operands, kind)
+        return self.code.define(text, kind, uniform)
 
     def text(self, name: str, params: Params, operands: list[Element], kind: str) -> str:
         """Return the C expression of an operation on single numbers."""
+        bounds = {"max": operands[:1], "min": operands[:1], "clamp": operands[::2]}.get(name, ())
+        if (
+            bounds
+            and kind == "f"
+            and all(e.value is not None and e.value == e.value for e in bounds)
+        ):
+            name = f"{name} of bounds"
         template, alike = elementary.expression(name, params, [e.kind for e in operands], kind)
         texts = [each.text for each in operands]
         mixed = len({each.uniform for each in operands}) > 1
