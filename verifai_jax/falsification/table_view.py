@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from verifai_jax.core.notebook import InNotebook, frame_html
+from verifai_jax.core.store.files import record_checksum
 from verifai_jax.falsification import segments
 from verifai_jax.falsification.columns import (
     ROW,
@@ -30,7 +31,6 @@ from verifai_jax.falsification.columns import (
 )
 from verifai_jax.falsification.counts import Counts, claimed_rows, count, violating_rows
 from verifai_jax.falsification.segments import Segment, standing_out
-from verifai_jax.store.files import record_checksum
 
 if TYPE_CHECKING:
     import pandas as pd
