@@ -19,7 +19,7 @@ from verifai_jax.reports.sections import (
     provenance_content,
 )
 from verifai_jax.reports.studies import png
-from verifai_jax.sweeps.result import Sweep
+from verifai_jax.training.sweeps.result import Sweep
 
 FILES = (
     ("sweep.json", "the record of the sweep"),

@@ -50,7 +50,7 @@ class Sensitivity(InNotebook):
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the indices with their intervals; returns the figure."""
-        return lazy_import("verifai_jax.plotting.overview", "plot_sensitivity")(self, path)
+        return lazy_import("verifai_jax.reports.plotting.overview", "plot_sensitivity")(self, path)
 
     def __repr__(self) -> str:
         return str(self)
