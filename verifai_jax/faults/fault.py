@@ -58,14 +58,11 @@ class FaultFeatures(Struct):
     fault: "Fault | None"
 
     def __init__(
-        self,
-        fields: Mapping[str, Domain],
-        nominal: Mapping[str, PyTree],
-        fault: "Fault | None" = None,
+        self, fields: Mapping[str, Domain], nominal: PyTree, fault: "Fault | None" = None
     ) -> None:
         super().__init__(fields)
-        object.__setattr__(self, "_nominal", dict(nominal))
-        object.__setattr__(self, "fault", fault)
+        for name, value in (("_nominal", nominal), ("fault", fault)):
+            object.__setattr__(self, name, value)
 
     @property
     def nominal(self) -> dict[str, PyTree]:
@@ -188,14 +185,9 @@ class Fault:
 class AtMost:
     """Several faults of which at most `count` happen in one simulation.
 
-    They are chosen by the feature `name`, whose entries are each the name of a fault or `none`,
-    equally likely.
-
-    **Arguments:**
-
-    - `count`: the number of faults in one simulation.
-    - `faults`: the faults that are chosen from.
-    - `name`: the name of the feature.
+    - `count`: the number of faults in one simulation; `faults`: those that are chosen from.
+    - `name`: the name of the feature that chooses, whose entries are each the name of a fault or
+      `none`, equally likely.
 
     **Raises:** `ValueError` for a count that is not positive, and for things that are no faults.
     """

@@ -58,8 +58,7 @@ def neighbourhoods(
 class Mixture:
     """Points of the unit cube of a space, from the prior and from neighbourhoods.
 
-    - `shares`: the shares of episodes that are the task's own, from the prior, and from
-      neighbourhoods.
+    - `shares`: of episodes that are the task's own, from the prior, and from neighbourhoods.
     - `low`, `high`: `[neighbourhoods, d]`, boxes of the unit cube; the first `count` of them count.
     """
 
@@ -97,8 +96,7 @@ class Mixture:
         tries = 1 if self.space.where is None else TRIES
         u = jax.random.uniform(point_key, (tries, self.space.dim))
         low, high = (jnp.asarray(ends)[index] for ends in (self.low, self.high))
-        inside = low + u * (high - low)
-        points = jnp.where(near, inside, u)
+        points = jnp.where(near, low + u * (high - low), u)
         if tries == 1:
             return points[0]
         accepted = jax.vmap(lambda point: self.space.accepts(self.space.unflatten(point)))(points)
