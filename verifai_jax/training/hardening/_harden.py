@@ -56,7 +56,7 @@ CERTIFIED = ("failures", "simulations", "failure_rate", "failure_low", "failure_
 """Columns of a certificate that the table has."""
 OWN_STEP, OWN_LIMIT = 0.25, 0.75
 """Share of episodes that become the task's own after a round that does not keep the return, and
-how many are its own at most."""
+cease to be after one that does; and how many are its own at most."""
 TABLE, SHRUNK = 512, 4
 """Uniform samples beside the counterexamples of a round, and counterexamples that are shrunk."""
 
@@ -162,7 +162,7 @@ def harden(
     - `added`: points to train around that a round adds at most.
     - `own`, `failing`: shares of episodes that are the task's own, and that begin near failures,
       those of the prior included that fail anyway; the others are of the prior. After a
-      round that loses return, more are the task's own.
+      round that loses return, more are the task's own, and fewer again after one that does not.
     - `tolerance`: share of the first policy's return that may be lost.
     - `episodes`: the number of episodes of the task itself, the same for all policies, that measure
       returns.
@@ -298,8 +298,8 @@ class Work:
             self.added.append(pd.DataFrame(columns).assign(round=stage, source=found.sources))
         rate, mixtures = certificates[0].rate.estimate if certificates[0].rate else 0.0, []
         for arm, count in zip(self.arms_named, (len(self.points), 0), strict=False):
-            more = 0.0 if self._keeps_return(arm, stage) else OWN_STEP
-            own = self.own[arm] = max(plan.own, min(self.own[arm] + more, OWN_LIMIT))
+            change = -OWN_STEP if self._keeps_return(arm, stage) else OWN_STEP
+            own = self.own[arm] = max(plan.own, min(self.own[arm] + change, OWN_LIMIT))
             # The more of the prior fails, the more of its episodes begin at failures anyway.
             wanted = plan.failing * (1 - own) / max(1 - plan.own, 1e-9)
             failing = min(max((wanted - (1 - own) * rate) / max(1 - rate, 1e-9), 0.0), wanted)
