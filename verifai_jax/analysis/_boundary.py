@@ -130,7 +130,7 @@ class Boundary(InNotebook):
         lines = [
             f"the failing boundary of {self.samples.name}, from {len(self.samples):,} rows: "
             f"Brier score {self.brier:z.3g} on rows not learned from, {self.base:z.3g} by the "
-            "share of failures alone",
+            "share of failures alone"
         ]
         if self._prior is not None:
             lines.append(

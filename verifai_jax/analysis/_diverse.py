@@ -17,14 +17,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
 
-from verifai_jax.analysis.data.samples import (
-    Samples,
-    Scale,
-    Source,
-    Which,
-    distances,
-    with_columns,
-)
+from verifai_jax.analysis.data.samples import Samples, Scale, Source, Which, distances, with_columns
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.figure import Drawn
 from verifai_jax.core.notebook import InNotebook

@@ -142,10 +142,7 @@ class Augmentation(InNotebook):
         return Workshop(self.task)
 
     def plot(
-        self,
-        path: str | Path | None = None,
-        metric: str = "error",
-        reference: str = "none",
+        self, path: str | Path | None = None, metric: str = "error", reference: str = "none"
     ) -> Figure:
         """Draw a metric of each arm and its paired difference with intervals.
 

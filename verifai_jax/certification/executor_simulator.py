@@ -17,11 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.certification.policy_groups import PolicyGroup
-from verifai_jax.certification.simulators import (
-    SeparateSimulators,
-    problem_with,
-    shared_simulator,
-)
+from verifai_jax.certification.simulators import SeparateSimulators, problem_with, shared_simulator
 from verifai_jax.core.executors import (
     SECONDS,
     Executor,

@@ -63,9 +63,7 @@ KEEP_GOING = click.option(
     "--keep-going", is_flag=True, help="Simulate on where all of the first simulations raise."
 )
 PROGRESS = click.option(
-    "--progress/--no-progress",
-    default=None,
-    help="Show a progress bar  [default: on a terminal]",
+    "--progress/--no-progress", default=None, help="Show a progress bar  [default: on a terminal]"
 )
 """The progress bar can be forced or left out."""
 

@@ -141,10 +141,7 @@ def falsify(
         asked = {
             name: given[name] for name in ("max_seconds", "stop_after", "progress", "keep_going")
         }
-        with (
-            given_or_next(resume, "runs", "", goes_on),
-            arguments.on_cluster(cluster) as executor,
-        ):
+        with given_or_next(resume, "runs", "", goes_on), arguments.on_cluster(cluster) as executor:
             run = falsification.resume(
                 resume,
                 problem,

@@ -39,12 +39,7 @@ _MAX_ROWS = 12
 @click.option("--budget", type=int, help="Simulations of the certification in all.")
 @click.option("--attack", help="Search that attacks each policy  [default: cross_entropy]")
 @click.option("--attack-simulations", type=int, help="Simulations of each attack  [default: 256]")
-@click.option(
-    "--halving",
-    "reduction",
-    type=float,
-    help="One of so many configurations continues.",
-)
+@click.option("--halving", "reduction", type=float, help="One of so many configurations continues.")
 @click.option("--halving-by", "by", help="Criterion: return or safety  [default: return]")
 @click.option("--only", metavar="NAMES", help="Hyper-parameters to vary, comma-separated.")
 @click.option(
@@ -93,10 +88,7 @@ def sweep(
         folder, cache = resume, resume if cache is None else cache
         before = _read_command(cache)
         target = target or target_of_project(
-            before["target"],
-            resume,
-            kind="study",
-            remedy="specs/FILE.py:NAME --resume ...",
+            before["target"], resume, kind="study", remedy="specs/FILE.py:NAME --resume ..."
         )
         given, configurations = before["given"], configurations or before["configurations"]
         options, nominal = tuple(before["options"]), tuple(before["nominal"])

@@ -54,6 +54,5 @@ def verify(
     if report is not None:
         click.echo(f"  report       {found.report(report, problem=problem)}")
     check_gate(
-        fail_on,
-        {"counterexample": found.broken.mass > 0, "undecided": found.proved.mass < 1},
+        fail_on, {"counterexample": found.broken.mass > 0, "undecided": found.proved.mass < 1}
     )

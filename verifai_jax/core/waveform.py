@@ -331,11 +331,7 @@ def control_times(
 
 
 def acting_spans(
-    count: int,
-    hold: str,
-    times: Sequence[float] | None,
-    width: float | None,
-    duration: float,
+    count: int, hold: str, times: Sequence[float] | None, width: float | None, duration: float
 ) -> list[tuple[float, float]]:
     """Return the begin and the end of the time in which each control point acts, in seconds.
 

@@ -205,11 +205,7 @@ def _replay_each(
 
 
 def _replay_batch(
-    problem: Problem,
-    seed: int,
-    precision: str,
-    backend: str | None,
-    batch: _Batch,
+    problem: Problem, seed: int, precision: str, backend: str | None, batch: _Batch
 ) -> _Replayed:
     """Replay counterexamples of one seed, precision and backend."""
     problem = resolved(problem, wanted=backend).problem

@@ -10,9 +10,7 @@ from verifai_jax.core.events import Events
 from verifai_jax.core.figure import Drawn
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_seconds
-from verifai_jax.counterexamples.selection import (
-    columns_at,
-)
+from verifai_jax.counterexamples.selection import columns_at
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.problem.problem import Problem
 

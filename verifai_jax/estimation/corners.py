@@ -75,9 +75,7 @@ def cost_of_corner(planes: int = PLANES, halvings: int = HALVINGS) -> int:
     return planes * (halvings + 3)
 
 
-def _nearest(
-    planes: list[tuple[Float[np.ndarray, " d"], float]],
-) -> Float[np.ndarray, " d"] | None:
+def _nearest(planes: list[tuple[Float[np.ndarray, " d"], float]]) -> Float[np.ndarray, " d"] | None:
     """Return the point nearest to the origin on the inner side of all planes; None without one."""
     from scipy.optimize import nnls
 

@@ -137,11 +137,7 @@ def lowest_failing(again: Verdicts, more: Verdicts, at: np.ndarray) -> Verdicts:
 
 
 def describe_disagreement(
-    i: int,
-    found: Mapping[str, Verdicts],
-    rho: float,
-    band: float,
-    as_run: float | None = None,
+    i: int, found: Mapping[str, Verdicts], rho: float, band: float, as_run: float | None = None
 ) -> str:
     """Say why a row is not confirmed.
 

@@ -149,10 +149,7 @@ class Confirmer:
             self._plan()
 
     def __call__(
-        self,
-        rows: Mapping[str, Any],
-        numbers: Sequence[int] | np.ndarray,
-        limit: int | None = None,
+        self, rows: Mapping[str, Any], numbers: Sequence[int] | np.ndarray, limit: int | None = None
     ) -> Confirmations:
         """Check these rows of the table.
 
@@ -314,9 +311,7 @@ class Confirmer:
         return 1 if self.problem.black_box else 1 + WITH_WORST
 
     def _examine(
-        self,
-        rows: Mapping[str, np.ndarray],
-        numbers: Int[np.ndarray, " n"],
+        self, rows: Mapping[str, np.ndarray], numbers: Int[np.ndarray, " n"]
     ) -> Confirmations:
         """Replay rows by all checks, decide, and note how far the replays have moved them."""
         run = rows.get("rho")

@@ -29,11 +29,7 @@ from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.host_monitor import MONITORS, HostMonitor
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.remarks import Remarks
-from verifai_jax.evaluation.verdicts import (
-    RowVerdict,
-    Verdicts,
-    violations,
-)
+from verifai_jax.evaluation.verdicts import RowVerdict, Verdicts, violations
 from verifai_jax.mtl.setting import period
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import Outcome, System, outcome_of

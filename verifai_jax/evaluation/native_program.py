@@ -21,13 +21,7 @@ from verifai_jax.core.precision import in_precision
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.verdicts import Verdicts, violations
-from verifai_jax.native_code.library import (
-    Library,
-    approve,
-    is_approved,
-    library_name,
-    load,
-)
+from verifai_jax.native_code.library import Library, approve, is_approved, library_name, load
 from verifai_jax.native_code.source import translate
 from verifai_jax.native_code.values import Untranslatable
 

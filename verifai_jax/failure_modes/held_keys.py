@@ -158,10 +158,7 @@ def _likeliest_of(
 
 
 def _choose_keys(
-    limit_state: LimitState,
-    held: Held,
-    keys: Int[np.ndarray, " k"],
-    z: Float[np.ndarray, "n d"],
+    limit_state: LimitState, held: Held, keys: Int[np.ndarray, " k"], z: Float[np.ndarray, "n d"]
 ) -> list[int]:
     """Choose keys of failures so that nearly all of these fail under one; see the module."""
     fails: dict[int, Bool[np.ndarray, " n"]] = {}

@@ -84,10 +84,7 @@ def _conditions(
     values = np.concatenate([own, others[np.isfinite(others)]])
     if np.all(values == np.round(values)):
         # The lower end is not included: it is the next smaller number.
-        return [
-            Between(name, above=low - 1, integer=True),
-            Between(name, upto=high, integer=True),
-        ]
+        return [Between(name, above=low - 1, integer=True), Between(name, upto=high, integer=True)]
     return [Between(name, above=_short(low, -1)), Between(name, upto=_short(high, 1))]
 
 

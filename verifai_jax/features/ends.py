@@ -86,12 +86,7 @@ def is_inside(
     return np.asarray(((numbers >= first) & (numbers <= last)) | at_low | at_high)
 
 
-def round_inwards(
-    value: Reals,
-    low: End,
-    high: End,
-    closed: str = "both",
-) -> Reals:
+def round_inwards(value: Reals, low: End, high: End, closed: str = "both") -> Reals:
     """Return numbers with those on an end that rounding moved outwards moved to the last number
     inside.
 

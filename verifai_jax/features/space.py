@@ -68,9 +68,7 @@ class FeatureSpace(PointMaps, ForUsers):
     ))  # fmt: skip
 
     def __init__(
-        self,
-        domains: Mapping[str, Domain],
-        where: Callable[[Any], Bool[Array, ""]] | None = None,
+        self, domains: Mapping[str, Domain], where: Callable[[Any], Bool[Array, ""]] | None = None
     ) -> None:
         super().__init__(Struct(domains), where)
         if where is not None and not callable(where):

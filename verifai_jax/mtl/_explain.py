@@ -143,11 +143,7 @@ def heading(f: Formula) -> str:
 
 
 def explain(
-    formula: Formula | str,
-    trace: Trace,
-    k: int = 5,
-    end: End = "hold",
-    tau: float | None = None,
+    formula: Formula | str, trace: Trace, k: int = 5, end: End = "hold", tau: float | None = None
 ) -> Explanation:
     """Find the predicate, instant and path that decide a formula on one trace.
 

@@ -132,11 +132,7 @@ class Mutants(InNotebook):
 
 
 def mutants(
-    formula: Formula | str,
-    signals: Recordings | None = None,
-    *,
-    end: End = "hold",
-    seed: int = 0,
+    formula: Formula | str, signals: Recordings | None = None, *, end: End = "hold", seed: int = 0
 ) -> Mutants:
     """Change a formula in one point at a time, and see which recordings notice.
 

@@ -185,10 +185,7 @@ def _columns(path: Path, table: Table) -> tuple[Columns, dict[str, str]]:
 
 
 def _of_clock(
-    source: str,
-    tables: list[tuple[Columns, dict[str, str]]],
-    clock: str,
-    names: Sequence[str],
+    source: str, tables: list[tuple[Columns, dict[str, str]]], clock: str, names: Sequence[str]
 ) -> tuple[Columns, dict[str, str]]:
     """Return the columns of one of several clocks of a table, its times as `time`."""
     columns = {name: column for table, _ in tables for name, column in table.items()}

@@ -22,9 +22,7 @@ Bound = Literal["none", "lower", "upper"]
 
 
 @partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["tau"],
-    meta_fields=["kind", "error", "bound"],
+    jax.tree_util.register_dataclass, data_fields=["tau"], meta_fields=["kind", "error", "bound"]
 )
 @dataclass(frozen=True)
 class Semantics:

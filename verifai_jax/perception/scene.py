@@ -139,8 +139,7 @@ class Scene:
         below = _below_horizon(rays)
         return [
             jnp.broadcast_to(
-                sky[k] + (in_fog(conditions, k, ground[k] * light, through) - sky[k]) * below,
-                shape,
+                sky[k] + (in_fog(conditions, k, ground[k] * light, through) - sky[k]) * below, shape
             )
             for k in range(3)
         ]

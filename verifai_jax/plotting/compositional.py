@@ -12,9 +12,7 @@ from verifai_jax.plotting import style
 
 
 def plot_region(
-    result: Compositional,
-    path: str | Path | None = None,
-    features: tuple[str, str] | None = None,
+    result: Compositional, path: str | Path | None = None, features: tuple[str, str] | None = None
 ) -> Figure:
     """Draw the samples of the region by the least error that fails, and the confirmed failures.
 

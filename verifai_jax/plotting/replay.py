@@ -123,8 +123,7 @@ def plot_replay(
     where = replay.describe_features()
     figure.suptitle(
         shorten(
-            f"{shorten(str(formulas[name]), LONGEST_FORMULA)}\n{verdict} at {where}",
-            LONGEST_TITLE,
+            f"{shorten(str(formulas[name]), LONGEST_FORMULA)}\n{verdict} at {where}", LONGEST_TITLE
         ),
         fontsize=9,
         color=FAILING if replay.violated else BOUND,

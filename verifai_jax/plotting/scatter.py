@@ -20,10 +20,7 @@ LARGE = 30
 
 
 def plot_features(
-    run: Run,
-    path: str | Path | None = None,
-    features: list[str] | None = None,
-    maximum: int = 4,
+    run: Run, path: str | Path | None = None, features: list[str] | None = None, maximum: int = 4
 ) -> Figure:
     """Draw safe (green) and failing (red) samples over pairs of features.
 

@@ -93,9 +93,7 @@ class RandomPolicy(Policy):
 
 
 jax.tree_util.register_dataclass(
-    RandomPolicy,
-    ["weights", "initial_memory", "normaliser"],
-    ["compute", "actions"],
+    RandomPolicy, ["weights", "initial_memory", "normaliser"], ["compute", "actions"]
 )
 
 

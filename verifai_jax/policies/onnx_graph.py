@@ -229,9 +229,7 @@ def read_onnx(
     return Graph(nodes, constants, inputs, ordered, chosen), weights, start
 
 
-def _sorted_out(
-    arrays: Mapping[str, np.ndarray],
-) -> tuple[dict[str, Array], dict[str, np.ndarray]]:
+def _sorted_out(arrays: Mapping[str, np.ndarray]) -> tuple[dict[str, Array], dict[str, np.ndarray]]:
     """Return the weights among arrays, which are real numbers, and the others."""
     weights = {n: jnp.asarray(a) for n, a in arrays.items() if a.dtype.kind == "f" and a.size}
     return weights, {n: a for n, a in arrays.items() if n not in weights}

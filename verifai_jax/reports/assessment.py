@@ -45,11 +45,7 @@ STEPS = (
         (),
         "How good must each kind of evidence be for this risk, as set before the simulations?",
     ),
-    (
-        "Adequacy, before",
-        (),
-        "Would evidence that reaches these goals be enough for the decision?",
-    ),
+    ("Adequacy, before", (), "Would evidence that reaches these goals be enough for the decision?"),
     (
         "Generation of the evidence",
         ("found", "limits", "reproduce"),

@@ -122,9 +122,7 @@ def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> 
             ),
         ),
         Section(
-            "limits",
-            "What was not shown",
-            (bullets([without, *assumptions, *estimate.notes]),),
+            "limits", "What was not shown", (bullets([without, *assumptions, *estimate.notes]),)
         ),
         claims_section(claims),
         Section(

@@ -90,11 +90,7 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[Child]], caption: str = 
     - `caption`: above the table, if any.
     """
     body = [
-        element(
-            "tr",
-            element("th", first, scope="row"),
-            [element("td", cell) for cell in others],
-        )
+        element("tr", element("th", first, scope="row"), [element("td", cell) for cell in others])
         for first, *others in rows
     ]
     return element(

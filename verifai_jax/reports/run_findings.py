@@ -41,10 +41,7 @@ _NOT_AGAIN = "Not all rows give their numbers when they are simulated again."
 def findings(run: Run) -> Section:
     """Write what was found, in numbers."""
     content = [table(["number", "value"], number_rows(run))]
-    content += [
-        element("h3", "The summary, as the tool prints it"),
-        preformatted(run.summary()),
-    ]
+    content += [element("h3", "The summary, as the tool prints it"), preformatted(run.summary())]
     return Section("found", "What was found", tuple(content))
 
 

@@ -67,9 +67,7 @@ def _unknown(features: Any) -> Any:
 
 
 def property_content(
-    texts: Mapping[str, str],
-    problem: Problem | None,
-    requirements: Mapping[str, Mapping[str, str]],
+    texts: Mapping[str, str], problem: Problem | None, requirements: Mapping[str, Mapping[str, str]]
 ) -> list[Markup]:
     """Write properties as formulas and in words.
 

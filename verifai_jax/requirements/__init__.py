@@ -3,11 +3,7 @@
 `vj.mtl.mine` takes a problem instead of recordings.
 """
 
-from verifai_jax.requirements.by_search import (
-    distinguish_by_search,
-    mine_by_search,
-    simulated,
-)
+from verifai_jax.requirements.by_search import distinguish_by_search, mine_by_search, simulated
 
 __all__ = ["distinguish_by_search", "mine_by_search", "simulated"]
 

@@ -34,12 +34,7 @@ Totals = tuple[State, Float[Array, "..."], Bool[Array, "..."]]
 
 @shows_progress("simulating episodes of", "episodes")
 def evaluate(
-    task: Task,
-    policy: Policy,
-    *,
-    seed: int = 0,
-    episodes: int = 100,
-    progress: bool | None = None,
+    task: Task, policy: Policy, *, seed: int = 0, episodes: int = 100, progress: bool | None = None
 ) -> Float[np.ndarray, " episodes"]:
     """Simulate episodes with the policy's most likely actions and return their returns.
 

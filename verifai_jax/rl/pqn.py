@@ -29,12 +29,7 @@ from verifai_jax.rl.experience import (
     progress,
     start_episodes,
 )
-from verifai_jax.rl.observations import (
-    ObservationStatistics,
-    mean_and_scale,
-    normalise,
-    update,
-)
+from verifai_jax.rl.observations import ObservationStatistics, mean_and_scale, normalise, update
 from verifai_jax.rl.on_policy import minibatch_epochs
 from verifai_jax.rl.optimizer import adam, annealed
 from verifai_jax.rl.policy import ACTIVATIONS, Layers, Policy, network, new_layers

@@ -27,12 +27,7 @@ from verifai_jax.rl.experience import (
     progress,
     start_episodes,
 )
-from verifai_jax.rl.observations import (
-    ObservationStatistics,
-    mean_and_scale,
-    normalise,
-    update,
-)
+from verifai_jax.rl.observations import ObservationStatistics, mean_and_scale, normalise, update
 from verifai_jax.rl.optimizer import adam, annealed
 from verifai_jax.rl.policy import ACTIVATIONS, Layers, Policy, network, new_layers, scale_to_range
 from verifai_jax.rl.replay_buffer import ReplayBuffer, StoredTransitions, add, empty_buffer, sample
@@ -168,9 +163,7 @@ class SAC:
             carry, transition, observation = act(self, task, carry, noise, step_key)
             taken = (state.done * self.horizon + number + 1) * self.environments
             carry = jax.lax.cond(
-                taken >= self.warmup,
-                lambda: _learn(self, carry, rate, learn_key),
-                lambda: carry,
+                taken >= self.warmup, lambda: _learn(self, carry, rate, learn_key), lambda: carry
             )
             return carry, (transition, observation)
 

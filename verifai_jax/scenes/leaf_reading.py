@@ -6,14 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from verifai_jax.features import (
-    Box,
-    Categorical,
-    Constant,
-    DiscreteBox,
-    Normal,
-    TruncatedNormal,
-)
+from verifai_jax.features import Box, Categorical, Constant, DiscreteBox, Normal, TruncatedNormal
 from verifai_jax.features.domain import MAX_LEVELS, Domain
 from verifai_jax.scenes.graph import field, is_random, kind_of, law
 from verifai_jax.scenes.leaves import (

@@ -26,13 +26,7 @@ from verifai_jax.features.domain import Domain
 from verifai_jax.scenes.compilation import Compiled, ProgramError
 from verifai_jax.scenes.graph import field, is_constructed, is_random, kind_of, law, nodes
 from verifai_jax.scenes.leaf_reading import leaf_of
-from verifai_jax.scenes.leaves import (
-    Leaf,
-    NothingToDrawError,
-    OnPolyline,
-    Series,
-    SeriesValue,
-)
+from verifai_jax.scenes.leaves import Leaf, NothingToDrawError, OnPolyline, Series, SeriesValue
 from verifai_jax.scenes.naming import leaf_names, owner_names, unique
 
 SEED = "seed"

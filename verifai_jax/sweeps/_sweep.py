@@ -131,10 +131,7 @@ def sweep(
     if proposer.learns:
         # Its proposals depend on both.
         options |= {"configurations": configurations, "batch": proposer.batch}
-    with (
-        locked_cache(folder) as cache,
-        Clock(study.name, max_seconds, progress) as clock,
-    ):
+    with locked_cache(folder) as cache, Clock(study.name, max_seconds, progress) as clock:
         sources = cache.claim(fingerprint(study, options), study.sources(), even_if_changed)
         if note is not None:
             cache.note("command", dict(note))

@@ -345,9 +345,7 @@ def _inputs(
 
 
 def _components(
-    table: "pd.DataFrame",
-    inputs: Sequence[_Input],
-    which: Literal["counterexamples", "safe"],
+    table: "pd.DataFrame", inputs: Sequence[_Input], which: Literal["counterexamples", "safe"]
 ) -> "Components | None":
     """Compute principal components of the ordered hyper-parameters of unsafe or safe rows."""
     import pandas as pd

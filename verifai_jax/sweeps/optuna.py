@@ -93,11 +93,7 @@ class OptunaProposer:
     learns = True
 
     def __init__(
-        self,
-        description: OptunaSampler,
-        sampler: "BaseSampler",
-        space: FeatureSpace,
-        batch: int,
+        self, description: OptunaSampler, sampler: "BaseSampler", space: FeatureSpace, batch: int
     ) -> None:
         self.description, self.space, self.batch = description, space, batch
         optuna = require("optuna", "optuna")

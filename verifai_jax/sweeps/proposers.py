@@ -55,12 +55,7 @@ class Proposer(Protocol):
 
 
 def make_proposer(
-    search: object,
-    space: FeatureSpace,
-    *,
-    configurations: int,
-    seed: int,
-    batch: int | None = None,
+    search: object, space: FeatureSpace, *, configurations: int, seed: int, batch: int | None = None
 ) -> Proposer:
     """Make the proposer of a search.
 

@@ -96,11 +96,7 @@ def attack(
     reserved = DESCENT * MAX_FOLLOWED * (each + len(STEPS)) if follows else 0
     searching = limits.slice(limits.left - min(reserved, limits.left // 3))
     proposals = Proposals(
-        search,
-        loop.environment.cube,
-        batch,
-        jax.random.key(seed),
-        loop.environment.constraint,
+        search, loop.environment.cube, batch, jax.random.key(seed), loop.environment.constraint
     )
     parts: list[tuple[np.ndarray, Pairs]] = []
     violations = 0

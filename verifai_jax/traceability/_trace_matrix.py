@@ -132,9 +132,7 @@ def _gaps_of(
             yield Gap("missing", kind, name, f"{MISSING_LINK[kind]} {name} {where}")
 
 
-def _problems(
-    given: Problem | Location | Sequence[Problem | Location],
-) -> Iterator[Problem]:
+def _problems(given: Problem | Location | Sequence[Problem | Location]) -> Iterator[Problem]:
     items = [given] if isinstance(given, Problem | str | Path) else given
     for item in items:
         if isinstance(item, Problem):

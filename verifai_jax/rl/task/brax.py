@@ -113,10 +113,7 @@ def brax_task(
 
 @suggests_options
 def playground_task(
-    env: str | PlaygroundEnv,
-    *,
-    time_limit: int = 1000,
-    options: Mapping[str, object] | None = None,
+    env: str | PlaygroundEnv, *, time_limit: int = 1000, options: Mapping[str, object] | None = None
 ) -> BraxTask:
     """Make a `Task` of an environment of MuJoCo Playground.
 

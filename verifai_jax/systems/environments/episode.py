@@ -104,10 +104,7 @@ def rollout(episode: Episode, key: Seed) -> Trace:
 
 
 def fold(
-    episode: Episode,
-    key: Seed,
-    carry: Carry,
-    update: Callable[[Carry, dict[str, Array]], Carry],
+    episode: Episode, key: Seed, carry: Carry, update: Callable[[Carry, dict[str, Array]], Carry]
 ) -> tuple[Carry, Int[Array, ""]]:
     """Apply `carry = update(carry, sample)` to the samples of `rollout` without storing them.
 

@@ -324,11 +324,7 @@ def mujoco(
     if delay.max_steps and controller is None:
         raise ValueError("action_delay needs a controller; got none")
     loaded = load(
-        model,
-        contacts,
-        keyframe,
-        iterations=solver_iterations,
-        ls_iterations=ls_iterations,
+        model, contacts, keyframe, iterations=solver_iterations, ls_iterations=ls_iterations
     )
     timestep = float(loaded.compiled.opt.timestep)
     loop = Loop(
