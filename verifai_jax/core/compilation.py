@@ -101,7 +101,8 @@ class Compilation:
                 self._program = _compiled(self.name, self._lowered, *self._how)
             except KeyboardInterrupt:
                 # Or else the process would not end before all others are compiled.
-                _cancel_waiting()
+                _pool().shutdown(wait=False, cancel_futures=True)
+                _pool.cache_clear()
                 raise
             finally:
                 _count_waiting(time.perf_counter() - began)
@@ -212,12 +213,6 @@ def describe_compilation() -> str:
 @cache
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(available_cores(), "compile")
-
-
-def _cancel_waiting() -> None:
-    """Give up what waits for its turn; it is compiled when it is called, if it ever is."""
-    _pool().shutdown(wait=False, cancel_futures=True)
-    _pool.cache_clear()
 
 
 def _compiled(

@@ -157,7 +157,9 @@ def _descend(
             break
         points = np.where(better[:, None], moved[np.arange(len(points)), which], points)
         best = np.where(better, lowest, best)
-    return _join(first, _collect(tried, level, loop))
+    return Attack(
+        *(np.concatenate(both) for both in zip(first, _collect(tried, level, loop), strict=True))
+    )
 
 
 def _gradients(
@@ -195,7 +197,3 @@ def _collect(parts: list[tuple[np.ndarray, Pairs]], level: float, loop: Parametr
         np.concatenate([pairs.rho[0] for _, pairs in parts]),
         np.concatenate([pairs.violates(level)[0] for _, pairs in parts]),
     )
-
-
-def _join(one: Attack, other: Attack) -> Attack:
-    return Attack(*(np.concatenate(both) for both in zip(one, other, strict=True)))

@@ -388,7 +388,11 @@ class _Worker:
                 if self.pipe.poll(min(max(left, 0.0), POLL_SECONDS)):
                     number, outcome = self.pipe.recv()
                     if number == self.asked:
-                        return self._noted(outcome)
+                        if not self.dropped or outcome.trace is None:
+                            return outcome
+                        notes = {**outcome.trace.notes, DROPPED: self.dropped}
+                        self.dropped = 0
+                        return outcome._replace(trace=replace(outcome.trace, notes=notes))
                     # Such as of a copy of the worker that its simulator has forked.
                     self.dropped += 1
                     continue
@@ -399,14 +403,6 @@ class _Worker:
                     return Outcome(None, Status.TIMEOUT, message)
         except Exception:  # The pipe is closed, or somebody else has written into it.
             return None
-
-    def _noted(self, outcome: Outcome) -> Outcome:
-        """Return an outcome that says how many answers to other questions came before it."""
-        if not self.dropped or outcome.trace is None:
-            return outcome
-        notes = {**outcome.trace.notes, DROPPED: self.dropped}
-        self.dropped = 0
-        return outcome._replace(trace=replace(outcome.trace, notes=notes))
 
     def kill(self) -> None:
         """Kill the process, and those that it has started."""
