@@ -76,7 +76,6 @@ class Boundary(InNotebook):
         """Return the probability of a failure at points.
 
         **Arguments:**
-
         - `points`: a dictionary of the features of one point, or a DataFrame of several.
 
         **Returns:** a number, or an array; NaN where no row lies near (`sampled`).
@@ -99,7 +98,6 @@ class Boundary(InNotebook):
         the others.
 
         **Arguments:**
-
         - `count`: number of points.
 
         **Returns:** their features, with `probability` and `sampled`.
@@ -156,7 +154,6 @@ def boundary(source: Source, *, seed: int = 0) -> Boundary:
     It is calibrated on rows that were not learned from, and says where no row lies near.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame, or `Samples`; rows with a verdict count.
     - `seed`: the seed of the folds, and of the points of the prior.
 

@@ -119,7 +119,6 @@ def coverage(source: Source, *, cells: int = 10, seed: int = 0) -> Coverage:
     """Measure how well samples cover the space of features.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame, or `Samples`; of the first three all rows with a
       verdict.
     - `cells`: into how many equal parts the range of a feature is cut, fewer where rows are too few
@@ -278,7 +277,6 @@ def largest_hole(
     more than 8 dimensions.
 
     **Arguments:**
-
     - `points`: in the unit cube.
     - `parts`: the prior distributions of their columns.
     - `seed`: the seed of the probes.

@@ -74,7 +74,6 @@ def diverse(
     """Select `k` rows: the worst one first, then always the row farthest from all before.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
     - `k`: how many; all rows if there are no more.

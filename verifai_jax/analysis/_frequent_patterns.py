@@ -178,7 +178,6 @@ def frequent_patterns(
     """Find frequent values of unordered columns, and combinations of up to `size` of them.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
     - `size`: values that a combination has at most.

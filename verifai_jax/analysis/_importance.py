@@ -100,7 +100,6 @@ def importance(
     """Measure how important each feature is to a model trained on the table; nothing is simulated.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame, or `Samples`; of the first three all rows with a
       verdict.
     - `repeats`: how often each feature is shuffled.

@@ -95,7 +95,6 @@ class Components(Drawn, InNotebook):
         """Return coordinates along the components, in scaled units, a column each; 0 is the pivot.
 
         **Arguments:**
-
         - `rows`: row numbers of the table, or a DataFrame with the columns; by default the rows
           that were analysed.
 
@@ -116,7 +115,6 @@ class Components(Drawn, InNotebook):
         """Draw features: normal along the components around the pivot, within the space's bounds.
 
         **Arguments:**
-
         - `seed`: an integer, a NumPy generator or a `jax.random` key.
         - `n`: how many.
         - `spread`: times the standard deviations of the rows.
@@ -236,7 +234,6 @@ def pca(
     """Compute principal components of the ordered features.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
       Unordered columns are left out.

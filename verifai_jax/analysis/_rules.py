@@ -179,7 +179,6 @@ def rules(
     """Describe the failure region by a few boxes.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame, or `Samples` of `"all"` rows.
     - `depth`: features that a rule has conditions on at most.
     - `cover`: share of the failures to cover; `max_rules` rules at most.

@@ -84,7 +84,6 @@ def k_closest(
     """Select the tightest group: a row and its `k - 1` nearest, of the least sum of distances.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
       Unordered columns count 1 where they differ; VerifAI leaves them out and includes `rho`:
@@ -129,7 +128,6 @@ def nearest(
     """Select the `k` rows nearest to a point, the nearest first.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
     - `point`: features (a mapping with all analysed columns, or a row of a table), or the number of
@@ -172,7 +170,6 @@ def random_rows(
     """Draw `k` different rows, each as likely as any other; all of them if there are no more.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
     - `k`: how many.

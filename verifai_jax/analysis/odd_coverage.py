@@ -62,7 +62,6 @@ class OddCoverage(InNotebook):
         """Return points inside the domain that occupy the most empty cells and pairs of cells.
 
         **Arguments:**
-
         - `count`: number of points.
 
         **Returns:** their features, a row each, with `new`, the cells and pairs that each occupies.
@@ -124,7 +123,6 @@ def odd_coverage(
     """Measure how much of a domain rows cover: by attribute, by pairs, by volume, by prior mass.
 
     **Arguments:**
-
     - `domain`: the domain; its attributes are cut into cells of equal width, not the features.
     - `source`: a run, its table, or a DataFrame; all rows with a verdict.
     - `cells`: cells of a range; an integer of up to 20 values and literals have one a value.

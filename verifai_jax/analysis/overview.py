@@ -154,7 +154,6 @@ def analyze(
     """Apply every analysis of the error table that fits it, and say why others do not.
 
     **Arguments:**
-
     - `source`: a run, its table, or a DataFrame with feature columns.
     - `seed`: the seed of everything that is drawn at random.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.

@@ -76,7 +76,6 @@ def augment(
     - `pca_kept`, `rules_kept`: the same, of which only those are added on which the network errs.
 
     **Arguments:**
-
     - `task`: what is trained, and how its inputs are rendered.
     - `arms`: names of arms, or `"all"`; by default `none`, `random`, `counterexamples`, and
       `standard` where the task has a transformation.

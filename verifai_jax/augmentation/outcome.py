@@ -59,7 +59,6 @@ class Outcome(NamedTuple):
         """Compare all arms with one of them, seed by seed.
 
         **Arguments:**
-
         - `metric`: the column to compare.
         - `reference`: the arm that is subtracted.
 

@@ -93,7 +93,6 @@ class Augmentation(InNotebook):
         is not compared.
 
         **Arguments:**
-
         - `metric`: name of a column that measures a network.
         - `reference`: the arm that is subtracted, or `"base"`.
 
@@ -120,7 +119,6 @@ class Augmentation(InNotebook):
         """Return the inputs that an arm added, rendered again.
 
         **Arguments:**
-
         - `arm`: name of the arm.
         - `seed`: number of the seed.
 
@@ -147,7 +145,6 @@ class Augmentation(InNotebook):
         """Draw a metric of each arm and its paired difference with intervals.
 
         **Arguments:**
-
         - `path`: file that the picture is written to, if given.
         - `metric`, `reference`: as in `compare`.
 
@@ -168,7 +165,6 @@ class Augmentation(InNotebook):
         """Draw inputs that an arm added, for tasks whose inputs are images.
 
         **Arguments:**
-
         - `path`: file that the picture is written to, if given.
         - `arm`, `seed`: as in `examples`.
         - `count`: images at most.

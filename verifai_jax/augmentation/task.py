@@ -52,7 +52,6 @@ class SupervisedTask:
     """A network to train, and labelled inputs that are rendered from features.
 
     **Arguments:**
-
     - `name`: how results call it.
     - `space`: a `FeatureSpace`, or a dictionary of domains, of all inputs that the network is for.
     - `render`: features -> one input.
@@ -168,7 +167,6 @@ class SupervisedTask:
         the task is a black box.
 
         **Arguments:**
-
         - `weights`: the weights of the network.
         """
         if self.black_box:

@@ -42,7 +42,6 @@ def flip(share: float = 0.5) -> Transformation:
     """Return a transformation that mirrors images left to right.
 
     **Arguments:**
-
     - `share`: the share of images that are mirrored.
 
     **Raises:** `ValueError` for a share out of range.
@@ -63,7 +62,6 @@ def shift(pixels: int) -> Transformation:
     What comes in from beyond an edge repeats the edge.
 
     **Arguments:**
-
     - `pixels`: by which an image moves at most, in each direction.
 
     **Raises:** `ValueError` unless it is a positive integer.
@@ -90,7 +88,6 @@ def brightness(max_change: float) -> Transformation:
     """Return a transformation that multiplies images by factors of `1 - most` to `1 + most`.
 
     **Arguments:**
-
     - `max_change`: change of brightness at most, a share.
 
     **Raises:** `ValueError` for a share out of range.
@@ -102,7 +99,6 @@ def contrast(max_change: float) -> Transformation:
     """Return a transformation that scales images around their mean by `1 - most` to `1 + most`.
 
     **Arguments:**
-
     - `max_change`: change of contrast at most, a share.
 
     **Raises:** `ValueError` for a share out of range.

@@ -71,7 +71,6 @@ def certify(
     """Attack all policies, then bound the failure probability of each from fresh samples.
 
     **Arguments:**
-
     - `problem_of`: a policy's `Problem`. JAX traces it with the policy's numbers as arguments, so
       that policies of one structure share a program; where it cannot, each is compiled by itself.
     - `policies`: `rl.Policy` objects, or other pytrees of numbers.
@@ -336,7 +335,6 @@ def repeat_failures(
     One for 25 simulations or 32 of them, and up to 1024 where one has not come again.
 
     **Arguments:**
-
     - `blocks`: that simulate the policies.
     - `policy`: its number.
     - `sampled`, `attacked`: its simulations, whose verdicts are replaced.

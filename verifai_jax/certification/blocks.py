@@ -69,7 +69,6 @@ class Blocks:
     `sources` is the record of the model that they are simulated with.
 
     **Arguments:**
-
     - `problem_of`: a policy's problem; JAX traces it where it can.
     - `policies`: any pytrees of numbers, or other objects, which are then simulated one by one.
     - `seed`: the seed of the samples and of the random keys of simulations.
@@ -196,7 +195,6 @@ class Blocks:
         """Simulate rows of a policy on the host once more.
 
         **Arguments:**
-
         - `policy`: its number.
         - `points`: the points of the rows.
         - `numbers`: the numbers of the simulations, which their random keys come from.

@@ -44,7 +44,6 @@ class ExecutorSimulator:
     """Policies of one structure, or each by itself, on workers; see the module's docstring.
 
     **Arguments:**
-
     - `shipment`: with `problem_of`.
     - `policies`: as a worker simulates them, those of one structure already padded.
     - `structure`: the structure of the policies that share a program; None for those simulated by

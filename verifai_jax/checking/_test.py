@@ -48,7 +48,6 @@ def test(
     shrunk and added to the corpus. Under pytest `--vj-budget` and `--vj-seed` go first.
 
     **Arguments:**
-
     - `problem`: the problem, or `FILE.py:NAME`; one file is loaded once for all tests.
     - `budget`: simulations at most.
     - `max_failure_probability`: accept failures that are as rare, or rarer; the test passes only

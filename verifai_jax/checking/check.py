@@ -82,7 +82,6 @@ class Check:
         """Replay the corpus, and spend the budget where all of it is fixed.
 
         **Arguments:**
-
         - `problem`: to be tested.
         - `corpus`: folder of saved counterexamples, to which a new one is added; None for none.
         - `target`: the command line's name of the problem, for the files of the corpus.

@@ -365,7 +365,6 @@ def refuse_others(allowed: Container[str], why: str) -> None:
     """Raise a usage error for an option of this command that was given and is not allowed now.
 
     **Arguments:**
-
     - `allowed`: names of parameters, in addition to those that every command has.
     - `why`: the end of the message, after the option.
     """
@@ -395,7 +394,6 @@ def resuming(command: str, folder: Path, target: str | None, options: Mapping[st
     """Write the command that goes on with a folder, as a shell reads it.
 
     **Arguments:**
-
     - `command`: `falsify` or `sweep`.
     - `target`: that the folder records; it is named where the record alone would not do.
     - `options`: that the record does not hold, with their values; those that are None are left out.

@@ -70,7 +70,6 @@ def check_again(finding: str, even_if_changed: bool) -> None:
     """End the command with code 4 where a row did not give its number again.
 
     **Arguments:**
-
     - `finding`: what differs, as text; empty if nothing does.
     - `even_if_changed`: whether the user has said that another model is meant.
     """

@@ -233,7 +233,6 @@ def print_run(
     """Print the summary of a run and how to see more of it.
 
     **Arguments:**
-
     - `options`: the options of the command that the record does not hold, to be given again on
       resuming.
 

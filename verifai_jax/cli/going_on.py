@@ -44,7 +44,6 @@ class Kept:
         """Note that the result exists, and what ended the work.
 
         **Arguments:**
-
         - `why`: what ended it early; None or anything else if it is done.
         """
         if self._work is None:

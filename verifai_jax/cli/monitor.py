@@ -237,7 +237,6 @@ def monitor_stream(
     """Monitor samples until the verdict is certain whatever follows, or until they end.
 
     **Arguments:**
-
     - `lines`: the lines of CSV; the first has the names.
     - `time`: the column of sample times in seconds, or of dates (ISO 8601).
     - `dt`: the sampling period in seconds, instead of a column of times.

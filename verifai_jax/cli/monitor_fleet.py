@@ -52,7 +52,6 @@ def monitor_fleet(
     """Judge requirements, a file of them or one formula, on recordings; print what was found.
 
     **Arguments:**
-
     - `jobs`: processes that judge; more than one are started for it.
     - `options`: the options of `judge`: how recordings are read.
 

@@ -30,7 +30,6 @@ def connect(address: str) -> Iterator[Executor]:
     """Connect to a cluster for as long as the context lasts.
 
     **Arguments:**
-
     - `address`: `dask://HOST:PORT` of a scheduler; `ray://HOST:PORT` of a head node's client
       server, or `ray://auto` for the cluster that this machine is part of; `slurm`, with parameters
       of submitit where they are wanted: `slurm?slurm_partition=cpu&timeout_min=60&jobs=32`.
@@ -115,7 +114,6 @@ class RayExecutor:
     """`concurrent.futures`' `submit` on a cluster of Ray.
 
     **Arguments:**
-
     - `address`: the address of the cluster, as of `ray.init`; the one that Ray is connected to
       already, or else a new one on this machine, when left out.
     - `cpus`: cores that a block takes.

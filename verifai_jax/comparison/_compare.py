@@ -65,7 +65,6 @@ def compare(
     whenever sampling stops, and for several candidates together.
 
     **Arguments:**
-
     - `baseline`: the problem to compare with: itself, `FILE.py:NAME`, or `FILE.py:NAME@REVISION`
       for the problem as it was at a revision of git.
     - `candidates`: another one that varies the same features, or several by name. What is held,

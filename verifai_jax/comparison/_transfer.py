@@ -72,7 +72,6 @@ def transfer(
     a move of the features by one rounding of single precision makes in the same engine.
 
     **Arguments:**
-
     - `policy`: given to both problems; None if they have it already.
     - `problem_a`, `problem_b`: a function from the policy to a `Problem`, or a `Problem`. Features
       that both have, with the same domains, are varied; all others are held at their nominal

@@ -127,7 +127,6 @@ class Comparison(InNotebook):
         """Write the evidence report on the comparison as HTML, and its claims as JSON.
 
         **Arguments:**
-
         - `path`: the path of the HTML file.
         - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`, `errors`.
 
@@ -230,7 +229,6 @@ class Transfer(InNotebook):
         """Write the evidence report as HTML, and its claims as JSON.
 
         **Arguments:**
-
         - `path`: the path of the HTML file.
         - `options`: the options of `reports.write_report`: `units`, `reasons`.
 
@@ -242,7 +240,6 @@ class Transfer(InNotebook):
         """Draw the pair that parts most, and the gaps of all by the feature that matters most.
 
         **Arguments:**
-
         - `path`: the picture that is written; none when left out.
 
         **Returns:** the figure.

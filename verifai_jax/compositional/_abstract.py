@@ -78,7 +78,6 @@ def abstract(
     looked for. Images that only fill up a compiled batch are not counted.
 
     **Arguments:**
-
     - `problem`: the loop with its network, one image at each sample of its traces.
     - `abstraction`: `severity -> system`, the same loop without images: its perception is the truth
       with an error of a severity from 0 (none) to 1 (the worst allowed); JAX traces it. Its
@@ -299,7 +298,6 @@ class DecisiveImage(System):
     """The network's reading of the last image that the loop cannot do without.
 
     **Arguments:**
-
     - `loop`: the loop without images.
     - `frame`: renders one image, and returns the signals of the network's reading.
     - `lanes`: images that are worked on together.

@@ -69,7 +69,6 @@ class AbstractLoop:
     """A loop whose perception is the truth with an error of a given severity.
 
     **Arguments:**
-
     - `problem`: the loop with the network; its formulas decide.
     - `abstraction`: `severity -> system`, without images.
     - `error`: a condition on the signals of one instant: the perception errs.

@@ -79,7 +79,6 @@ class Compositional(InNotebook):
         """Simulate a confirmed failure again, and keep its trace.
 
         **Arguments:**
-
         - `number`: 0 is the first that was found.
 
         **Raises:** `IndexError` where there are not as many.
@@ -97,7 +96,6 @@ class Compositional(InNotebook):
         Samples that fail anyway or have no verdict are left out.
 
         **Arguments:**
-
         - `options`: those of `vj.analysis.rules`.
         """
         known = self.region["kind"].isin([UNCERTAIN, SAFE])
@@ -111,7 +109,6 @@ class Compositional(InNotebook):
         """Draw the region of uncertainty over two features, by the least error that fails.
 
         **Arguments:**
-
         - `path`: file that the picture is written to, if given.
         - `features`: the columns; by default the two that the region depends on most.
 

@@ -25,7 +25,6 @@ def check_name(
     """Check a name that tables and files can hold.
 
     **Arguments:**
-
     - `what`: what it names, for the message: `the name of a signal`.
     - `name`: name to check.
     - `lines`: whether it may have line breaks and other control characters.
@@ -63,7 +62,6 @@ def check_fraction(
     """Check a probability or another share of one.
 
     **Arguments:**
-
     - `name`: name of the argument in the error message.
     - `value`: value to check.
     - `zero`: whether 0 itself is allowed.
@@ -88,7 +86,6 @@ def check_positive(
     """Check a number above zero.
 
     **Arguments:**
-
     - `name`: name of the argument in the error message.
     - `value`: value to check.
     - `finite`: whether infinity is refused too.
@@ -109,7 +106,6 @@ def check_count(
     """Check an integer that counts something.
 
     **Arguments:**
-
     - `name`: name of the argument in the error message.
     - `value`: value to check; NumPy's integers are welcome, truth values and floats are not.
     - `minimum`: smallest value allowed.

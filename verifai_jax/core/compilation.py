@@ -135,7 +135,6 @@ def compile_soon(
     """Compile a program in the background.
 
     **Arguments:**
-
     - `name`: the name of the program, for people: "the search".
     - `lowered`: the program, lowered by JAX.
     - `effort`: how much XLA does to make it fast; accelerators always do the most.
@@ -152,7 +151,6 @@ def while_compiling(work: Callable[[], object], after: float = LONG) -> None:
     """Have work done once where this process next waits for a program; never where it does not.
 
     **Arguments:**
-
     - `work`: what will be needed anyway, such as an import; nothing that results depend on.
     - `after`: seconds of the wait before; 0 for what a first result needs.
     """
@@ -167,7 +165,6 @@ def tracing(name: str = "") -> Iterator[None]:
     would look at all of them again and again, for a fifth of the time.
 
     **Arguments:**
-
     - `name`: the name of the program, which `describe_compilation` then says already; none by
       default.
     """
@@ -254,7 +251,6 @@ def known_options(options: Mapping[str, Any]) -> dict[str, Any]:
     it does not know, and ends a process that gets it in `XLA_FLAGS`.
 
     **Arguments:**
-
     - `options`: values by their names.
     """
     nothing = jax.jit(lambda: np.float32(0)).lower()

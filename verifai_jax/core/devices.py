@@ -29,7 +29,6 @@ def spread_over_devices(
     """Split the leading axis of some arguments, and of all results, over devices.
 
     **Arguments:**
-
     - `function`: the function of arrays whose leading axes are a device's share.
     - `split`: for each argument whether its leading axis is split; the others are given whole.
     - `devices`: JAX devices; all of this process when left out. Leading axes must be multiples of

@@ -102,7 +102,6 @@ class Events:
         """Return whether an event of this name has happened in the last `seconds`.
 
         **Arguments:**
-
         - `seconds`: how long an event lasts: a number, or the name of a parameter that says so.
         """
         ends = self[seconds] if isinstance(seconds, str) else seconds

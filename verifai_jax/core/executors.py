@@ -180,7 +180,6 @@ class Shipment(Generic[T]):
     """An object that is sent to workers; each worker keeps it with the programs compiled for it.
 
     **Arguments:**
-
     - `thing`: the object.
     - `target`: its name `FILE.py:NAME`; given, the workers load it by that name, and it is not sent
       itself.

@@ -30,7 +30,6 @@ class Drawn:
         """Draw the result.
 
         **Arguments:**
-
         - `path`: file that the picture is written to, if given.
 
         **Returns:** the Matplotlib figure.
@@ -45,7 +44,6 @@ def new_figure(**options: Any) -> Figure:
     As the last value of a notebook cell it is drawn, with or without `%matplotlib inline`.
 
     **Arguments:**
-
     - `options`: those of `matplotlib.figure.Figure`.
     """
     return _figure_class()(**options)

@@ -50,7 +50,6 @@ def fingerprint(program: Any, derivatives: bool = True) -> str | None:
     """Return a hash of all that a traced function computes, with its constants.
 
     **Arguments:**
-
     - `program`: what JAX traced, with its constants.
     - `derivatives`: whether rules of derivatives are read too. They are traced for that, and only
       programs that differentiate this one depend on them.
@@ -255,7 +254,6 @@ def without_unused(program: Any, wanted: Sequence[bool]) -> Any:
     """Return a program that computes some of the results of another, from the same inputs.
 
     **Arguments:**
-
     - `program`: a `Jaxpr`.
     - `wanted`: which of its results.
     """
@@ -266,7 +264,6 @@ def as_function(program: Any, step: Any) -> tuple[Callable[..., list[Any]], list
     """Return a function that takes one step of a program, and the variables that are its arguments.
 
     **Arguments:**
-
     - `program`: a `Jaxpr`.
     - `step`: one of its equations.
 
@@ -288,7 +285,6 @@ def of_some(
     """Return a function of some arguments of another, to be differentiated.
 
     **Arguments:**
-
     - `call`: the other function, of arrays.
     - `values`: all of its arguments.
     - `indices`: numbers of those that the function takes; the others keep their values.

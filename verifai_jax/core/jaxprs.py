@@ -34,7 +34,6 @@ def run_through(
     """Go through the steps of a `Jaxpr` in their order, and return its results.
 
     **Arguments:**
-
     - `constants`, `inputs`: the values of its constants and of its arguments.
     - `literal`: makes a value of a number in the program, given as JAX's `Literal`.
     - `step`: makes the results of one step from its operands.

@@ -27,7 +27,6 @@ class CSVLogger:
     """A CSV file with a row a call: the step, then the values; a cell without a value is empty.
 
     **Arguments:**
-
     - `path`: the path of the file; one that is there is continued.
 
     **Raises:** `ValueError` for a file that is there and has no column `step`.
@@ -76,7 +75,6 @@ class TensorBoardLogger:
     tensorflow/core/util/event.proto).
 
     **Arguments:**
-
     - `folder`: the folder of the event file; each logger begins a file of its own in it.
     - `prefix`: before the names of values, such as `"falsify/"`.
     """

@@ -52,7 +52,6 @@ def library_file(name: str, program: Callable[[], Program]) -> Path:
     """Return the file of the library of this name, compiled where there is none.
 
     **Arguments:**
-
     - `name`: which depends on all that the library depends on.
     - `program`: makes the source and the compiler's flags, if they are needed.
 

@@ -95,7 +95,6 @@ class ProgressBar:
     """One line, for one stage of a computation at a time; a context manager around all of them.
 
     **Arguments:**
-
     - `show`: whether to show it; None decides by where the error stream goes, False shows nothing.
     """
 
@@ -257,7 +256,6 @@ def shows_progress(
     is done.
 
     **Arguments:**
-
     - `doing`: a word for the verb, before the name of its first argument: "comparing".
     - `unit`: name of what is counted.
     - `of_budget`: whether its option `budget` is the total, and not that of a part.
@@ -311,7 +309,6 @@ class SimulationProgress:
     """The bar of a run: simulations per second, least robustness, counterexamples, time left.
 
     **Arguments:**
-
     - `name`: text in front of the bar.
     - `budget`: simulations in all.
     - `show`: whether to draw; None decides by where the error stream goes.
@@ -359,7 +356,6 @@ def goes_on_with(command: str, kept: Callable[[], bool]) -> Iterator[None]:
     """Say after a moment which command resumes the work, since a killed process cannot say it.
 
     **Arguments:**
-
     - `kept`: whether there is anything to go on with by now.
     """
     over = threading.Event()

@@ -49,7 +49,6 @@ def files_read_by(module: str) -> set[str]:
     """Return the files that a module has read so far.
 
     **Arguments:**
-
     - `module`: path of its file.
     """
     return _read.get(module, set())
@@ -59,7 +58,6 @@ def modules_loaded_by(module: str) -> set[str]:
     """Return the files of modules that a module was the first to import, by whatever name.
 
     **Arguments:**
-
     - `module`: path of its file.
     """
     return _loaded.get(module, set())

@@ -49,7 +49,6 @@ def remembered_as(kind: str, *values: object) -> str | None:
     """Return the name under which a program is kept, a hash of all that it depends on.
 
     **Arguments:**
-
     - `kind`: of the program, for people who look into the folder.
     - `values`: everything that determines the program, besides this package and JAX; see
       `identity`.
@@ -77,7 +76,6 @@ def lower_or_recall(
     It is the same program, to the last bit, whether it was traced here or by an earlier process.
 
     **Arguments:**
-
     - `name`: the name of `remembered_as`; None for a program that is not kept.
     - `function`: the function of pytrees; is traced where there is no file.
     - `arguments`: their shapes and types.

@@ -42,7 +42,6 @@ def definitions(location: str, *kinds: type[Kind]) -> dict[str, Kind]:
     """Return the objects of some classes that a file or module defines.
 
     **Arguments:**
-
     - `location`: file (`specs/cartpole.py`) or module (`specs.cartpole`); it is run.
     - `kinds`: classes to look for.
 
@@ -89,7 +88,6 @@ def load_target(target: str, kind: type[Kind]) -> Kind:
     """Load the object that a target names.
 
     **Arguments:**
-
     - `target`: `FILE.py:NAME` or `MODULE:NAME`, with the name of the object or of its variable;
       the name may be left out where the file defines one object of this kind.
     - `kind`: class of the object.
@@ -129,7 +127,6 @@ def target_of_project(target: object, folder: Path, *, kind: str, remedy: str) -
     `runs` or `sweeps`, and any with the files of a run or a sweep.
 
     **Arguments:**
-
     - `target`: the target that the folder records, of any type.
     - `folder`: folder that records it.
     - `kind`: noun of the object, such as `"problem"`, for the message.

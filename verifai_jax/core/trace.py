@@ -55,7 +55,6 @@ class Trace(InNotebook):
     """Signals of one simulation, sampled on one clock.
 
     **Arguments:**
-
     - `signals`: name -> array `[time]` or `[time, k]`; all with the same `time`.
     - `dt`: sampling period in seconds. Exactly one of `dt` and `times` is given.
     - `times`: `[time]` strictly increasing sample times in seconds.
@@ -174,7 +173,6 @@ class Trace(InNotebook):
         out. `verifai_jax.mtl.read` can also choose columns and resample.
 
         **Arguments:**
-
         - `time`: the column of sample times in seconds, or the name of the index; dates and
           durations become seconds since the first.
         - `dt`: the sampling period in seconds, instead of a column of times.
@@ -321,7 +319,6 @@ def check_code(name: str, value: Any, wanted: str) -> int | None:
     """Check that a value of a trace is a whole number, or an array of whole numbers.
 
     **Arguments:**
-
     - `name`, `wanted`: what it is and what it must be, for the message.
 
     **Returns:** the number where it is known and a single one, else None.

@@ -147,7 +147,6 @@ def check_called_with(
     """Check that a function of a user takes the positional arguments that it will be called with.
 
     **Arguments:**
-
     - `role`: what the function is, for the message: "dynamics".
     - `function`: what was given; None if nothing was.
     - `arguments`: names of the arguments.
@@ -174,7 +173,6 @@ def source_line(traceback: object) -> str | None:
     """Return the user's line at which JAX recorded an operation; None if it is not known.
 
     **Arguments:**
-
     - `traceback`: the traceback of the operation, as JAX keeps it: frames from the innermost one
       on.
     """
@@ -190,7 +188,6 @@ def explain_user_error(
     """Write what failed in a user's code, at which line, and the remedy, in one line.
 
     **Arguments:**
-
     - `error`: as the code raised it.
     - `features`: that the code was called with, to tell a misspelt one from another missing key.
     - `system`: whether the code belongs to a system, which could also run as a black box.

@@ -38,7 +38,6 @@ class Waveform:
     """Control points at equal distances or given times, and the course between them.
 
     **Arguments:**
-
     - `knots`: `[knots, ...]`. With `"linear"` and `"pchip"` the first is the value at time 0 and
       the last that at the end; with `"constant"` each is held for an equal part of the duration,
       its beginning included; with `"pulse"` for the first `width` seconds of that part, and the

@@ -58,7 +58,6 @@ def confirm(
     """Replay counterexamples more finely than they were found, and decide which are real.
 
     **Arguments:**
-
     - `run`: a run of a problem.
     - `row`: a row number, a row of the table, or a mapping with its feature columns; all
       counterexamples of the table when left out.

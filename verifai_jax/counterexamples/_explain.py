@@ -95,7 +95,6 @@ def explain(
     """Explain a counterexample: the predicate that decides, when, and the features that matter.
 
     **Arguments:**
-
     - `run`: a run of a problem, with a counterexample.
     - `row`: the number of one, or a row of the table; the worst when left out.
     - `nominal`: features that are ordinary, where the problem does not say or others are meant.
@@ -203,7 +202,6 @@ def slopes_of(
     distribution and little in its middle.
 
     **Arguments:**
-
     - `space`: the space of the features.
     - `u`: the point at which the gradient was taken.
     - `gradient`: by the coordinates.

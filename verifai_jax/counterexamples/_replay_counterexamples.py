@@ -147,7 +147,6 @@ def replay_counterexamples(
     judged by those of today, and says so. Files of problems of other names are counted.
 
     **Arguments:**
-
     - `problem`: as it is now.
     - `folder`: that `run.save_counterexamples` wrote into, or one file of it.
     - `rename`: new names of features by their old ones.

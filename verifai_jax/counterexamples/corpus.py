@@ -182,7 +182,6 @@ def save_counterexamples(
     few of them stand for all.
 
     **Arguments:**
-
     - `run`: with its problem.
     - `folder`: made if missing; existing files stay.
     - `max_count`: counterexamples at most.

@@ -40,7 +40,6 @@ def draw_around_elite(candidates: Candidates, rng: np.random.Generator) -> None:
     """Sample around the likeliest failures, fit to the likeliest of all, and so on.
 
     **Arguments:**
-
     - `candidates`: simulates, and remembers what failed, within its limit.
     - `rng`: the rng of the samples.
     """
@@ -99,7 +98,6 @@ def exchange_cells(candidates: Candidates, rng: np.random.Generator) -> None:
     """Change cells of the likeliest failures until no change of two makes any likelier.
 
     **Arguments:**
-
     - `candidates`: simulates, and remembers what failed, within its limit.
     - `rng`: the rng of the order of changes that are predicted alike.
     """

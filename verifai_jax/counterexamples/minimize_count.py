@@ -230,7 +230,6 @@ def minimize_count(candidates: Candidates, starts: Points, rng: np.random.Genera
     """Minimise the number of coordinates that depart from nominal, among failing points.
 
     **Arguments:**
-
     - `candidates`: simulates, and remembers what failed.
     - `starts` `[m, d]`: failing points to begin with.
     - `rng`: for random candidates.

@@ -74,7 +74,6 @@ def minimize_distance(
     """Follow failing points along the boundary until none comes nearer to nominal.
 
     **Arguments:**
-
     - `candidates`: simulates, and remembers what failed.
     - `starts` `[n, d]`: failing points.
     - `rng`: for random candidates.

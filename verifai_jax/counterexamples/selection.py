@@ -35,7 +35,6 @@ def select_row(run: Run, row: Row) -> tuple[int, dict[str, Any]]:
     """Select a counterexample of a run.
 
     **Arguments:**
-
     - `run`: a run with a counterexample.
     - `row`: its number, or a row of the table; the worst where it is None.
 

@@ -68,7 +68,6 @@ def error_budget(
     """Say how wrong a probability can be, part by part, and how far the prior may be wrong.
 
     **Arguments:**
-
     - `problem`: that was simulated; of a comparison the candidate, of a certificate the policy's.
     - `result`: an estimate, a rate (`run.failure_rate`), a certificate, or a candidate of a
       comparison, `comparison["NAME"]`.

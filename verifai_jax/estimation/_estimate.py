@@ -93,7 +93,6 @@ def estimate(
     the constraint holds; a system's own randomness counts as well.
 
     **Arguments:**
-
     - `problem`: the system with its feature space and formulas.
     - `method`: `"monte_carlo"`, `"importance"`, `"splitting"` or `"surrogate"`; the first samples
       choose when left out.

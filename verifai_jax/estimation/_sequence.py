@@ -64,7 +64,6 @@ def sequence(
     are simulated again for it, and parts in between are simulated.
 
     **Arguments:**
-
     - `parts`: problems, or runs with `search="uniform"`, in their order.
     - `handover`: for a feature of a part, the signal of the part before whose last value it begins
       with (`"x"`, or `"position[1]"`), or the feature of that part that it keeps. One for all

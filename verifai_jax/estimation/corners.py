@@ -36,7 +36,6 @@ def approach_corner(
     the next plane.
 
     **Arguments:**
-
     - `limit_state`: one with gradients.
     - `z`: failures.
     - `planes`: planes of a failure, at most.

@@ -84,7 +84,6 @@ class DoublePrecisionEvaluator:
     linear functions.
 
     **Arguments:**
-
     - `problem`: a checked one, on the backend that it is to run on.
     - `batch`: simulations at once.
     - `precision`: the precision of the simulations, `"float32"` or `"float64"`.

@@ -52,7 +52,6 @@ def weigh_together(
     """Weigh states of chains and weighted samples of the same failures, each for its worth.
 
     **Arguments:**
-
     - `states`: number of states, which are alike and so worth less than they count.
     - `worth`: independent points that all of them are worth.
     - `weight`: the weight of the samples.
@@ -221,7 +220,6 @@ def fit_marginals(
     """Fit the density of each coordinate by kernels, reflected at the ends, in fine steps.
 
     **Arguments:**
-
     - `wider`: width of the kernels over that of Silverman's rule (Density estimation, 1986,
       equation 3.31).
     """

@@ -109,7 +109,6 @@ def fit_mixture(
     """Fit a mixture to weighted failures.
 
     **Arguments:**
-
     - `z`: failures `[n, d]` in normal space.
     - `weight`: parts `[n]` of the failures' distribution that they stand for.
     - `chain_ids`: the chain `[n]` of each; points of one chain stay in one half.
@@ -150,7 +149,6 @@ def optimal_shares(
     The multiplicative steps have the minima as fixed points.
 
     **Arguments:**
-
     - `table`: densities of the components over the prior's, at failures; without the defensive
       part, which is 1.
     - `weight`: weights of the failures, of sum one.

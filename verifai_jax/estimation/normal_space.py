@@ -89,7 +89,6 @@ class LimitState:
     """Scores of points of standard normal space, within a budget of simulations.
 
     **Arguments:**
-
     - `evaluate`: from points `u [n, d]` of the unit cube to `(rho, failing, proper)`, each `[n]`.
     - `dim`: number of unit coordinates.
     - `budget`: simulations in all; a method has to plan with `left`.
@@ -302,7 +301,6 @@ class Begun:
     """Simulations on their way; `result` waits for them, once, in the order in which they began.
 
     **Arguments:**
-
     - `limit_state`: which counts them when they are waited for.
     - `z`: their points.
     """
@@ -379,7 +377,6 @@ def farthest_first(
     """Choose points that are far from one another.
 
     **Arguments:**
-
     - `first`: the point that is chosen first.
     - `gaps_from`: the distances `[n]` of all points from one.
     - `maximum`: number of points, at most.

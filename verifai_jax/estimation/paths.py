@@ -48,7 +48,6 @@ def halve(
     """Follow straight ways as far as they fail, by halving.
 
     **Arguments:**
-
     - `begin`: failures.
     - `end`: points that are taken not to fail; they are not simulated.
 

@@ -112,7 +112,6 @@ class Estimate(Drawn, InNotebook):
         """Count further samples of the prior that show a probability below `p0` if none fails.
 
         **Arguments:**
-
         - `p0`: failure probability to be shown, between 0 and 1.
         - `confidence`: the confidence of the bound; that of the estimate when left out.
 
@@ -201,7 +200,6 @@ class Estimate(Drawn, InNotebook):
         """Write the evidence report on the estimate as HTML, and its claims as JSON.
 
         **Arguments:**
-
         - `path`: the path of the HTML file.
         - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`, `errors`.
 

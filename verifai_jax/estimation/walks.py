@@ -35,7 +35,6 @@ def walk_among_failures(
     """Walk among the failures.
 
     **Arguments:**
-
     - `z`: the failure where each chain begins.
     - `deciding`: the coordinates of each that have to be near what they are for it to fail.
     - `groups`: the group of each chain, from 0.

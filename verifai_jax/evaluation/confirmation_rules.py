@@ -39,7 +39,6 @@ def decide(
     """Decide about rows from their replays.
 
     **Arguments:**
-
     - `found`: the rows, all of verdict `raised`; completed in place.
     - `replayed`: the verdicts of each check.
     - `run`: robustness of the rows in the run, if that is known.
@@ -118,7 +117,6 @@ def lowest_failing(again: Verdicts, more: Verdicts, at: np.ndarray) -> Verdicts:
     """Return the repetitions, those rows replaced that a further one shows to fail less.
 
     **Arguments:**
-
     - `again`: of all rows.
     - `more`: a further repetition of the rows `at`.
     """
@@ -142,7 +140,6 @@ def describe_disagreement(
     """Say why a row is not confirmed.
 
     **Arguments:**
-
     - `i`: index of the row.
     - `found`: the replays of all rows, by check.
     - `rho`: robustness of the row in the finest replay.

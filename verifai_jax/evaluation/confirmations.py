@@ -69,7 +69,6 @@ def describe_checks(checks: Collection[str], *, of_step: bool = True) -> str:
     """Describe the checks that a confirmed row has passed.
 
     **Arguments:**
-
     - `checks`: their names, as in `Confirmations.checks`.
     - `of_step`: whether to say why there was none at a finer step.
 
@@ -108,7 +107,6 @@ class Confirmation(InNotebook):
     """The verdict of finer replays on one counterexample.
 
     **Fields:**
-
     - `name`: the name of the problem.
     - `row`: its number in the table; None for features without one.
     - `verdict`: `"confirmed"`, `"refuted"`, `"fragile"` or `"raised"`.
@@ -164,7 +162,6 @@ class Confirmations(InNotebook):
     """The verdicts of finer replays on `n` counterexamples.
 
     **Fields:**
-
     - `name`: the name of the problem.
     - `numbers`: `[n]`, of the rows in the table.
     - `run_rho`: `[n]`, the robustness as the run computed it; NaN if it is unknown.

@@ -89,7 +89,6 @@ class Confirmer:
     """Checks rows of a run's table; what it compiles is kept with the problem.
 
     **Arguments:**
-
     - `problem`: on the backend that it ran on.
     - `precision`: the precision of the run.
     - `seed`: the seed of the run; a simulation gets the random key that it had.
@@ -154,7 +153,6 @@ class Confirmer:
         """Check these rows of the table.
 
         **Arguments:**
-
         - `rows`: columns `[n]` by name, as the table has them: those of the features, and `rho`.
         - `numbers`: `[n]`, of the rows, which decide on their random keys.
         - `limit`: rows that are examined in all calls together; no limit when left out. Of more,
@@ -200,7 +198,6 @@ class Confirmer:
         """Check the violating ones of a run's new rows, as many as `limit` says.
 
         **Arguments:**
-
         - `columns`: the columns of all new rows, as the table will have them.
         - `first`: number of the first one in the run.
 

@@ -45,7 +45,6 @@ class Evaluator:
     """Simulates and evaluates points of a problem's unit cube; `simulations` counts them.
 
     **Arguments:**
-
     - `problem`: a checked one, on the backend it is to run on.
     - `batch`: simulations at once; a call with fewer points is padded.
     - `gradient`: whether the smooth robustness is differentiated too.
@@ -173,7 +172,6 @@ class Evaluator:
         """Simulate and evaluate these points.
 
         **Arguments:**
-
         - `u`: points of the unit cube, or rows of given features.
         - `temperature`: the temperature of the smooth robustness that is differentiated, one for
           all or one each.

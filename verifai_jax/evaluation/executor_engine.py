@@ -63,7 +63,6 @@ class ExecutorEngine:
     """Evaluates any number of rows on the workers of an executor; see the module's docstring.
 
     **Arguments:**
-
     - `problem`: a checked one, on the backend it is to run on.
     - `batch`: rows of a batch on one machine, which says how many lanes go together.
     - `executor`: with `submit`.
@@ -263,7 +262,6 @@ class Pending:
     from how long the first have taken.
 
     **Arguments:**
-
     - `engine`: that sends them.
     - `u`: their points.
     - `key`, `first`: as of `ExecutorEngine.submit`.

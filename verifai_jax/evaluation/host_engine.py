@@ -47,7 +47,6 @@ class HostEngine:
     """Evaluates batches of a black-box problem; the counterpart of `engine.Engine`.
 
     **Arguments:**
-
     - `problem`: a checked `Problem`.
     - `precision`: `"float32"` or `"float64"`, of features and monitor.
     - `journal`: where rows are kept as soon as they have a verdict, until their batch is finished.
@@ -111,7 +110,6 @@ class HostEngine:
         """Simulate `n` points of the unit cube and decide which violate the property.
 
         **Arguments:** as of `engine.Engine.evaluate`; nothing is differentiated.
-
         - `padded_to`: a power of two; features are computed of so many rows together at least, so
           that few rows get theirs from the program that many would.
         - `keep_traces`: as of the engine, for this call.
@@ -132,7 +130,6 @@ class HostEngine:
         """Simulate `n` rows of features, each with the seed of its own, and decide.
 
         **Arguments:**
-
         - `features`: `[n, ...]` each.
         - `seeds`: the seeds of the simulations.
         - `keys`: that the seeds are made of, which a system needs that simulates batches.

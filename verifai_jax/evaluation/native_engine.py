@@ -42,7 +42,6 @@ class NativeEngine:
     """Evaluates batches of a problem like the engine that it is given.
 
     **Arguments:**
-
     - `engine`: the engine of XLA, in single precision, over points of the unit cube.
     - `wanted`: `"native"`, or `"auto"` for the rule of the module's docstring.
     - `budget`: simulations of the run.

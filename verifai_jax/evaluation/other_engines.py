@@ -22,7 +22,6 @@ def engines_for(problem: Problem, engines: Engines) -> dict[str, Problem]:
     """Return the problem in other engines, by the names of their checks.
 
     **Arguments:**
-
     - `problem`: on the backend that it ran on.
     - `engines`: another system for the same features and signals, a problem with one, the name of a
       backend of its system, `"all"` for all other backends that are installed; several names, or

@@ -117,7 +117,6 @@ class Replay(InNotebook):
         """Draw signals with the bounds of all formulas and the instant marked; returns the figure.
 
         **Arguments:**
-
         - `path`: file that the picture is written to, if given.
         - `signals`: the signals, and features that are Signals, to draw; chosen when left out.
 
@@ -136,7 +135,6 @@ class Replay(InNotebook):
         """Draw the simulation as an animated GIF, which a notebook shows.
 
         **Arguments:**
-
         - `path`: a file that is written too; none when left out.
         - `camera`: the name of a camera of a MuJoCo model; the one that sees best what moves when
           left out.

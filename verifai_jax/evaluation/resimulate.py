@@ -77,7 +77,6 @@ class Replays:
     """Replays of a problem that JAX traces.
 
     **Arguments:**
-
     - `problem`: on the backend that it ran on.
     - `precision`: the precision of the replays.
     - `key`: the key of the run's simulations, from `run_keys`.
@@ -110,7 +109,6 @@ class Replays:
         """Simulate the rows of these numbers again, with a `factor` times smaller step.
 
         **Arguments:**
-
         - `factor`: by how much the step is smaller; 1 is the system's own step.
         - `each`: features `[n, ...]` of all rows, as `FeatureSpace.features_of` gives them; the
           rows are simulated once with each.
@@ -198,7 +196,6 @@ class HostReplays:
     workers share would wait for one process.
 
     **Arguments:**
-
     - `problem`, `precision`, `key`: as of `Replays`.
     - `executor`: with `submit`; this process simulates when left out.
     - `target`: name of the problem, for an executor that cannot send it.
@@ -318,7 +315,6 @@ def finest_replays(
     """Return replays of a problem's rows in the finest precision that it can be traced in.
 
     **Arguments:**
-
     - `run`: precision of the run.
     - `key`, `executor`, `target`: as of `HostReplays`.
 
@@ -363,7 +359,6 @@ def replay_block(
     """Simulate rows again; called by a worker.
 
     **Arguments:**
-
     - `shipment`: with the problem.
     - `how`: backend, precision, by how much the step is smaller, and whether the system is to be
       made anew.

@@ -127,7 +127,6 @@ def violations(
     """Decide which simulations violate the property.
 
     **Arguments:**
-
     - `rho`: hard robustness; NaN where there is no verdict.
     - `status`: codes of `Status`.
     - `holds`: gives the Boolean semantics of each formula; called only where a robustness of

@@ -83,7 +83,6 @@ def evaluate_block(
     """Simulate and evaluate the rows `first` to `first + n - 1`; called by a worker.
 
     **Arguments:**
-
     - `shipment`: with the problem.
     - `mode`: how.
     - `key`: words of the run's random key.

@@ -83,7 +83,6 @@ def modes(
     """Find every mode of failure, with its probability under the prior of the features.
 
     **Arguments:**
-
     - `source`: a problem, or a run of one, whose failures are looked at too.
     - `budget`: simulations at most; one with its gradient counts 2.
     - `batch`: simulations at once.

@@ -91,7 +91,6 @@ def divide_under_keys(
     """Find the failing regions of a system that draws, within what is left of a budget.
 
     **Arguments:**
-
     - `held`: the limit state under a key.
     - `samples`: weighted samples, of which there are failures.
     - `starts`: further points to begin from.

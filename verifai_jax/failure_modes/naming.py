@@ -45,7 +45,6 @@ def name_mode(failures: pd.DataFrame, prior: pd.DataFrame) -> str:
     """Name a mode by conditions on the features that vary.
 
     **Arguments:**
-
     - `failures`: features of failures of the mode, one a row.
     - `prior`: features of samples of the prior.
 

@@ -49,7 +49,6 @@ def find_regions(
     """Find the failing regions that weighted failures lie in.
 
     **Arguments:**
-
     - `z`: failures `[n, d]`.
     - `share`: the part `[n]` of the failure probability that each stands for, of sum one.
     - `nearest`: further failures `[m, d]`, such as those of searches.

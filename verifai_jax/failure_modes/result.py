@@ -87,7 +87,6 @@ class Mode(InNotebook):
         """Draw the likeliest failure as an animated GIF.
 
         **Arguments:**
-
         - `path`: a file that is written too; none when left out.
         - `options`: `camera`, `size` and `fps`, as in `Replay.animate`.
 

@@ -41,7 +41,6 @@ def acceptance_rate(
     A constraint that Python decides is asked for a second, or until it has accepted one sample.
 
     **Arguments:**
-
     - `where`: the constraint as a function of one point of the unit cube.
     - `accepts`: the same for many points, compiled.
     - `names`: the names of the features, for messages.

@@ -24,7 +24,6 @@ class Array(Domain):
     arrays of a `Struct`. With `length=(1, 3)` the number varies too, see `VariableArray`.
 
     **Arguments:**
-
     - `domain`: the domain of each value.
     - `length`: their number, or a pair with the smallest and the greatest number.
 

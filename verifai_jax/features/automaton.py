@@ -41,7 +41,6 @@ class Automaton(Domain):
     inverse cumulative distribution, so every point of the cube is a legal sequence.
 
     **Arguments:**
-
     - `start`: the state before the first event.
     - `events`: `(state, name)` -> what happens: a dictionary with
 

@@ -77,7 +77,6 @@ class Box(_Between):
     the greatest value of `Box(0, 61.2)` is then 61.199997, since 61.2 itself would be rounded up.
 
     **Arguments:**
-
     - `low`, `high`: the ends, two finite numbers or two sequences of one length; `low < high`.
     - `closed`: which ends may be values: `"both"`, `"left"` (the range is half-open, without
       `high`), `"right"` or `"neither"`. Next to an end that is left out come the nearest numbers
@@ -228,7 +227,6 @@ class DiscreteBox(_Between):
     `int32`, or an array of them with shape `[entries]`.
 
     **Arguments:**
-
     - `low`, `high`: the ends, two integers or two sequences of one length; `low <= high`.
 
     **Raises:** `ValueError` for ends that are no integers, reversed, of different lengths, beyond

@@ -49,7 +49,6 @@ class Categorical(Domain):
     number.
 
     **Arguments:**
-
     - `choices`: numbers, texts or other objects, one by one.
     - `weights`: their probabilities; equally likely when left out.
 
@@ -325,7 +324,6 @@ class Constant(Domain):
     in a `Categorical` with one choice.
 
     **Arguments:**
-
     - `value`: the only one, such as `9.8`, `[0, 1]`, `"dry"`.
 
     **Raises:** `ValueError` for a number that is not finite, or a value of another kind.

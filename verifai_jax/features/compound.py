@@ -23,7 +23,6 @@ class Struct(Domain):
     A value is a dictionary with these names.
 
     **Arguments:**
-
     - `fields`: name -> `Domain`, in the order in which coordinates and columns come.
 
     **Raises:** `ValueError` for no fields, or a name that is empty or no text; `TypeError` for a

@@ -72,7 +72,6 @@ class Continuous(Domain):
         """Return the natural logarithm of the probability density, in double precision.
 
         **Arguments:**
-
         - `value`: numbers of double precision; minus infinity comes for those beyond the support.
 
         **Raises:** `NotImplementedError` for a distribution that does not say it.

@@ -28,7 +28,6 @@ class Distribution(Continuous):
     or a limit that no value has, is never simulated.
 
     **Arguments:**
-
     - `inverse_cdf`: probability -> value, increasing.
     - `cdf`: value -> probability.
     - `name`: for people and JSON.

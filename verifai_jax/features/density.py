@@ -36,7 +36,6 @@ def log_density(space: FeatureSpace, rows: Mapping[str, Any]) -> Float[np.ndarra
     nothing, and the share that the constraint accepts, by which it would be divided, is left out.
 
     **Arguments:**
-
     - `space`: the space of the features.
     - `rows`: columns `[n]` by name; columns of no feature are ignored.
 
@@ -57,7 +56,6 @@ def tails(space: FeatureSpace, rows: Mapping[str, Any]) -> dict[str, np.ndarray]
     Boxes, integers and choices, whose values are as probable as their weights say, have none.
 
     **Arguments:**
-
     - `space`, `rows`: as of `log_density`.
 
     **Returns:** probabilities `[n]` by the names of columns; NaN for an absent item.

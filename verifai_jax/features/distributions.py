@@ -46,7 +46,6 @@ class Normal(Continuous):
     probability of 3e-8; the coordinates 0 and 1 stand for these outermost values.
 
     **Arguments:**
-
     - `mean`: the mean of the distribution.
     - `std`: its standard deviation, positive.
 
@@ -94,7 +93,6 @@ class TruncatedNormal(Continuous):
     """A normal distribution given that the value lies in `[low, high]`.
 
     **Arguments:**
-
     - `mean`, `std`: of the distribution before it is cut off.
     - `low`, `high`: the ends; `low < high`.
 
@@ -202,7 +200,6 @@ class LogUniform(Continuous):
     """Positive numbers whose logarithm is uniform: learning rates, masses, stiffnesses.
 
     **Arguments:**
-
     - `low`, `high`: the ends; `0 < low < high`.
 
     **Raises:** `ValueError` for ends that are not finite, not positive, reversed or equal.

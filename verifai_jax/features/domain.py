@@ -121,7 +121,6 @@ class Domain(ForUsers, abc.ABC):
         """Check that a concrete value lies in the domain.
 
         **Arguments:**
-
         - `value`: as `from_unit` gives it, or as a person writes it.
         - `name`: the name of the feature, for the message.
 
@@ -219,7 +218,6 @@ class Domain(ForUsers, abc.ABC):
         """Return the domains of a value's parts, with the names of their columns.
 
         **Arguments:**
-
         - `name`: the name of the feature.
         """
         return ()
@@ -278,7 +276,6 @@ class Domain(ForUsers, abc.ABC):
         None.
 
         **Arguments:**
-
         - `duration`: the duration of the simulation in seconds.
         """
         return None
@@ -297,7 +294,6 @@ class Domain(ForUsers, abc.ABC):
         """Return the names of the unit coordinates for people: control points by their time.
 
         **Arguments:**
-
         - `name`: the name of the feature.
         - `duration`: the duration of a simulation in seconds, for signals that have none of their
           own.

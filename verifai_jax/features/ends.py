@@ -46,7 +46,6 @@ def ends_within(
     They are zero or normal numbers: XLA takes a subnormal one for zero.
 
     **Arguments:**
-
     - `low`, `high`: the ends.
     - `dtype`: the data type of the precision.
     - `closed`: which ends belong to the intervals, one of `CLOSED`.
@@ -93,7 +92,6 @@ def round_inwards(value: Reals, low: End, high: End, closed: str = "both") -> Re
     Others stay as they are, those that are farther outside too.
 
     **Arguments:**
-
     - `value`: numbers in single or double precision.
     - `low`, `high`, `closed`: as in `ends_within`.
     """

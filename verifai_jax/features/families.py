@@ -66,7 +66,6 @@ class LogNormal(Positive):
     Coordinates reach 5.54 standard deviations of the logarithm to either side.
 
     **Arguments:**
-
     - `mean`, `std`: of the logarithm; the median is `exp(mean)`.
 
     **Raises:** `ValueError` for parameters that are not finite, a standard deviation that is not
@@ -113,7 +112,6 @@ class Weibull(Positive):
     The probability of more than `x` is `exp(-(x / scale) ** shape)`.
 
     **Arguments:**
-
     - `shape`: positive; below 1 the density is infinite at zero.
     - `scale`: positive, in the unit of the value.
 
@@ -154,7 +152,6 @@ class Exponential(Positive):
     """Positive numbers such as waits between independent events: `Exponential(mean)`.
 
     **Arguments:**
-
     - `mean`: positive; one over the rate.
 
     **Raises:** `ValueError` for a mean that is not finite and positive, or values that do not fit
@@ -192,7 +189,6 @@ class Triangular(Continuous):
     but for one that is the mode.
 
     **Arguments:**
-
     - `low`, `mode`, `high`: `low <= mode <= high` and `low < high`.
 
     **Raises:** `ValueError` for numbers that are not finite or not in this order.

@@ -44,7 +44,6 @@ class Improbability:
     """The departures of points from the likeliest one, coordinate by coordinate.
 
     **Arguments:**
-
     - `space`: the space of the features.
 
     **Raises:** `NoDensityError` for a domain whose values have no density, such as an automaton.

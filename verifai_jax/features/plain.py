@@ -71,7 +71,6 @@ def from_plain(
     """Build the domain that `to_plain` described.
 
     **Arguments:**
-
     - `data`: as `to_plain` gives it.
     - `distributions`: those with functions, by name.
 

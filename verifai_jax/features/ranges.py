@@ -29,7 +29,6 @@ class FeatureRanges:
     - `edges`: where the cells of each coordinate begin and end; None for a continuous one.
 
     **Arguments:**
-
     - `space`: the feature space.
     - `precision`: the precision of features, `"float32"` or `"float64"`.
     """

@@ -26,7 +26,6 @@ class Reactive(Domain):
     how to react, where a `Signal` can only say when.
 
     **Arguments:**
-
     - `inputs`: signal -> `(low, high)`, the range that it usually has, which is scaled to -1 to 1;
       or names of signals that are of that size anyway.
     - `hidden`: hidden units of a network with hyperbolic tangents; 0 for an affine function.

@@ -47,7 +47,6 @@ class Signal(Domain):
     A value is a `Waveform`, which a system calls with a time in seconds: `features["wind"](time)`.
 
     **Arguments:**
-
     - `domain`: the domain of each control point: a `Box`, of numbers or vectors, or a distribution.
     - `knots`: number of control points, at equal distances; with `times` it is theirs.
     - `hold`: `"linear"` joins them by lines, the first at time 0 and the last at the end;
@@ -183,7 +182,6 @@ class Signal(Domain):
         """Return from when to when each control point changes the function, in seconds.
 
         **Arguments:**
-
         - `duration`: the duration of the simulation in seconds; that of the signal comes first.
         """
         length = self.duration or duration

@@ -49,7 +49,6 @@ class FeatureSpace(PointMaps, ForUsers):
       trace.
 
     **Arguments:**
-
     - `domains`: name -> `Domain`, in the order in which coordinates and columns come.
     - `where`: a constraint between features, a JAX function from features to one truth value. The
       prior is then that of the domains given that it holds, and only such points are simulated.
@@ -95,7 +94,6 @@ class FeatureSpace(PointMaps, ForUsers):
         """Convert columns `[n]` of a table to features `[n, ...]`: `from_row` of each row, stacked.
 
         **Arguments:**
-
         - `rows`: columns `[n]` by name; others than those of features are ignored.
         - `precision`: `"float32"` or `"float64"`, of their real numbers.
 
@@ -111,7 +109,6 @@ class FeatureSpace(PointMaps, ForUsers):
         """Check features that a person wrote and convert them to those that a system sees.
 
         **Arguments:**
-
         - `features`: numbers, lists, choices, dictionaries by name; constant, fixed ones and events
           may be left out.
 
@@ -128,7 +125,6 @@ class FeatureSpace(PointMaps, ForUsers):
         Their names and shapes are checked, and their values are not: JAX may trace them.
 
         **Arguments:**
-
         - `features`: as in `coerce`.
 
         **Returns:** the features as `unflatten` gives them.
@@ -176,7 +172,6 @@ class FeatureSpace(PointMaps, ForUsers):
         times.
 
         **Arguments:**
-
         - `seed`: the seed of the samples.
 
         **Raises:** `ValueError` for a constraint that raises, does not return one truth value, or
@@ -193,7 +188,6 @@ class FeatureSpace(PointMaps, ForUsers):
         """Draw features from the prior; for people.
 
         **Arguments:**
-
         - `key`: a random key of JAX.
         - `count`: number of samples.
 
@@ -223,7 +217,6 @@ class FeatureSpace(PointMaps, ForUsers):
         middle of its domain. A metric; pure JAX on the values that `unflatten` gives.
 
         **Arguments:**
-
         - `one`, `other`: features as `unflatten` gives them, or as a person writes them (numbers,
           lists, choices, dictionaries by name; constant, fixed ones and events may be left out), or
           rows of a table.
@@ -243,7 +236,6 @@ class FeatureSpace(PointMaps, ForUsers):
         """Return the space with these features held at a value; they keep their table columns.
 
         **Arguments:**
-
         - `values`: by name, as a person writes them.
 
         **Raises:** `ValueError` for an unknown feature, or a value outside its domain.
@@ -259,7 +251,6 @@ class FeatureSpace(PointMaps, ForUsers):
         """Return the space with these features varied alone, the others held at `nominal`.
 
         **Arguments:**
-
         - `features`: names of those that vary.
         - `nominal`: values of the others, by name, as a person writes them.
 
@@ -289,7 +280,6 @@ class FeatureSpace(PointMaps, ForUsers):
         See `Signal.refined`; the finer features are the same functions of time.
 
         **Arguments:**
-
         - `factor`: control points of the finer signals for one of the coarse ones.
 
         **Raises:** `ValueError` for a factor that is not a positive integer.
@@ -318,7 +308,6 @@ class FeatureSpace(PointMaps, ForUsers):
         """Build the space that `to_json` described; code is given, never read.
 
         **Arguments:**
-
         - `data`: as `to_json` gives it.
         - `where`: the constraint, if the space has one.
         - `distributions`: those with functions of their own, by name.

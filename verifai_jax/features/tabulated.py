@@ -91,7 +91,6 @@ class Gamma(Positive):
     """Positive numbers such as sums of waits: `Gamma(shape, scale)`, with mean `shape * scale`.
 
     **Arguments:**
-
     - `shape`: at least 0.05; below 1 the density is infinite at zero.
     - `scale`: positive, in the unit of the value; one over the rate.
 
@@ -164,7 +163,6 @@ class Beta(Continuous):
     """Shares, or numbers between two ends: `Beta(a, b)`, `Beta(a, b, low, high)`.
 
     **Arguments:**
-
     - `a`, `b`: at least 0.05 each; the mean is `low + (high - low) * a / (a + b)`.
     - `low`, `high`: the ends, which are no values themselves.
 
@@ -272,7 +270,6 @@ class Empirical(Continuous):
     occur.
 
     **Arguments:**
-
     - `data`: finite numbers, at least two different ones.
 
     **Raises:** `ValueError` for fewer, for more than 65 536 different ones, or for what is no

@@ -266,7 +266,6 @@ def read_event(entry: object, event: object) -> Transition:
     """Return the transition that one entry of an automaton's `events` describes.
 
     **Arguments:**
-
     - `entry`: its key, `(state, name)`.
     - `event`: its dictionary; see `Automaton`.
 

@@ -50,7 +50,6 @@ def fuzz(
     """Look for failures by covering what can happen, with or without formulas.
 
     **Arguments:**
-
     - `problem`: a problem with formulas; or none, with `space` and `system` in its place.
     - `budget`: simulations at most.
     - `space`, `system`: what varies and what is simulated, where there is no formula. A simulation

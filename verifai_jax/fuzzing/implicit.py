@@ -52,7 +52,6 @@ class CheckedSystem(System):
     """A system whose traces say whether it ended properly, with finite signals.
 
     **Arguments:**
-
     - `system`: the system.
     - `ranges`: the ranges of signals; numbers that are not finite are replaced by the middle, as
       they are reported anyway.
@@ -256,7 +255,6 @@ def as_recorded(problem: Problem, derived: Mapping[str, Any]) -> Problem:
     """Return a problem with the implicit properties that a run of `fuzz` recorded.
 
     **Arguments:**
-
     - `problem`: with its own formulas alone; for a run without any its name, its space and its
       system count.
     - `derived`: `CheckedSystem.derived` of the run.

@@ -148,7 +148,6 @@ def explain(
     """Find the predicate, instant and path that decide a formula on one trace.
 
     **Arguments:**
-
     - `formula`, `trace`, `end`: as for `robustness`; the trace is concrete, not under `jit`.
     - `k`: how many critical instants to report at most: the peaks, over time, of each predicate's
       influence.

@@ -39,7 +39,6 @@ def parse(
     """Read a formula from its text.
 
     **Arguments:**
-
     - `text`: see the grammar in the documentation; times are in seconds unless a unit follows.
     - `constants`: numbers by name, also usable as the ends of intervals.
     - `definitions`: sub-formulas by name, as text or formulas; a text may use the names before it.

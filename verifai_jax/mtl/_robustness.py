@@ -40,7 +40,6 @@ def robustness(
     """Compute how robustly a trace satisfies a formula at time 0: positive, it holds.
 
     **Arguments:**
-
     - `formula`: a `Formula`, or its text.
     - `trace`: signals `[time]` or `[time, k]`, evenly sampled. Batches by `jax.vmap`.
     - `semantics`: `hard` (in the unit of the predicates), `smooth(tau)`, or `boolean` (+1 / -1).

@@ -231,7 +231,6 @@ def export_c(
     `math.h`, `stdbool.h` and `stdint.h` alone.
 
     **Arguments:**
-
     - `dt`: sampling period in seconds.
     - `name`: the name of the type in C, and before the names of its functions.
     - `semantics`: `hard` or `boolean`.

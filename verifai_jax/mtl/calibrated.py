@@ -139,7 +139,6 @@ def predictive_monitor(
     """Learn to predict a violation of a requirement within the next seconds.
 
     **Arguments:**
-
     - `formula`: a requirement; of `always f` the robustness of `f` at each instant is foretold.
     - `traces`: runs of one system on one clock.
     - `horizon`: seconds ahead, a multiple of the sampling period.
@@ -224,7 +223,6 @@ def domain_monitor(
     """Learn which samples were tested, to recognise later ones that are unlike them.
 
     **Arguments:**
-
     - `traces`: the tested runs; for inputs without time, traces of one sample.
     - `signals`: names of those that are compared; all if None.
     - `alpha`: probability of an alarm in a run that is like the tested ones.

@@ -249,7 +249,6 @@ def dense_robustness(formula: Formula | str, trace: Trace, method: Method = "lin
     """Compute the robustness at the first sample, with all that is between the samples.
 
     **Arguments:**
-
     - `trace`: with samples at any times; its last ones are held for ever.
     - `method`: what a signal is between two samples: `"linear"`, or `"hold"` for its last sample.
 
@@ -268,7 +267,6 @@ def dense_gradient(
     differences is the slope; at a kink it is the mean of both sides.
 
     **Arguments:**
-
     - `formula`: its text, as for `mine`.
     - `values`: the values of all parameters.
     """

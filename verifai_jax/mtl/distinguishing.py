@@ -84,7 +84,6 @@ def distinguish(
     """Find a trace that tells two formulas apart.
 
     **Arguments:**
-
     - `one`, `other`: formulas, or their texts.
     - `signals`: a problem, which is simulated by a search for such a trace; or recordings, of which
       the first that tells them apart is taken; signals that move freely when left out.
@@ -139,7 +138,6 @@ def free_difference(
     """Return a trace of free signals that tells two formulas apart; None if none was found.
 
     **Arguments:**
-
     - `like`: recordings whose values the signals may have too.
     """
     free = FreeTraces.of([one, other], like, dt, duration, end)

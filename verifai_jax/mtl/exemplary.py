@@ -92,7 +92,6 @@ def examples(
     """Find a trace that satisfies a formula, one that barely does, and one that breaks it.
 
     **Arguments:**
-
     - `formula`: a formula, or its text.
     - `like`: recordings in whose range the signals move; near the bounds of the formula when left
       out.

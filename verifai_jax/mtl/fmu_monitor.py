@@ -167,7 +167,6 @@ def export_fmu(
     were set before it.
 
     **Arguments:**
-
     - `dt`: sampling period in seconds; steps of communication have to be multiples of it.
     - `file`: the FMU to write.
     - `semantics`, `every`, `sizes`: as in `export_c`.

@@ -73,7 +73,6 @@ class FreeTraces:
         """Return the free traces that formulas can tell apart.
 
         **Arguments:**
-
         - `like`: recordings whose values are levels too.
         - `dt`, `duration`: in seconds; both follow from the windows when left out.
 
@@ -136,7 +135,6 @@ class FreeTraces:
         """Find the trace of the greatest score by changing parts of the best ones again and again.
 
         **Arguments:**
-
         - `score`: the score of `[lanes]` traces.
         - `enough`: a score that ends the search.
 

@@ -105,7 +105,6 @@ class Judgement(InNotebook):
         """Return how the robustness of each requirement is spread over the recordings.
 
         **Arguments:**
-
         - `shares`: the shares of the recordings, from 0 (the least robustness) to 1 (the greatest).
 
         **Returns:** a row for each requirement: how many recordings have a verdict, how many fail,
@@ -138,7 +137,6 @@ class Judgement(InNotebook):
         deviation of normal values. At least five recordings are needed.
 
         **Arguments:**
-
         - `distance`: from which on a row is an outlier.
 
         **Returns:** rows of the table with their `distance`, the greatest first.

@@ -71,7 +71,6 @@ def judge(
     judged is a row without a verdict that says why.
 
     **Arguments:**
-
     - `formulas`: one, a sequence, or a dictionary by identifier; `read_requirements` reads a file.
     - `recordings`: paths of files, of folders (all recordings in and below them), traces or data
       frames: one, a sequence, or a dictionary by name; or a problem, which is simulated.

@@ -52,7 +52,6 @@ def lint(
     """Find parts of formulas that may not say what their author means.
 
     **Arguments:**
-
     - `formulas`: one, a sequence, or a dictionary by identifier; `read_requirements` reads a file.
     - `signals`: recordings (traces, files, folders, tables), or a problem, which is simulated 64
       times. What only data tells is left out without any.

@@ -118,7 +118,6 @@ def mine(
     Thresholds are exact to the last digit of the data, times to the sample.
 
     **Arguments:**
-
     - `text`: a formula with one or two parameters `?name`, for numbers or ends of intervals.
     - `recordings`: traces, files or tables; or a `Problem`, whose tightest values that a search
       does not break are found, which proves nothing.

@@ -137,7 +137,6 @@ def mutants(
     """Change a formula in one point at a time, and see which recordings notice.
 
     **Arguments:**
-
     - `formula`: a formula, or its text.
     - `signals`: recordings (traces, files, folders, tables), or a problem, which is simulated 64
       times. Without any all mutants survive, each with an example of a trace that would kill it.
@@ -180,7 +179,6 @@ def changes(formula: Formula, dt: float = 0.0) -> Iterator[Change]:
     """Yield the formulas that differ from one in a single point.
 
     **Arguments:**
-
     - `dt`: period in seconds by which a window moves, at least.
     """
     if isinstance(formula, ast.Constant):

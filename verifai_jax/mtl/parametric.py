@@ -176,7 +176,6 @@ def read_parametric(
     """Read a formula in which `?name` stands for numbers and for ends of intervals.
 
     **Arguments:**
-
     - `constants`, `definitions`: as of `parse`.
 
     **Raises:** `FormulaSyntaxError` as `parse`; `ValueError` for a name that is both a number and a
@@ -298,7 +297,6 @@ def templates(words: str = "", domain: str | None = None) -> tuple[Template, ...
     """Return the templates that have all of some words, in the order of the library.
 
     **Arguments:**
-
     - `words`: looked for in all that a template says, whatever their case; all templates when left
       out.
     - `domain`: the domain of the templates; every one when left out.

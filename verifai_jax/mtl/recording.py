@@ -75,7 +75,6 @@ def read(
     others have a sample. Resampling with `"hold"` then keeps each signal's own last value.
 
     **Arguments:**
-
     - `source`: the path of a `.csv` (first line: names), `.parquet`, `.npz` (an array is a column),
       `.mcap`, `.nc`, `.h5` or `.hdf5` file, of a `.zarr` store, or of the folder of a LeRobot data
       set; a `pandas.DataFrame`, whose index is read as a column if it has a name; several paths.

@@ -124,7 +124,6 @@ def read_requirements(
     `ReqIF.ForeignID` (the id) and `ReqIF.Text`; others are left out.
 
     **Arguments:**
-
     - `constants`, `definitions`: further names; they come before those of the file.
     - `need_formulas`: whether an entry without a formula is refused.
 
@@ -253,7 +252,6 @@ def read_reqif(path: Path, fields: Sequence[str]) -> list[dict[str, object]]:
     """Read the objects of a ReqIF file.
 
     **Arguments:**
-
     - `path`: the path of the file.
     - `fields`: the fields of a requirement; attributes of other names are left out.
 
@@ -334,7 +332,6 @@ def reqif_document(
     """Write entries as a ReqIF document: an object each, in one specification.
 
     **Arguments:**
-
     - `entries`: texts by field.
     - `fields`: that an object may have.
     - `title`: the title of the document.

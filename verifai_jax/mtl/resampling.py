@@ -35,7 +35,6 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
     last value, and a note says so; `"linear"` leaves a gap.
 
     **Arguments:**
-
     - `trace`: with `times` or another period; NumPy or JAX arrays, not under `jit`.
     - `dt`: the new sampling period in seconds.
     - `method`: `"hold"` keeps each value until the next sample; `"linear"` interpolates.
@@ -181,7 +180,6 @@ def joined(
     """Return the instants of several clocks in one order, and columns with gaps at those of others.
 
     **Arguments:**
-
     - `stamps`: times of each clock in seconds, and the instant that they are counted from.
     - `parts`: the columns of each clock.
     """

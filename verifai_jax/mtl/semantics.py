@@ -54,7 +54,6 @@ def smooth(
     """Return quantitative semantics by log-sum-exp, differentiable everywhere.
 
     **Arguments:**
-
     - `tau`: temperature, positive, in the unit of the predicates; may be traced. As it tends to 0
       the value tends to the hard one. It is not itself differentiated.
     - `error`: instead of `tau`, the greatest distance from the hard value that is acceptable; the
@@ -79,7 +78,6 @@ def compared(comparison: str, left: Any, right: Any, boolean: bool, xp: ModuleTy
     """Compute the value of a comparison between arrays.
 
     **Arguments:**
-
     - `left`, `right`: arrays that broadcast, or numbers.
     - `boolean`: whether the value is +1 where it holds and -1 where not, or else the margin.
     - `xp`: `jax.numpy`, or `numpy` on the host.

@@ -217,7 +217,6 @@ def plain_period(dt: float, error: float) -> float:
     Stamps are rounded, and so 0.1 s comes as 0.09999 s, and a thirtieth as 0.033333334 s.
 
     **Arguments:**
-
     - `error`: seconds by which `dt` may be off.
     """
     error = max(error, 1e-9 * dt)

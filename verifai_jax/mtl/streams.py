@@ -107,7 +107,6 @@ def streams(
     """Lay out the operations of one formula or several; what they have in common occurs once.
 
     **Arguments:**
-
     - `dt`: sampling period in seconds.
     - `semantics`: `hard` or `boolean`.
     - `every`: whether each formula is asked at every instant, or at time 0.

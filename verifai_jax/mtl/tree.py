@@ -27,7 +27,6 @@ def missing_case(walk: str, node: object) -> MissingCaseError:
     """Return the error for a node that a walk over a formula has no case for.
 
     **Arguments:**
-
     - `walk`: what the walk gives, such as `"the horizon"`.
     - `node`: the node; its own text is not asked for, since that is a walk, too.
     """
@@ -207,7 +206,6 @@ class Tree(Node):
         are not subtracted, which keeps the bound simple).
 
         **Arguments:**
-
         - `dt`: sampling period in seconds, by which `next` looks ahead.
         """
         return self._total_reach(dt, "ahead")
@@ -216,7 +214,6 @@ class Tree(Node):
         """Return the seconds of trace before an instant on which its truth there depends.
 
         **Arguments:**
-
         - `dt`: sampling period in seconds, by which `prev` looks back.
         """
         return self._total_reach(dt, "back")
@@ -235,7 +232,6 @@ class Tree(Node):
         Unbounded windows end with the trace and do not count.
 
         **Arguments:**
-
         - `dt`: sampling period in seconds, by which `next` looks ahead.
         - `start`: instant at which the formula is asked, in seconds.
         """
@@ -249,7 +245,6 @@ class Tree(Node):
         seconds.
 
         **Arguments:**
-
         - `dt`: sampling period in seconds, by which `next` and `prev` look.
         """
         spans: dict[Tree, tuple[float, float]] = {self: (0.0, 0.0)}
@@ -297,7 +292,6 @@ class Tree(Node):
         looks.
 
         **Arguments:**
-
         - `dt`: sampling period in seconds, by which `next` and `prev` look.
         """
         if not self.side:

@@ -254,7 +254,6 @@ def watch(
     `sin`, `cos`, `exp` and powers.
 
     **Arguments:**
-
     - `semantics`: `hard`, or `boolean`, by which the value is 1 where a formula holds and -1 where
       it does not.
     - `every`: whether each formula is asked at every instant, or at time 0. With it no formula may

@@ -189,7 +189,6 @@ def operator_text(word: str, interval: str, operands: Sequence[Text]) -> Text:
     """Return the text of an operator over operands.
 
     **Arguments:**
-
     - `word`: operator, a key of `OPERATORS`.
     - `interval`: text of its interval; empty if it has none.
     - `operands`: text of its operands.

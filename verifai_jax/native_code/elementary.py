@@ -108,7 +108,6 @@ def expression(name: str, params: Params, kinds: list[str], out: str) -> tuple[s
     """Return the template of an operation, and whether its operands must be alike.
 
     **Arguments:**
-
     - `name`, `params`: of the primitive.
     - `kinds`: the kinds of its operands.
     - `out`: the kind of its result.

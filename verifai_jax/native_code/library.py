@@ -97,7 +97,6 @@ def library_name(fingerprint: str | None) -> str:
     """Return the name of the library of a program, by all that it depends on.
 
     **Arguments:**
-
     - `fingerprint`: the fingerprint of the program; None if it has none.
 
     **Raises:** `Unavailable` where there is no compiler, no cache folder, or no fingerprint.
@@ -115,7 +114,6 @@ def load(name: str, count: int, translate: Callable[[], str], quickly: bool = Fa
     """Return the library of this name, compiled where there is none.
 
     **Arguments:**
-
     - `name`: as `library_name` gives it.
     - `count`: numbers that a simulation returns.
     - `translate`: makes the source.

@@ -33,7 +33,6 @@ def translate(program: Program) -> str:
     """Translate a program of one simulation.
 
     **Arguments:**
-
     - `program`: a closed `Jaxpr` of the row `[d]`, the words `[2]` of a random key, the number of
       the simulation, a temperature, and numbers `[n]` that all share; it returns a vector of bits.
 

@@ -132,7 +132,6 @@ def detector(
     """Return a detector with random weights (He et al., "Delving deep into rectifiers", 2015).
 
     **Arguments:**
-
     - `key`: the key of the weights.
     - `shape`: height and width of the images.
     - `kinds`: number of kinds of objects to tell apart.

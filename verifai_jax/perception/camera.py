@@ -175,7 +175,6 @@ class Camera:
     """A pinhole camera.
 
     **Arguments:**
-
     - `height`, `width`: pixels of the image.
     - `field_of_view`: horizontal angle of view in rad.
     - `position`: the position of the eye, in m.

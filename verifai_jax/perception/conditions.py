@@ -76,7 +76,6 @@ def taken(
     """Return the image that a sensor behind a lens gives of `image`, in [0, 1].
 
     **Arguments:**
-
     - `image`: colours of the scene.
     - `conditions`: fog apart, which is part of the scene.
     - `key`: the key of what is drawn anew for each frame: noise and rain.

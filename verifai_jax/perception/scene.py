@@ -62,7 +62,6 @@ class Scene:
         """Return the image that a camera takes.
 
         **Arguments:**
-
         - `camera`: its pose must be above the ground.
         - `conditions`: weather, lens and sensor; None is a clear day and a perfect camera.
         - `key`: the key of what differs from frame to frame (noise, rain).

@@ -54,7 +54,6 @@ def train_detector(
     CPUs. Rows are drawn without replacement, epoch by epoch.
 
     **Arguments:**
-
     - `images`: colours in [0, 1].
     - `labels`: the labels of each image.
     - `network`: one to go on from; None begins anew, with the layers that `detector` chooses.
@@ -207,7 +206,6 @@ def score(
     """Compare a detector's output with the truth.
 
     **Arguments:**
-
     - `tolerance`: absolute error of a value above which it counts as wrong.
     """
     labels = _checked(jnp.asarray(images), labels)

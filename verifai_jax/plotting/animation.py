@@ -60,7 +60,6 @@ def animate(
     itself.
 
     **Arguments:**
-
     - `replay`: what `run.replay` returned.
     - `path`: a file that is written too; folders are made.
     - `camera`: the name of a camera of a MuJoCo model; the one that sees best what moves when left

@@ -22,7 +22,6 @@ def plot_arms(
     """Draw a metric of each arm and seed, and the paired difference of each arm to one of them.
 
     **Arguments:**
-
     - `result`: the result.
     - `path`: file that the picture is written to, if given.
     - `metric`, `reference`: as in `Augmentation.compare`.
@@ -74,7 +73,6 @@ def plot_montage(
     """Draw images that an arm added.
 
     **Arguments:**
-
     - `result`: the result.
     - `path`: file that the picture is written to, if given.
     - `arm`, `seed`: the arm, and the seed of its training.

@@ -27,7 +27,6 @@ def plot_clusters(clusters: Clusters, path: str | Path | None = None) -> Figure:
     """Draw the clusters over the two columns that tell them apart best.
 
     **Arguments:**
-
     - `clusters`: what `analysis.clusters` returned.
     - `path`: file that the picture is written to, if given.
 
@@ -109,7 +108,6 @@ def plot_diverse(diverse: Diverse, path: str | Path | None = None) -> Figure:
     """Draw the rows among all, in their order, and the distance of each from those before.
 
     **Arguments:**
-
     - `diverse`: what `analysis.diverse` returned.
     - `path`: file that the picture is written to, if given.
 
@@ -146,7 +144,6 @@ def plot_neighbours(neighbours: Neighbours, path: str | Path | None = None) -> F
     """Draw the rows among the others, over the two features that vary most.
 
     **Arguments:**
-
     - `neighbours`: what `analysis.k_closest`, `nearest` or `random_rows` returned.
     - `path`: file that the picture is written to, if given.
 

@@ -17,7 +17,6 @@ def plot_region(
     """Draw the samples of the region by the least error that fails, and the confirmed failures.
 
     **Arguments:**
-
     - `result`: what `vj.perception.abstract` returned.
     - `path`: file that the picture is written to, if given.
     - `features`: the columns across and up; by default the two that the region depends on most.

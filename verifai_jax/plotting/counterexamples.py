@@ -33,7 +33,6 @@ def plot_explanation(explained: Explained, path: str | Path | None = None) -> Fi
     """Draw the deciding signal with its bound and instant, input signals, and the features.
 
     **Arguments:**
-
     - `explained`: what `explain` returned.
     - `path`: file that the picture is written to, if given.
 
@@ -192,7 +191,6 @@ def plot_shrunk(shrunk: Shrunk, path: str | Path | None = None) -> Figure:
     """Draw the coordinates that depart from nominal, next to the signal that breaks the property.
 
     **Arguments:**
-
     - `shrunk`: what `shrink` returned.
     - `path`: file that the picture is written to, if given.
 

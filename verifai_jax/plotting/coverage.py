@@ -17,7 +17,6 @@ def plot_coverage(coverage: Coverage, path: str | Path | None = None) -> Figure:
     """Draw the share of cells occupied, and samples with the largest hole.
 
     **Arguments:**
-
     - `coverage`: what `analysis.coverage` returned.
     - `path`: file that the picture is written to, if given.
 

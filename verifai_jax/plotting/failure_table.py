@@ -16,7 +16,6 @@ def plot_failure_table(found: FailureTable, path: str | Path | None = None) -> F
     """Draw the probability of a failure by each fault and pair, with its interval.
 
     **Arguments:**
-
     - `found`: the table.
     - `path`: file that the picture is written to, if given.
 

@@ -47,7 +47,6 @@ def film_samples(
     """Return the samples that a film shows, in real time where they are not too many.
 
     **Arguments:**
-
     - `clock`: seconds of each sample.
     - `fps`: frames a second; None for `usual` many.
 

@@ -18,7 +18,6 @@ def plot_frequent_patterns(patterns: FrequentPatterns, path: str | Path | None =
     """Draw the shares of the patterns with the greatest lift, and the shares expected.
 
     **Arguments:**
-
     - `patterns`: what `analysis.frequent_patterns` returned.
     - `path`: file that the picture is written to, if given.
 

@@ -35,7 +35,6 @@ def film_episode(
     """Simulate an episode again, in this process, and return what the environment draws as a GIF.
 
     **Arguments:**
-
     - `replay`: the replay of a problem with an environment of Gymnasium.
     - `size`: width and height in pixels; those of the environment when left out.
     - `fps`: frames a second; `FRAMES_PER_SECOND` when left out.

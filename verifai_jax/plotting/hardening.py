@@ -11,7 +11,6 @@ def plot_hardening(result: Hardening, path: str | Path | None = None) -> Figure:
     """Draw the failure probability of each round with its interval, and the mean return.
 
     **Arguments:**
-
     - `result`: the result.
     - `path`: file that the picture is written to, if given.
 

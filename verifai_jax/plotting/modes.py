@@ -30,7 +30,6 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
     """Draw the probability of each mode with its interval, and failures of each mode.
 
     **Arguments:**
-
     - `modes`: the modes.
     - `path`: file that the picture is written to, if given.
 

@@ -51,7 +51,6 @@ def film(
     """Write an animated GIF, in real time where its frames are not too many.
 
     **Arguments:**
-
     - `motion`: what `record` returned.
     - `path`: the path of the file; folders are made.
     - `size`: width and height in pixels; `SIZE` when left out.
@@ -87,7 +86,6 @@ def strip(
     Those of a failure close in on the sample that decided it.
 
     **Arguments:**
-
     - `motion`: what `record` returned.
     - `path`: the path of the file; folders are made.
     - `count`: instants.
@@ -126,7 +124,6 @@ def frames(
     """Draw the motion at some samples.
 
     **Arguments:**
-
     - `motion`: what `record` returned.
     - `samples`: their numbers.
     - `size`: width and height in pixels.
@@ -304,7 +301,6 @@ def best_view(motion: Motion, draw: Callable[..., Any], size: tuple[int, int]) -
     """Return the camera that sees best what moves.
 
     **Arguments:**
-
     - `motion`: the motion of the model.
     - `draw`: what `mujoco_scene.canvas` gives, for pictures of this `size`.
     """

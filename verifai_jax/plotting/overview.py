@@ -24,7 +24,6 @@ def plot_overview(analysis: Analysis, path: str | Path | None = None) -> Figure:
     """Draw failures over the two most important features, and the importances as bars.
 
     **Arguments:**
-
     - `analysis`: what `analysis.analyze` returned.
     - `path`: file that the picture is written to, if given.
 
@@ -94,7 +93,6 @@ def plot_importance(importance: Importance, path: str | Path | None = None) -> F
     """Draw the losses of the models' scores as bars.
 
     **Arguments:**
-
     - `importance`: what `analysis.importance` returned.
     - `path`: file that the picture is written to, if given.
 
@@ -117,7 +115,6 @@ def plot_sensitivity(sensitivity: Sensitivity, path: str | Path | None = None) -
     """Draw sensitivity indices with their intervals.
 
     **Arguments:**
-
     - `sensitivity`: what `analysis.sobol_indices`, `morris` or `gradient_sensitivity` returned.
     - `path`: file that the picture is written to, if given.
 
@@ -147,7 +144,6 @@ def plot_bars(
     """Draw one horizontal bar for each row and column of a table.
 
     **Arguments:**
-
     - `table`: a row for each feature; intervals are in the columns `NAME_low` and `NAME_high`, or
       in `low` and `high`.
     - `columns`: the name in the legend of each column to draw, empty for none.
@@ -199,7 +195,6 @@ def plot_effects(table: pd.DataFrame, title: str, path: str | Path | None = None
     """Draw the mean size of elementary effects against their standard deviation.
 
     **Arguments:**
-
     - `table`: that of `analysis.morris`.
     - `title`: above the picture.
     - `path`: file that the picture is written to, if given.

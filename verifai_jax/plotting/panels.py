@@ -23,7 +23,6 @@ def plot_rules(rules: Rules, path: str | Path | None = None) -> Figure:
     """Draw samples over the features that the rules use most, with the rules' boxes.
 
     **Arguments:**
-
     - `rules`: what `analysis.rules` returned.
     - `path`: file that the picture is written to, if given.
 

@@ -17,7 +17,6 @@ def plot_components(components: Components, path: str | Path | None = None) -> F
     """Draw the rows along the first two components, and the loadings of the first three.
 
     **Arguments:**
-
     - `components`: what `analysis.pca` returned.
     - `path`: file that the picture is written to, if given.
 

@@ -12,7 +12,6 @@ def plot_repair(repair: Repair, path: str | Path | None = None) -> Figure:
     """Draw the worst robustness that the attack of each round found.
 
     **Arguments:**
-
     - `repair`: what `repair` returned.
     - `path`: file that the picture is written to, if given.
 

@@ -55,7 +55,6 @@ def plot_replay(
     (`vj.Signal`), then the others, as many as there is room for.
 
     **Arguments:**
-
     - `replay`: what `run.replay` returned.
     - `path`: file that the picture is written to, if given.
     - `signals`: the signals and Signal features to draw, in this order; chosen when left out.

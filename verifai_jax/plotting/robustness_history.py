@@ -21,7 +21,6 @@ def plot_robustness_history(
     """Draw robustness over simulations with the running minimum; several runs share the axes.
 
     **Arguments:**
-
     - `run`: a run, or runs by the label that the legend gives them.
     - `path`: file that the picture is written to, if given.
     - `axes`: to draw into; those of a new figure when left out.

@@ -28,7 +28,6 @@ def plot_features(
     those without a verdict are grey crosses.
 
     **Arguments:**
-
     - `run`: what `falsify` returned.
     - `path`: file that the picture is written to, if given.
     - `features`: names; by default the `maximum` that distinguish failing from safe samples best.

@@ -19,7 +19,6 @@ def draw_scene(program: Any, scene: Any, path: str | Path | None = None) -> Figu
     """Draw the objects of a scene, each with its name and where it heads; returns the figure.
 
     **Arguments:**
-
     - `program`: a `ScenicProgram`.
     - `scene`: one of its scenes, of Scenic.
     - `path`: file to write the picture to.

@@ -43,7 +43,6 @@ def plot_sweep(sweep: Sweep, path: str | Path | None = None) -> Figure:
     """Draw safety, learning curves and importance; the last two where there is any to show.
 
     **Arguments:**
-
     - `sweep`: the result of a sweep.
     - `path`: file that the picture is written to, if given.
 
@@ -71,7 +70,6 @@ def plot_importance(importance: HyperparameterImportance, path: str | Path | Non
     """Draw the shares of the variance, or the trends where no model is reliable.
 
     **Arguments:**
-
     - `importance`: the importance of hyper-parameters.
     - `path`: file that the picture is written to, if given.
 

@@ -20,7 +20,6 @@ def plot_verification(result: Verification, path: str | Path | None = None) -> F
     """Draw each pair of the coordinates that were split most, as mixtures over the others.
 
     **Arguments:**
-
     - `result`: the result.
     - `path`: file that the picture is written to, if given.
 

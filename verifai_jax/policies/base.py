@@ -160,7 +160,6 @@ class Policy:
         """Return the action; for a policy that remembers, `(action, memory)`.
 
         **Arguments:**
-
         - `observation`: one observation, or a batch for a network of vectors.
         - `memory`: the memory of a policy that remembers; `initial_memory` at the start of an
           episode.
@@ -179,7 +178,6 @@ class Policy:
         policy that remembers becomes inputs and outputs `memory.0`, `memory.0.next` and so on.
 
         **Arguments:**
-
         - `path`: ends in `.onnx`, in `.safetensors`, or in `.npz`, which needs no other package.
         - `observation`: an example of an observation, where the network does not say its size.
 

@@ -55,7 +55,6 @@ def policy(
     """Load a policy that was trained anywhere, as a pure function of JAX with its weights.
 
     **Arguments:**
-
     - `source`: a file or a model:
       - `.zip`: a model of Stable-Baselines3 (PPO, A2C, SAC, TD3, DDPG, DQN), with its spaces, its
         squashing and its bounds;

@@ -36,7 +36,6 @@ def from_object(source: object, observation: ArrayLike | None, batched: bool) ->
     """Return the policy of a model or function.
 
     **Arguments:**
-
     - `source`: see `policy`.
     - `observation`: an example, where the object cannot be translated without one.
     - `batched`: a Python function takes a batch of observations.

@@ -178,7 +178,6 @@ def read_onnx(
     """Read a model of ONNX.
 
     **Arguments:**
-
     - `path`: the path of the file, next to which tensors may be kept; None for bytes alone.
     - `data`: the model.
     - `what`: its name, for errors.

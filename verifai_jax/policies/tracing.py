@@ -65,7 +65,6 @@ def traced(
     """Translate a function `(weights, observation, memory) -> (action, memory)`.
 
     **Arguments:**
-
     - `function`: a pure function of JAX.
     - `weights`: pytree of arrays, which keep their paths in it as names.
     - `observation`: an example; several arrays by name become several inputs.

@@ -55,7 +55,6 @@ class Problem(InNotebook):
     """A feature space, a system and the properties it must keep, under a name.
 
     **Arguments:**
-
     - `name`: how the command line and the report call it.
     - `space`: a `FeatureSpace`, or a dictionary of domains.
     - `system`: any function `(features, key) -> Trace`, pure and traceable by JAX, or a `System`;
@@ -183,7 +182,6 @@ class Problem(InNotebook):
         """Return the files that make the problem, with their hashes, and versions.
 
         **Arguments:**
-
         - `first`: the row of a table from which on that holds.
         """
         return sources_of(self, made=self.made_in or (), first=first)
@@ -240,7 +238,6 @@ class Problem(InNotebook):
         """Return the same problem with faults of its sensors and actuators among its features.
 
         **Arguments:**
-
         - `faults`: the faults of `vj.faults`, in the order in which those of one channel apply.
           The numbers of a fault that vary are a feature with the name of the fault; its nominal
           value is the weakest, shortest and latest fault.
@@ -267,7 +264,6 @@ class Problem(InNotebook):
         cube; `jax.vmap` and `jax.jit` work as usual.
 
         **Arguments:**
-
         - `semantics`: `mtl.hard`, the margin of the verdict, or `mtl.smooth(temperature)`.
         - `of`: what it is a function of: `"unit"`, a point `[dim]` of the unit cube, or
           `"features"`, a dictionary by name.

@@ -32,7 +32,6 @@ def comparison_page(comparison: Comparison, about: About, problem: Problem | Non
     """Make the report on a comparison.
 
     **Arguments:**
-
     - `comparison`: the comparison.
     - `about`: units and reasons of the features.
     - `problem`: the baseline; None if it is not at hand.

@@ -57,7 +57,6 @@ def write_report(
     """Write the evidence report on a result as one HTML file, and its claims as JSON next to it.
 
     **Arguments:**
-
     - `result`: a run, a sweep, an estimate, a verification, a comparison, a transfer, a failure
       table or a judgement. The failures of a run that has its problem are simulated again.
     - `path`: the path of the HTML file; the claims go to the same name with the ending

@@ -29,7 +29,6 @@ def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> 
     """Make the report on an estimate.
 
     **Arguments:**
-
     - `estimate`: the estimate.
     - `about`: units and reasons of the features.
     - `problem`: what was asked; None if it is not at hand.

@@ -28,7 +28,6 @@ def failure_table_page(found: FailureTable, about: About, problem: Problem | Non
     """Make the report on a failure table.
 
     **Arguments:**
-
     - `found`: the failure table.
     - `about`: units and reasons of the features.
     - `problem`: the problem with its faults; None if it is not at hand.

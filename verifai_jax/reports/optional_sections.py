@@ -90,7 +90,6 @@ def modes_section(found: Modes, about: About) -> Section:
     """Write the ways of failing, the most probable first.
 
     **Arguments:**
-
     - `found`: the modes.
     - `about`: units of the features.
     """

@@ -72,7 +72,6 @@ def property_content(
     """Write properties as formulas and in words.
 
     **Arguments:**
-
     - `texts`: the texts of the formulas by name.
     - `problem`: for what else is known; None if it is not.
     - `requirements`: what the formulas stand for, by name.

@@ -56,7 +56,6 @@ def model_warnings(model: Model, findings: Sequence[str] = ()) -> tuple[Markup, 
     """Write that the model is another one by now, with both hashes of each file; often nothing.
 
     **Arguments:**
-
     - `model`: what the result was made of.
     - `findings`: rows that did not give their numbers again, as sentences.
     """
@@ -162,7 +161,6 @@ def answers_section(rows: Sequence[tuple[str, str, str]]) -> Section:
     """Answer the questions of an auditor, with links to the long answers.
 
     **Arguments:**
-
     - `rows`: question, answer, and the anchor of the section that says more.
     """
     cells: list[list[Child]] = [

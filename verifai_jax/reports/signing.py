@@ -12,7 +12,6 @@ def signing_section(sentence: str) -> Section:
     """Return the section that persons sign.
 
     **Arguments:**
-
     - `sentence`: what they sign.
     """
     rows = [(role, *(blank(name) for name in ("name", "date", "signature"))) for role in ROLES]

@@ -88,7 +88,6 @@ def study(
     """Study a run for its report: everything is decided by the run and its seed.
 
     **Arguments:**
-
     - `run`: the run.
     - `traces`: rows simulated beforehand at most; chosen when left out.
     - `studies`: whether the worst failure is explained and shrunk, which takes up to 2000

@@ -44,7 +44,6 @@ def sweep_page(sweep: Sweep, about: About) -> Page:
     """Make the report on a sweep.
 
     **Arguments:**
-
     - `sweep`: the sweep; its study is not needed.
     - `about`: units and reasons of the hyper-parameters.
     """

@@ -35,7 +35,6 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
     """Make the report on a verification.
 
     **Arguments:**
-
     - `result`: the verification.
     - `about`: units and reasons of the features.
     - `problem`: what was asked; None if it is not at hand.

@@ -52,7 +52,6 @@ def mine_by_search(
     """Find the tightest parameters that no search breaks: each counterexample loosens them.
 
     **Arguments:**
-
     - `budget`: simulations in all. A search that finds nothing ends the work.
 
     **Raises:** as `mine` and `falsify`.

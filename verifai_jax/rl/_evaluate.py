@@ -39,7 +39,6 @@ def evaluate(
     """Simulate episodes with the policy's most likely actions and return their returns.
 
     **Arguments:**
-
     - `task`: the task. An episode ends where it says so, or at its time limit.
     - `policy`: the policy to measure.
     - `seed`: the seed of the episodes' starts and of what is random in their steps.

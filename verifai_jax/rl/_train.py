@@ -67,7 +67,6 @@ def train(
     other hyper-parameters re-use the program.
 
     **Arguments:**
-
     - `task`: the task to learn; see `Task`.
     - `algorithm`: the algorithm with its hyper-parameters; `PPO()` when left out.
     - `seed`: the seed of everything random in the training.

@@ -112,7 +112,6 @@ class BatchedTraining:
     """Training runs that can be advanced side by side, any of them to any step.
 
     **Arguments:**
-
     - `configurations`: the runs; numbers below are indices in this sequence.
     - `devices`: JAX devices to spread them over; all of this process when left out.
     - `per_device`: runs under one `vmap` on a device; when left out 1 on CPUs, else 64.
@@ -145,7 +144,6 @@ class BatchedTraining:
         """Advance runs until each has used its target of environment steps.
 
         **Arguments:**
-
         - `targets`: environment steps to reach, by number of the run.
 
         **Yields:** each number as it gets there, those of one structure after another. Between

@@ -69,7 +69,6 @@ def advance(
     """Take one step of each environment.
 
     **Arguments:**
-
     - `episodes`: the episodes before it.
     - `action`: the action of each environment, as `task.step` takes it.
     - `key`: a random key, of this step of all environments.

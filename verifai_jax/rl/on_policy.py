@@ -32,7 +32,6 @@ def minibatch_epochs(
     """Descend the loss, one step for each minibatch.
 
     **Arguments:**
-
     - `loss(weights, minibatch) -> number`: what is descended.
     - `start`: weights, and the optimizer's state.
     - `batch`: a pytree of arrays with two leading axes, such as environments and time.

@@ -199,7 +199,6 @@ def save_policy(
     """Write a policy as a compressed `.npz` of float32 arrays.
 
     **Arguments:**
-
     - `policy`: the policy to write.
     - `path`: the file.
     - `sources`: what it was trained with, as a run records it; that of the modules that call this

@@ -198,7 +198,6 @@ def q_lambda_targets(
     """Compute targets for the values of the actions taken, lane by lane.
 
     **Arguments:**
-
     - `reward`: of each step.
     - `next_value`: the value of the best action in the state that the step led to, *before*
       any reset.

@@ -49,7 +49,6 @@ def scenic(
     scenes that are accepted, as in Scenic.
 
     **Arguments:**
-
     - `program`: path of a `.scenic` file, or the code of a program.
     - `mode2D`: Scenic's planar mode. In three dimensions features are the same, but Scenic computes
       every scene, in Python.

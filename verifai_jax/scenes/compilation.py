@@ -64,7 +64,6 @@ def compile_program(
     """Compile a Scenic program.
 
     **Arguments:**
-
     - `program`: path of a `.scenic` file, or the code of a program, which has several lines or a
       space.
     - `mode2D`: of Scenic: objects lie in the plane.

@@ -66,7 +66,6 @@ class Condition:
     """The condition of one `require`, as a function of traced values.
 
     **Arguments:**
-
     - `requirement`: Scenic's compiled one.
     - `tree`: its parsed condition.
     - `compiled`: the program.

@@ -31,7 +31,6 @@ def leaf_of(node: Any, name: str, options: Sequence[Any] | None = None) -> Leaf 
     """Return a random node as a leaf with an inverse; None for one that has none.
 
     **Arguments:**
-
     - `node`: in Scenic's graph.
     - `name`: the name of the leaf.
     - `options`: what the node selects from, for a selector.

@@ -58,7 +58,6 @@ class Leaf(abc.ABC):
         """Return the value at these features: a number, or the coordinates of a point.
 
         **Arguments:**
-
         - `parts`: features of this leaf, by name.
         - `given`: values of what it depends on.
         - `xp`: `numpy` or `jax.numpy`, which computes.

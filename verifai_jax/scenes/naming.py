@@ -30,7 +30,6 @@ def owner_names(
     """Return the names of the objects and points that a program makes by `new`, by identity.
 
     **Arguments:**
-
     - `scenario`: Scenic's.
     - `variables`: names of variables by the identity of what they hold.
     - `order`: random nodes.

@@ -84,7 +84,6 @@ class ScenicProgram:
         computed by Scenic, without derivatives.
 
         **Arguments:**
-
         - `features`: as `space.unflatten` gives them, or as a person writes them and `features_of`
           gives them.
 
@@ -96,7 +95,6 @@ class ScenicProgram:
         """Return a system that JAX traces, given one of scenes.
 
         **Arguments:**
-
         - `function(scene, key) -> Trace`: pure JAX, of the numbers that `scenes` gives.
 
         **Raises:** `ValueError` for what cannot be called.
@@ -116,7 +114,6 @@ class ScenicProgram:
         """Return a system on the host, given one of Scenic's own scenes.
 
         **Arguments:**
-
         - `function(scene) -> Trace`: of Scenic's `Scene`; `function(scene, seed)` with `seeded`.
         - `options`: those of `verifai_jax.blackbox`, such as `workers` and `timeout`. A worker
           compiles the program once.
@@ -143,7 +140,6 @@ class ScenicProgram:
         draw depends on the row alone.
 
         **Arguments:**
-
         - `steps`: the maximum number of steps of a simulation.
         - `records`: names of `record` statements, which become signals; all when left out.
         - `dt`: seconds of a step; the simulator's own when left out.
@@ -182,7 +178,6 @@ class ScenicProgram:
         """Return Scenic's `Scene` of a row of a run's table.
 
         **Arguments:**
-
         - `run`: a `Run`, or its table.
         - `row`: number of the row, or the row itself.
 
@@ -240,7 +235,6 @@ class ScenicProgram:
         """Draw a scene from above; returns the figure.
 
         **Arguments:**
-
         - `scene`: the scene of Scenic.
         - `path`: file to write the picture to.
         """
@@ -284,7 +278,6 @@ def scene_code(scene: Any, planar: bool) -> str:
     in a comment. Requirements are left out, since they hold in this scene.
 
     **Arguments:**
-
     - `scene`: the scene of Scenic.
     - `planar`: Scenic's `mode2D`, in which the code is meant to be compiled.
     """

@@ -148,7 +148,6 @@ class Sampling:
         """Return the value of each node at these features, as Scenic keeps them.
 
         **Arguments:**
-
         - `features`: numbers and choices by name, as `FeatureSpace.unflatten` gives them.
 
         **Raises:** `Refused` where Scenic refuses the scene while it draws it.

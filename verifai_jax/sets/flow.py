@@ -67,7 +67,6 @@ def flow(
     """Return what solutions are after some seconds, and at all times until then.
 
     **Arguments:**
-
     - `derivative(time, state)`: d state / d time; smooth in both.
     - `seconds`: the same in all boxes.
 
@@ -174,7 +173,6 @@ class _Step:
     """One step of a differential equation, on sets.
 
     **Arguments:**
-
     - `program`: the derivatives of all orders of a state, of the shared operands, a time and a
       state.
     - `shared`: operands that do not change during the step.

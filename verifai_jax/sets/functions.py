@@ -384,7 +384,6 @@ def selected(truth: np.ndarray, maybe: np.ndarray, no: Form, yes: Form) -> Form:
     """Return a case by a truth value that may be open: their hull where it is.
 
     **Arguments:**
-
     - `truth`, `maybe`: where it is true for certain, and where it is open.
     """
     if not np.any(maybe):

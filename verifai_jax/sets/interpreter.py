@@ -50,7 +50,6 @@ class Interpreter:
     """Evaluates programs with sets.
 
     **Arguments:**
-
     - `boxes`: size of the batch.
     - `features`: number of symbols that stand for features.
     - `known`: a rule for a function with a derivative of its own, by its program; or None.

@@ -59,7 +59,6 @@ def clopper_pearson(
     """Compute the exact two-sided binomial interval.
 
     **Arguments:**
-
     - `failures`: samples that failed.
     - `simulations`: samples in all, a number fixed beforehand.
     - `confidence`: probability with which the interval is to hold.
@@ -85,7 +84,6 @@ def exact_interval(
     """Compute the ends of the interval of Clopper and Pearson; counts may be effective ones.
 
     **Arguments:**
-
     - `low_count`, `high_count`: the smallest and the greatest possible number of failures, each
       used for one end.
     - `samples`: samples in all, or as many as weighted ones are worth.
@@ -118,7 +116,6 @@ def simulations_without_failure(rate: float, confidence: float = 0.95) -> int:
     """Count the simulations without a failure that show that the failure rate is below `rate`.
 
     **Arguments:**
-
     - `rate`: failure rate to exclude.
     - `confidence`: probability with which the statement is to hold.
 
@@ -137,7 +134,6 @@ def simulations_until(
     """Count the further simulations, none failing, that show that the failure rate is below `p0`.
 
     **Arguments:**
-
     - `p0`: failure rate to exclude.
     - `failures`, `simulations`: samples taken so far.
     - `confidence`: probability with which the statement is to hold.

@@ -86,7 +86,6 @@ def simultaneous_interval(
     policies share their features.
 
     **Arguments:**
-
     - `failures`: samples that failed.
     - `simulations`: samples in all; anything may have decided their number.
     - `confidence`: probability with which all intervals are to hold.
@@ -124,7 +123,6 @@ def evidence_below(failures: Counts, simulations: Counts, rate: Counts) -> Float
     The mixture is an atom at 0 and, above it, a density proportional to `t^(-1/2)`.
 
     **Arguments:**
-
     - `failures`, `simulations`: numbers of samples, which broadcast; `failures` may be fractions,
       for what is expected of samples to come.
     - `rate`: rates to reject from above.

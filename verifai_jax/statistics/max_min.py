@@ -21,7 +21,6 @@ def max_min_step(
     """Compute the step within `radius` a coordinate that raises `min(rho + gradients @ step)` most.
 
     **Arguments:**
-
     - `theta`: present parameters, from which the step is taken.
     - `rho`, `gradients`: robustness in each environment at `theta`, and its derivatives.
     - `radius`: greatest change of a coordinate.

@@ -63,7 +63,6 @@ def paired_difference(
     """Compute the mean of `values - reference` and its Student's t interval.
 
     **Arguments:**
-
     - `values`, `reference`: the two values of each pair; pairs in which one is not finite are left
       out.
     - `confidence`: probability with which the interval is to hold, if the differences are

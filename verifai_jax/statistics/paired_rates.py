@@ -71,7 +71,6 @@ def paired_rates(
     """Compute the interval of a difference of failure rates on paired samples.
 
     **Arguments:**
-
     - `only_first`, `only_second`: pairs in which only the first, only the second fails.
     - `pairs`: in all; anything may have decided their number.
     - `confidence`: probability with which the interval is to hold at all times together.

@@ -19,7 +19,6 @@ def fronts(points: ArrayLike) -> Int[np.ndarray, " n"]:
     """Return each point's front: 0 where none dominates it, 1 once those are gone, and so on.
 
     **Arguments:**
-
     - `points`: `[n, objectives]`, all objectives to be minimised. Infinite entries compare as
       numbers do.
 

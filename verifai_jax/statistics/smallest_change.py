@@ -16,7 +16,6 @@ def shortest(
     """Compute the shortest `z` with `matrix @ z >= bound`.
 
     **Arguments:**
-
     - `matrix`: rows of length one, up to rounding, so that one tolerance fits them all.
     - `bound`: least value of each row.
 
@@ -48,7 +47,6 @@ def shortest_in_box(
     """Compute the shortest `z` with `rows @ z <= most` and `low <= z <= high`.
 
     **Arguments:**
-
     - `rows`, `maximum`: linear inequalities; rows of zeros are left out.
     - `low`, `high`: the box.
 
@@ -79,7 +77,6 @@ def smallest_change(
     Exact for this linear model; the caller checks the step by simulation.
 
     **Arguments:**
-
     - `theta`: present parameters, from which the step is taken.
     - `nominal`: parameters to stay near to.
     - `rho`, `gradients`: robustness in each environment at `theta`, and its derivatives.

@@ -92,7 +92,6 @@ def stratified_rate(
     """Compute a failure rate and its interval from the trials of two strata.
 
     **Arguments:**
-
     - `first`, `second`: failures and trials of each stratum.
     - `share`: probability of the second stratum: a number, or how many of how many independent
       samples lie in it.

@@ -40,7 +40,6 @@ class Cache:
     """Finished work on disk.
 
     **Arguments:**
-
     - `folder`: in which it is the file `sweep.cache` for a sweep; None keeps everything in this
       process only.
     - `kind`: of the work: `"sweep"` or `"augmentation"`.
@@ -74,7 +73,6 @@ class Cache:
         """Record the work that this cache belongs to, or refuse the cache of other work.
 
         **Arguments:**
-
         - `fingerprint`: nested dictionaries of plain data.
         - `sources`: what the work is made of; finished work of other files is refused too.
         - `even_if_changed`: whether work of other files will do; it is recorded then.

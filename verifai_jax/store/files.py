@@ -56,7 +56,6 @@ def replacing_all(folder: Path, names: Sequence[str]) -> Iterator[Path]:
     So a full disk leaves what was there, and nothing of what was to come.
 
     **Arguments:**
-
     - `folder`: which is there, and has no other writer.
     - `names`: the names of all files and folders that belong together, also those that may be
       missing. The last one is that without which the others are worth nothing: it goes first and

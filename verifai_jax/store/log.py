@@ -48,7 +48,6 @@ class Log:
     """The entries of a file; see the module's docstring.
 
     **Arguments:**
-
     - `path`: the file, which is made when the first entry is put; None keeps them in this process.
     """
 

@@ -60,7 +60,6 @@ def sweep(
     same seed gives the same table on one machine.
 
     **Arguments:**
-
     - `study`: hyper-parameters, trainer and specification.
     - `search`: over the hyper-parameters: a name, a `Search`, `"optuna:tpe"`, or an
       `OptunaSampler`. One that learns proposes in rounds and minimises the failure rate, then the

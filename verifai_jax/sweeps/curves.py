@@ -51,7 +51,6 @@ def curve_trace(
     value is that of the first: those episodes began with the training.
 
     **Arguments:**
-
     - `steps`: environment steps taken by the end of each update.
     - `mean_return`: the mean return of the episodes that ended in each update; NaN where none did.
 
@@ -87,7 +86,6 @@ def curve_robustness(
     """Return the robustness of a formula on a learning curve.
 
     **Arguments:**
-
     - `formula`: over the signal `return`, bounds in environment steps from 0 on, rounded down to
       whole updates. After the end of the curve its last value stays.
     - `steps`, `mean_return`: the curve, as in `curve_trace`.

@@ -49,7 +49,6 @@ def leaf_boxes(
     """Return the leaves of a forest of regression trees over the unit cube.
 
     **Arguments:**
-
     - `forest`: the forest of scikit-learn, fitted.
     - `edges`: borders of the cells of each input, to the nearest of which thresholds move; None for
       a continuous input.

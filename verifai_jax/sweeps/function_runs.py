@@ -183,7 +183,6 @@ def train_once(
     """Call the function of a trainer, and turn its policy into arrays; a process runs this.
 
     **Arguments:**
-
     - `train`: see `Trainer`.
     - `observation`: an example for policies that do not say what they observe, or None.
     - `call`: the hyper-parameters `values`, the `steps` in all, the `folder` to resume from, and

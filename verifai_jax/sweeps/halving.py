@@ -22,7 +22,6 @@ class Halving:
     """Successive halving: keep the best 1/reduction of the configurations at each checkpoint.
 
     **Arguments:**
-
     - `reduction`: greater than 1; of so many configurations one continues, rounded up.
     - `by`: the criterion. `"return"` is the nominal return at the checkpoint; `"safety"` is the
       failure rate of the closed loop in a few simulations, then the worst robustness, then the
@@ -48,7 +47,6 @@ class Halving:
         """Choose the configurations that continue.
 
         **Arguments:**
-
         - `objective`: the objective of each configuration, by its number; the least is best, and
           NaN is worst.
 

@@ -66,7 +66,6 @@ class HyperparameterImportance(InNotebook):
     """The importance of each hyper-parameter for failing and for the return.
 
     **Fields:**
-
     - `table`: one row for each hyper-parameter, the most important first. For each of
       `failure_rate` and `nominal_return` it has the loss in R^2 on held-out configurations when the
       column is shuffled, with `_low` and `_high` two standard deviations of the repetitions away;
@@ -102,7 +101,6 @@ class HyperparameterImportance(InNotebook):
         """Draw the shares of the variance, or the trends where no model is reliable.
 
         **Arguments:**
-
         - `path`: file that the picture is written to, if given.
 
         **Returns:** the Matplotlib figure.
@@ -200,7 +198,6 @@ def hyperparameter_importance(
     Nothing is trained or simulated.
 
     **Arguments:**
-
     - `table`: with columns `configuration`, `steps`, `verdict`, `failure_rate`, `nominal_return`
       and the hyper-parameters.
     - `hyperparameters`: names of their columns; those that do not vary are left out. `steps` is

@@ -41,7 +41,6 @@ class OptunaSampler:
     """A sampler of Optuna with its options, such as `OptunaSampler("tpe", {"multivariate": 1})`.
 
     **Arguments:**
-
     - `name`: `tpe`, `random`, `cmaes`, `gp`, `nsgaii` or `qmc`.
     - `options`: keyword arguments of the sampler's class; the seed is the sweep's.
 
@@ -61,7 +60,6 @@ class OptunaSampler:
         """Make the proposer of this sampler.
 
         **Arguments:**
-
         - `space`: the space of the hyper-parameters.
         - `seed`: the seed of the sampler.
         - `batch`: configurations in a round.
@@ -83,7 +81,6 @@ class OptunaProposer:
     """A proposer that asks an Optuna study for trials.
 
     **Arguments:**
-
     - `description`: the sampler by name and options.
     - `sampler`: Optuna's own object.
     - `space`: the space of the hyper-parameters.

@@ -54,7 +54,6 @@ def export_to_optuna(
     one. A domain that Optuna lacks becomes the range of the values that were tried.
 
     **Arguments:**
-
     - `configurations`: one row for each, as `Sweep.configurations`.
     - `hyperparameters`: names of their columns.
     - `space`: the space of the hyper-parameters, where it is known.

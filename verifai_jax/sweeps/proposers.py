@@ -60,7 +60,6 @@ def make_proposer(
     """Make the proposer of a search.
 
     **Arguments:**
-
     - `search`: a name, `"optuna:NAME"`, a `Search`, or an `OptunaSampler`.
     - `space`: the space of the hyper-parameters.
     - `configurations`: number of proposals in all.
@@ -139,7 +138,6 @@ def objective(
     among equal ones of these the return, squeezed into a hundredth.
 
     **Arguments:**
-
     - `failure_rate`: between 0 and 1.
     - `worst_robustness`: the least robustness of all simulations.
     - `nominal_return`: mean return on the nominal task.

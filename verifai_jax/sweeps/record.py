@@ -109,7 +109,6 @@ def algorithm_uses(used: Mapping[str, Sequence[str]], algorithm: object, name: s
     """Return whether an algorithm has a hyper-parameter.
 
     **Arguments:**
-
     - `used`: names of the hyper-parameters of each algorithm; one that is missing has all.
     - `algorithm`: name of the algorithm; None has all.
     - `name`: the name of the hyper-parameter.

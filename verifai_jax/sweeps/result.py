@@ -55,7 +55,6 @@ class Sweep(Drawn):
     """The policies of a sweep with their returns and certificates, as `sweep` returns them.
 
     **Fields:**
-
     - `record`: everything that was trained and certified, as plain data.
     - `study`: the study that was swept; None for a loaded sweep without it.
     - `space`: the space of the hyper-parameters; the study's if left out, None if it is not known.
@@ -222,7 +221,6 @@ class Sweep(Drawn):
         Nothing is trained or simulated. With too few configurations the result says so.
 
         **Arguments:**
-
         - `repeats`: number of times that the folds are drawn and each column is shuffled.
         - `seed`: the seed of folds, shuffles and forests.
         """
@@ -250,7 +248,6 @@ class Sweep(Drawn):
         An empty table does not mean that there is no failure: the certificate bounds that.
 
         **Arguments:**
-
         - `i`: number of the row; the best when left out.
         - `simulations`: budget of a search for more than those of the sweep; needs the study.
         - `search`, `seed`: of these simulations.
@@ -358,7 +355,6 @@ class Sweep(Drawn):
         """Write the evidence report on the sweep: one HTML file, and its claims as JSON next to it.
 
         **Arguments:**
-
         - `path`: the path of the HTML file.
         - `options`: the options of `reports.write_report`: `units` and `reasons` of
           hyper-parameters.
@@ -392,7 +388,6 @@ class Sweep(Drawn):
         return, to maximise.
 
         **Arguments:**
-
         - `storage`: place where Optuna stores it, such as `"sqlite:///sweep.db"`; memory when left
           out.
         - `name`: the name of the study there; the sweep's own when left out.
@@ -415,7 +410,6 @@ def load_sweep(folder: str | Path, study: Study | str | None = None) -> Sweep:
     The certificates are those of the table, and the recorded counterexamples.
 
     **Arguments:**
-
     - `folder`: the folder.
     - `study`: the study or its name, such as `"specs/cartpole.py:safe_training"`; needed for
       `.problem(i)` and further counterexamples. The files never name code to run.

@@ -35,7 +35,6 @@ class Study(InNotebook):
     """A sweep to be made: hyper-parameters, their trainer, and the safety of a policy.
 
     **Arguments:**
-
     - `name`: name on the command line and in results.
     - `space`: the space of the hyper-parameters; a `FeatureSpace`, or a dictionary of domains.
     - `trainer`: the task and the algorithms.
@@ -168,7 +167,6 @@ class Study(InNotebook):
         """Return the study with these hyper-parameters varied alone; see `FeatureSpace.only`.
 
         **Arguments:**
-
         - `names`: hyper-parameters to vary.
         - `nominal`: values of the others.
 

@@ -58,7 +58,6 @@ class Trainer:
     `(policy, {"steps": [...], "mean_return": [...]})` with its learning curve.
 
     **Arguments:**
-
     - `task`: the task to learn, see `rl.Task`. If it is a dataclass its fields may be swept. Or a
       function that trains, whose `algorithms` is left out.
     - `algorithms`: an algorithm, or several by name; their fields are the values of the
@@ -150,7 +149,6 @@ class Trainer:
         """Return the training with these hyper-parameters.
 
         **Arguments:**
-
         - `values`: plain Python values; the fields of algorithm and task decide the others.
         - `seed`: training seed.
 

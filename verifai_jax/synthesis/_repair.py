@@ -89,7 +89,6 @@ def repair(
     """Change parameters as little as makes the formula hold in all counterexamples.
 
     **Arguments:**
-
     - `problem`: what fails, or a run of it, whose counterexamples come first.
     - `parameters`: names of features; or, with `system_of`, a pytree of arrays.
     - `budget`: simulations at most, the check not counted.

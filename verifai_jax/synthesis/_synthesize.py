@@ -91,7 +91,6 @@ def synthesize(
     """Find features for which the formula holds robustly, whatever the other features are.
 
     **Arguments:**
-
     - `problem`: the system, its features and formulas.
     - `parameters`: names of the features to choose; all when left out. The others are the
       environment, which varies.

@@ -77,7 +77,6 @@ def attack(
     """Search environments whose robustness lies below `level`.
 
     **Arguments:**
-
     - `loop`: the system with its parameters.
     - `theta` `[p]`: the parameters to attack.
     - `level`: robustness below which an environment counts.

@@ -35,7 +35,6 @@ class FailureCounts:
     """The search, whose best candidate can be read at any time.
 
     **Arguments:**
-
     - `loop`: the system with its parameters, some features being its environment.
     - `margin`: robustness below which a sample fails.
     - `limits`: its budget.

@@ -154,7 +154,6 @@ def climb(
     """Follow the gradients of the least robust environments from each start, all in step.
 
     **Arguments:**
-
     - `propose(theta, rho, gradients, radius)`: candidates for a step, the boldest first.
 
     A step is taken where simulations show that it is better; the radius follows its success.

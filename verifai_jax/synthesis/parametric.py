@@ -66,7 +66,6 @@ class FeatureParameters:
     """Some features of a problem as parameters, the others as the environment.
 
     **Arguments:**
-
     - `problem`: on the backend that it is to run on.
     - `names`: the names of the features that are parameters; all that vary when left out.
     - `batch`: simulations at once.
@@ -193,7 +192,6 @@ class ArrayParameters:
     """Arrays as parameters, such as the weights of a network; all features are the environment.
 
     **Arguments:**
-
     - `problem`: its space, formulas and `end` are used; the system is what `system_of` makes.
     - `parameters`: a pytree of arrays of real numbers.
     - `system_of(parameters) -> system`: pure, and traced by JAX.

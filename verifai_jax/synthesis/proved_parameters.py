@@ -67,7 +67,6 @@ def prove_around(
     """Prove a box of parameters around a point; None if no box was proved in time.
 
     **Arguments:**
-
     - `problem`: one that `enclosable` gave.
     - `point`: of the unit cube; its `chosen` coordinates are the parameters.
     - `low`, `high`: corners of the part of the cube in which the other features lie.
@@ -129,7 +128,6 @@ class _Hope:
     """The box of parameters around a point that holds none which is known to fail.
 
     **Arguments:**
-
     - `low`, `high`: corners of the part of the cube that is looked at.
     - `point`, `chosen`: as in `prove_around`.
     """

@@ -50,7 +50,6 @@ def outcome_of(simulate: Callable[[], Any]) -> Outcome:
     exceptions that are no `Exception` too. Only Ctrl-C ends the run.
 
     **Arguments:**
-
     - `simulate`: calls the system.
     """
     try:
@@ -118,7 +117,6 @@ class System(ForUsers):
         """Refuse features that the system does not fit, before anything compiles.
 
         **Arguments:**
-
         - `features`: `jax.ShapeDtypeStruct`s.
 
         **Raises:** `ValueError` that says what does not fit.
@@ -130,7 +128,6 @@ class System(ForUsers):
         None if nothing but a simulation can tell.
 
         **Arguments:**
-
         - `features`: `jax.ShapeDtypeStruct`s.
         """
         if self.black_box:
@@ -174,7 +171,6 @@ class System(ForUsers):
         """Return the same system, sampled and decided as before, at a smaller step.
 
         **Arguments:**
-
         - `factor`: the step is divided by it; a traced integer where `traced_factor` allows it.
 
         **Raises:** `ValueError` for a factor that is not a positive integer.
@@ -203,7 +199,6 @@ class System(ForUsers):
         """Say why compiling this system takes minutes, and what is cheaper; empty if it is quick.
 
         **Arguments:**
-
         - `gradient`: whether derivatives are compiled too.
         """
         return ""
@@ -212,7 +207,6 @@ class System(ForUsers):
         """Return the reason why a traced simulation ended with the status `ERROR`, None if unknown.
 
         **Arguments:**
-
         - `features`: numbers by the names of the table's columns.
         """
         return None
@@ -221,7 +215,6 @@ class System(ForUsers):
         """Return what passes between the system and its policy, where faults can be.
 
         **Arguments:**
-
         - `features`: `jax.ShapeDtypeStruct`s.
 
         **Raises:** `ValueError` for a system that has no policy or controller that is known here.
@@ -243,7 +236,6 @@ class System(ForUsers):
         JAX tells of any other system. What nobody knows may.
 
         **Arguments:**
-
         - `features`: `jax.ShapeDtypeStruct`s.
         """
         return True
@@ -257,7 +249,6 @@ class System(ForUsers):
         """Simulate `n` rows on the host, in lock-step.
 
         **Arguments:**
-
         - `features`: each leaf with a leading axis `[n]`.
 
         **Returns:** a trace, each leaf with a leading axis `[n]`.

@@ -11,7 +11,6 @@ def count_periods(seconds: float, period: float, name: str, of: str = "dt") -> i
     """Return the number of periods in a time.
 
     **Arguments:**
-
     - `seconds`, `period`: in seconds.
     - `name`, `of`: their names in the error.
 

@@ -16,7 +16,6 @@ def check_domain(domain: Domain, *, samples: int = 64, seed: int = 0) -> None:
     """Check the laws of a domain on random points and on the corners of its cube.
 
     **Arguments:**
-
     - `domain`: to check.
     - `samples`: number of random points.
     - `seed`: the seed of the points.

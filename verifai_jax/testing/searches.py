@@ -22,7 +22,6 @@ def check_search(
     """Check the contract of a search on one cube, on a quadratic robustness with failures.
 
     **Arguments:**
-
     - `search`: to check.
     - `cube`: that it searches.
     - `batch`: points in a round.
@@ -106,7 +105,6 @@ def check_batch_independence(search: Search, cube: Cube, *, points: int = 48) ->
     """Check that a passive search gives the same points whatever the batch size is.
 
     **Arguments:**
-
     - `search`: to check.
     - `cube`: that it searches.
     - `points`: number of points to compare.

@@ -24,7 +24,6 @@ def strategy(space: FeatureSpace, nominal: Mapping[str, Any] | None = None) -> A
             assert abs(features["x"]) * features["n"] < 4
 
     **Arguments:**
-
     - `space`: a feature space.
     - `nominal`: ordinary features, towards which examples shrink; the middles of the domains, and
       the least lengths, when left out.

@@ -19,7 +19,6 @@ def check_system(
     """Check the contract of a system on random features: pure, one clock, all its ways agree.
 
     **Arguments:**
-
     - `system`: to check, as `Problem` takes it.
     - `space`: the space of the features that it takes.
     - `samples`: number of random features.

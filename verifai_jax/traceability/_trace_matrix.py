@@ -47,7 +47,6 @@ def trace_matrix(
     formula, what the requirement says, the model, or the run that claims are about.
 
     **Arguments:**
-
     - `problems`: problems, or files `FILE.py` and names `FILE.py:NAME`, which are run.
     - `requirements`: a file, or what it says; those of the problems when left out.
     - `tests`: test functions of `vj.test`, files, and folders whose files `test_*.py` are run; a
@@ -283,7 +282,6 @@ class Evidence:
         """Yield sentences on what has changed since.
 
         **Arguments:**
-
         - `name`: the name of the formula.
         - `formula`: its text now.
         - `about`: what it stands for now.

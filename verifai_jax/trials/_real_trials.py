@@ -57,7 +57,6 @@ def real_trials(
     many trials or fewer give an interval as short as that of Clopper and Pearson.
 
     **Arguments:**
-
     - `problem`: the simulation. The prior of its features is the distribution of the trials.
     - `trials`: the path of a CSV or Parquet file, or a data frame: a column for each feature as in
       the table of a run, and `failed` (yes or no; empty where a trial may have failed), or

@@ -80,7 +80,6 @@ def calibrate(
     """Find values of features that make the simulation agree with trials.
 
     **Arguments:**
-
     - `problem`: the simulation.
     - `trials`: a table with the other features, and `failed` as in `real_trials`; a column
       `robustness` of measured values is used instead, where there is one.

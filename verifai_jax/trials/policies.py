@@ -88,7 +88,6 @@ def compare_trials(
     """Compare two policies by pairs of real trials, after any pair.
 
     **Arguments:**
-
     - `trials`: a table with the columns `pair`, `policy` and `failed` (yes, no, or empty), such as
       the one that `trial_protocol` makes; pairs of which a trial is missing are left out.
     - `baseline`, `candidate`: the policies' names.

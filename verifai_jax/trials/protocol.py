@@ -51,7 +51,6 @@ def trial_protocol(
     in `_key.csv`.
 
     **Arguments:**
-
     - `problem`: its features are drawn from the prior; its formulas are the property.
     - `path`: the path of the HTML file.
     - `count`: number of trials, or of pairs.

@@ -33,7 +33,6 @@ def read_trials(
     """Read trials, and judge those that have a recording instead of a verdict.
 
     **Arguments:**
-
     - `problem`: its features are columns of the table; its formulas judge recordings.
     - `trials`: a file or a data frame.
     - `time`, `dt`: of recordings, as `mtl.read` takes them.

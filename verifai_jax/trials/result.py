@@ -75,7 +75,6 @@ class RealTrials(InNotebook):
         """Describe by a few boxes of the features where the simulation is wrong; see `vj.rules`.
 
         **Arguments:**
-
         - `options`: the options of `analysis.rules`.
 
         **Raises:** `ValueError` where all predictions are right, or all wrong.
@@ -94,7 +93,6 @@ class RealTrials(InNotebook):
         `at_any_time=True` if you stop in between.
 
         **Arguments:**
-
         - `count`: number of trials.
         - `seed`: the seed of the draw.
 

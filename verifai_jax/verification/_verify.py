@@ -47,7 +47,6 @@ def verify(
     time as it is simulated, with its steps; or, if `continuous`, the differential equation itself.
 
     **Arguments:**
-
     - `problem`: whose system JAX traces, without randomness of its own.
     - `budget`: seconds, about; 60 if `boxes` is left out too. One may stop at any time with Ctrl-C.
     - `boxes`: number of boxes to look at, at most.

@@ -32,7 +32,6 @@ class Rest:
     """The part of the unit cube that is neither decided nor refused by the constraint.
 
     **Arguments:**
-
     - `boxes`: the partition of the cube.
     - `states`: those that count as decided.
 
@@ -65,7 +64,6 @@ class Rest:
         """Return whether points lie in boxes that are decided, and not near faces within the cube.
 
         **Arguments:**
-
         - `points`: of the unit cube.
         - `margin`: distance from the faces.
         - `xp`: NumPy, or JAX's, which may trace the points.

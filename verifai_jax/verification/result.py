@@ -238,7 +238,6 @@ class Verification(Drawn, InNotebook):
         robustness has the lowest bound.
 
         **Arguments:**
-
         - `problem`: that of `rest`.
         - `budget`: simulations of the search, of which these take an eighth at most.
 
@@ -258,7 +257,6 @@ class Verification(Drawn, InNotebook):
         Its constraint refuses the boxes that are proved, so that rates are those of the rest.
 
         **Arguments:**
-
         - `problem`: the problem that was verified.
         - `precision`: the precision of the simulations of the rest, in which it was verified.
 
@@ -274,7 +272,6 @@ class Verification(Drawn, InNotebook):
         """Write the evidence report on the verification as HTML, and its claims as JSON.
 
         **Arguments:**
-
         - `path`: the path of the HTML file.
         - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`.
 
@@ -286,7 +283,6 @@ class Verification(Drawn, InNotebook):
         """Write the result as JSON; `load_verification` reads it.
 
         **Arguments:**
-
         - `path`: the path of the file, whose folder is made.
 
         **Returns:** the path.

@@ -178,7 +178,6 @@ def clusters(
     """Find clusters of rows.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
     - `method`: `"kmeans"` looks at ordered columns only, `"kmodes"` at unordered ones only,

@@ -71,7 +71,6 @@ class Samples:
         """Select samples of a run, of its table, or of any DataFrame with feature columns.
 
         **Arguments:**
-
         - `source`: a run, its table, a DataFrame with feature columns and row numbers as index, or
           `Samples`, which are taken as they are, with other `columns` where they are given.
         - `which`: `"counterexamples"`, `"safe"`, `"failed"` (rows without a verdict), or `"all"`

@@ -91,7 +91,6 @@ def brax_task(
     """Make a `Task` of an environment of Brax.
 
     **Arguments:**
-
     - `env`: the name of an environment of Brax, or an `Env` of your own.
     - `backend`: the physics pipeline, as for `brax`.
     - `time_limit`: in steps, after which an episode is cut off; Brax trains on 1000.
@@ -118,7 +117,6 @@ def playground_task(
     """Make a `Task` of an environment of MuJoCo Playground.
 
     **Arguments:**
-
     - `env`: the name of an environment, or an `MjxEnv` of your own.
     - `time_limit`: in steps, after which an episode is cut off.
     - `options`: overrides of the configuration of an environment by name.

@@ -102,7 +102,6 @@ def gymnax_task(
     """Make a `Task` of an environment of gymnax.
 
     **Arguments:**
-
     - `env`: the id of a registered environment, or an `Environment` of your own.
     - `params`: the environment's parameters; its default ones when left out.
     - `time_limit`: in steps; the environment's `max_steps_in_episode` when left out.

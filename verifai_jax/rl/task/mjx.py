@@ -158,7 +158,6 @@ def mjx_task(
     """Make a `Task` of a MuJoCo model.
 
     **Arguments:**
-
     - `model`: the path of an MJCF file, its text, an `mujoco.MjSpec` or an `mujoco.MjModel`.
     - `control_period`: seconds of a step, a multiple of the model's timestep.
     - `time_limit`: steps after which an episode is cut off.

@@ -132,7 +132,6 @@ def ode_task(
     The loop's own controller is not used.
 
     **Arguments:**
-
     - `loop`: a system made by `ode`.
     - `action`: the kind of action.
     - `reward(time, state, control, after) -> number`: the reward of one control period that begins

@@ -87,7 +87,6 @@ class Task(Protocol):
         """Draw a first state.
 
         **Arguments:**
-
         - `key`: a random key, of this episode's start alone.
 
         **Returns:** a state with the structure, shapes and dtypes that `step` returns.
@@ -100,7 +99,6 @@ class Task(Protocol):
         """Take one step.
 
         **Arguments:**
-
         - `key`: a random key, of this step alone.
         - `state`: as `reset` or `step` returned it.
         - `action`: an int32 scalar of a `Discrete` task, a float32 vector `[size]` of a

@@ -118,7 +118,6 @@ class BlackBox(_RowByRow):
         """Simulate once, with features as plain Python and NumPy values.
 
         **Arguments:**
-
         - `key`: a JAX random key, or an integer seed.
         """
         return self.simulation(plain_leaves(features), seed_of(key))
@@ -290,7 +289,6 @@ def blackbox(
     """Mark a Python function as a system that runs on the host.
 
     **Arguments:**
-
     - `function(features) -> Trace`: numbers arrive as `float` and `int`, arrays as NumPy. It may
       have a `refined(factor)`, the same function with a smaller step, to confirm failures with (not
       in workers).

@@ -19,7 +19,6 @@ class TraceForm:
     """The form that every trace of a simulator must have; a part that is None may be anything.
 
     **Arguments:**
-
     - `signals`: names of scalars, or names with their number of components (1 for a scalar).
     - `dt`: sampling period in seconds.
     - `length`: number of samples.

@@ -63,7 +63,6 @@ class Pool:
     """Processes that run one simulation at a time each; started when first needed.
 
     **Arguments:**
-
     - `simulation(features, seed) -> Trace`: picklable, as `function` is.
     - `function`: the user's part of it, which errors speak of.
     - `workers`, `timeout` (s), `retries`: see `blackbox`.

@@ -160,7 +160,6 @@ def brax(
     """Make a system `(features, key) -> Trace` from an environment of Brax and a policy.
 
     **Arguments:**
-
     - `env`: the name of an environment, or an `Env` of your own without training wrappers.
     - `policy`: `observation -> action`, or `(observation, key) -> action` for a random one; a
       function, or an object with a method `act`, such as an `rl.Policy`. An argument `features`

@@ -377,7 +377,6 @@ def gymnasium(
     """Make a black box from an environment of Gymnasium and a policy.
 
     **Arguments:**
-
     - `env`: the id of a registered environment, or a function that makes one; it is called once in
       each process.
     - `policy`: `observation -> action`, or an object with a method `act` that is one, such as an

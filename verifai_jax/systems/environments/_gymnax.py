@@ -126,7 +126,6 @@ def gymnax(
     """Make a system `(features, key) -> Trace` from an environment of gymnax and a policy.
 
     **Arguments:**
-
     - `env`: the id of a registered environment, or an `Environment` of your own.
     - `policy`: `observation -> action`, or `(observation, key) -> action` for a random one; a
       function, or an object with a method `act`, such as an `rl.Policy`. An argument `features`

@@ -116,7 +116,6 @@ def playground(
     """Make a system `(features, key) -> Trace` from an environment of MuJoCo Playground.
 
     **Arguments:**
-
     - `env`: the name of an environment, or an `MjxEnv` of your own without training wrappers.
     - `policy`: `observation -> action`, or `(observation, key) -> action` for a random one; a
       function, or an object with a method `act`, such as what `vj.policy` returns.

@@ -200,7 +200,6 @@ def policy_function(policy: object, memory: PyTree = None) -> Decide:
     """Return a user's policy as `decide(observation, memory, key, features) -> (action, memory)`.
 
     **Arguments:**
-
     - `policy`: a function of the observation, or of `(observation, key)` for a random one; or an
       object with a method `act` that is one, such as `rl.Policy`. It is given a key if that many
       arguments have no default, and the features of the instant if one is called `features`.

@@ -200,7 +200,6 @@ def loop_options(
     """Check the options that all environments have, and return them as `PolicyLoop` takes them.
 
     **Arguments:**
-
     - `delays`: the delays of observations and of actions.
     - `configured`, `started`: what `configure`, and a function `initial`, is called with first.
 

@@ -194,7 +194,6 @@ def fmu(
     trust.
 
     **Arguments:**
-
     - `file`: the FMU.
     - `duration`: seconds of a simulation.
     - `dt`: seconds between two samples, which is the step of communication.
@@ -266,7 +265,6 @@ def fmu_ranges(
     """Return the ranges that an FMU declares of variables, for `Box(low, high)`.
 
     **Arguments:**
-
     - `file`: the FMU.
     - `names`: parameters, start values or inputs.
     - `around`: share of the start value to both sides, for variables without a range, such as 0.2.

@@ -140,7 +140,6 @@ def read_description(file: str | Path, exchange: bool | None = None) -> Descript
     """Read the description of an FMU.
 
     **Arguments:**
-
     - `exchange`: whether its model exchange is meant; its co-simulation, if it has one, when left
       out.
 

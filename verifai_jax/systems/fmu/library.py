@@ -63,7 +63,6 @@ class Instance:
     """An instance of an FMU; `begin` may be called again after a simulation.
 
     **Arguments:**
-
     - `description`: the description of the FMU.
     - `folder`: where the FMU is unpacked.
 

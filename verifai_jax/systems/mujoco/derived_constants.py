@@ -53,7 +53,6 @@ def bodies_of_geoms(
     A model without a spec, and a body with an explicit `<inertial>`, keep their inertia.
 
     **Arguments:**
-
     - `model`: with the spec that it came from.
     - `changed`: numbers of geoms of another size or in another location.
     - `massive`: numbers of geoms with another mass, and the paths that say so.

@@ -61,7 +61,6 @@ def load(
     """Read and compile a model.
 
     **Arguments:**
-
     - `source`: the path of an MJCF file, its text, an `mujoco.MjSpec`, or an `mujoco.MjModel`.
     - `contacts`: paths `contact/GEOM` and `contact/GEOM/GEOM`, for which a sensor is added after
       the model's own.

@@ -94,7 +94,6 @@ class MuJoCo(System):
         """Say why MJX compiles this model for minutes, and what is cheaper; empty if it is quick.
 
         **Arguments:**
-
         - `gradient`: whether derivatives are compiled too.
         """
         compiled = self.loop.compiled
@@ -265,7 +264,6 @@ def mujoco(
     """Make a system `(features, key) -> Trace` from a MuJoCo model and a controller.
 
     **Arguments:**
-
     - `model`: the path of an MJCF file, its text, an `mujoco.MjSpec` or an `mujoco.MjModel`.
     - `duration`: in seconds, a multiple of `control_period`.
     - `control_period`: seconds between two runs of the controller, a multiple of the model's

@@ -45,7 +45,6 @@ def ode(
     """Make a system `(features, key) -> Trace` from equations of motion, with a fixed step.
 
     **Arguments:**
-
     - `dynamics(time, state, control, features) -> derivative`: d state / d time, in the form of the
       state; `time` in seconds; `control` is None without a controller. A `Signal` that is held
       keeps its value within a step; a piece that begins within one begins with the next.

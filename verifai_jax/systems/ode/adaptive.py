@@ -26,7 +26,6 @@ def adaptive(
     needs tolerances of 1e-6 or more.
 
     **Arguments:**
-
     - `solver`: the name of a solver of diffrax: `"Tsit5"` and `"Dopri8"` where the equations are
       not stiff, `"Kvaerno3"` and `"Kvaerno5"` (implicit) where they are.
     - `rtol`, `atol`: relative and absolute tolerance of a step's error.

@@ -64,7 +64,6 @@ def delay_line(value: Any, *, longest: float, period: float) -> DelayLine:
     """Make a line that has had one value until time 0.
 
     **Arguments:**
-
     - `value`: a number or an array.
     - `longest`: seconds back at most; what is older has the value of that time.
     - `period`: seconds between two samples: `dt` for a line that `update` pushes, the control

@@ -33,7 +33,6 @@ class LookupTable:
     breakpoint the derivative is that of the line after it.
 
     **Arguments:**
-
     - `axes_and_values`: the increasing breakpoints of each argument, at least two of each, and
       last the values, of shape `[len(axis), ...]` by `[len(axis), ...]` and so on. Axes after
       these make a table of vectors.

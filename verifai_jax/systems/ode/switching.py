@@ -37,7 +37,6 @@ class Switch:
     derivative of the simulation is that of the hybrid system, not of one whose instants stay.
 
     **Arguments:**
-
     - `guard(time, state, features) -> number`: the switch happens where it was positive and is so
       no more. A guard that is not positive at first waits until it has been.
     - `reset(time, state, features) -> state`: the state from there on.
@@ -64,7 +63,6 @@ def hysteresis(on: Any, value: Any, low: Any, high: Any) -> Any:
     """Return the next mode of a switch with hysteresis: 1 from `high` on, 0 below `low`.
 
     **Arguments:**
-
     - `on`: the mode now, 0 or 1, which stays between the two.
     - `low`, `high`: where the mode changes; numbers, or traced.
 
@@ -97,7 +95,6 @@ def switched_step(
     JAX traces the dynamics as often for many switches as for one.
 
     **Arguments:**
-
     - `dynamics(time, state, inputs) -> derivative`.
     - `inputs`: the control and the features, which guards and resets are given.
 

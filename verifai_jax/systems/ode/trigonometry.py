@@ -69,7 +69,6 @@ def sin_cos(
     """Return `(sin(angle), cos(angle))`, faster than two calls.
 
     **Arguments:**
-
     - `angle`: in radians, of any shape.
 
     **Returns:** values within 1.2e-7 of the true ones for angles of at most 1e5, NaN beyond; in

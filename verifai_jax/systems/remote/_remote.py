@@ -158,7 +158,6 @@ def remote(
     """Make a system that programs simulate which connect to this one.
 
     **Arguments:**
-
     - `host`: the address to listen at; this machine only when left out, `"localhost"` by IPv4 and
       IPv6. Anything else needs a token.
     - `port`: 0 for any that is free, see `Remote.address`.

@@ -319,7 +319,6 @@ def server_context(certificate: File, private_key: File | None) -> ssl.SSLContex
     """Return the settings of a server that shows a certificate.
 
     **Arguments:**
-
     - `certificate`: a PEM file with the certificate, and those between it and its authority.
     - `private_key`: a PEM file with its key; the same file when None. The key is not encrypted.
 

@@ -238,7 +238,6 @@ class Server(threading.Thread):
         """Tell a client why, and close the connection when it has had time to read it.
 
         **Arguments:**
-
         - `retry`: whether it may come back.
         """
         if client.leaving:
