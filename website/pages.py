@@ -12,6 +12,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+from markdown import Extension, Markdown
+from markdown.preprocessors import Preprocessor
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -46,7 +48,26 @@ def on_config(config: Any) -> Any:
         return lists.get(entry, entry)
 
     config["nav"] = filled(config["nav"])
+    config["markdown_extensions"].append(Sections())
     return config
+
+
+class Sections(Extension):
+    """Lists that begin right below `**Arguments:**`, as those of docstrings do."""
+
+    def extendMarkdown(self, md: Markdown) -> None:
+        """Add the empty line that Markdown needs in front of a list."""
+        md.preprocessors.register(_Spaced(md), "sections", priority=15)
+
+
+class _Spaced(Preprocessor):
+    def run(self, lines: list[str]) -> list[str]:
+        spaced: list[str] = []
+        for line in lines:
+            if line.startswith("- ") and spaced and spaced[-1].startswith("**"):
+                spaced.append("")
+            spaced.append(line)
+        return spaced
 
 
 def on_files(files: Files, config: Any) -> Files:

@@ -10,15 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax.core.text import listed
-from verifai_jax.evaluation.confirmations import (
-    FINER,
-    NOT_CLAIMED,
-    RAISED,
-    SINGLE,
-    Confirmations,
-    describe_check,
-    engines_of,
-)
+from verifai_jax.evaluation import confirmations
 from verifai_jax.evaluation.verdicts import Verdicts
 
 AMPLIFIED = 4.0
@@ -27,7 +19,7 @@ roundings into any of its outcomes, and two or three programs may agree by chanc
 
 
 def decide(
-    found: Confirmations,
+    found: confirmations.Confirmations,
     replayed: Mapping[str, Verdicts],
     run: Float[np.ndarray, " n"] | None,
     *,
@@ -35,7 +27,7 @@ def decide(
     may_refute: bool,
     by_far: bool,
     came_again: bool,
-) -> Confirmations:
+) -> confirmations.Confirmations:
     """Decide about rows from their replays.
 
     **Arguments:**
@@ -51,12 +43,12 @@ def decide(
     rho = {name: verdicts.lowest for name, verdicts in replayed.items()}
     found.rho.update(rho)
     base = next((name for name in ("float64", "again") if name in replayed), "")
-    engines = engines_of(replayed)
+    engines = confirmations.engines_of(replayed)
     finest = next((n for n in ("quarter_step", base, *engines) if n in replayed), "")
     step = rounding = np.zeros(len(found))
     if "half_step" in replayed:
         step = _moved(rho["half_step"], rho["quarter_step"])
-    for name in (SINGLE, "nudged"):
+    for name in (confirmations.SINGLE, "nudged"):
         if name in replayed:
             rounding = np.maximum(rounding, _moved(rho[name], rho[finest]))
     if run is not None and base:
@@ -65,11 +57,13 @@ def decide(
     if not replayed:
         found.why[:] = untraceable
         return found
-    deciding = [name for name in (*FINER, SINGLE) if name in replayed] or [base]
+    deciding = [
+        name for name in (*confirmations.FINER, confirmations.SINGLE) if name in replayed
+    ] or [base]
     deciding = [name for name in (*deciding, *engines) if name in replayed]
     failing = {name: verdicts.violated for name, verdicts in replayed.items()}
     holding = {name: v.proper & ~v.violated for name, v in replayed.items()}
-    raised = {name: np.isin(v.status, RAISED) for name, v in replayed.items()}
+    raised = {name: np.isin(v.status, confirmations.RAISED) for name, v in replayed.items()}
     # Of a host system that is simulated once more, and fails each time, that it fails says all.
     clear = (not by_far) | (np.abs(rho[finest]) >= np.maximum(step, AMPLIFIED * rounding))
     fails = np.all(list(failing.values()), axis=0)
@@ -91,7 +85,7 @@ def decide(
 
 
 def hold_to_run(
-    found: Confirmations,
+    found: confirmations.Confirmations,
     replayed: Mapping[str, Verdicts],
     rows: Mapping[str, np.ndarray],
     only_repeats: bool,
@@ -104,7 +98,7 @@ def hold_to_run(
     fails = np.all([verdicts.violated for verdicts in replayed.values()], axis=0)
     still = (rows["verdict"] == "confirmed") & fails & only_repeats
     found.verdict[still], found.why[still] = "confirmed", ""
-    refused = np.isin(rows["verdict"], NOT_CLAIMED)
+    refused = np.isin(rows["verdict"], confirmations.NOT_CLAIMED)
     refused &= np.isin(found.verdict, ("confirmed", "raised"))
     for i in np.flatnonzero(refused).tolist():
         found.verdict[i] = "fragile"
@@ -148,7 +142,7 @@ def describe_disagreement(
     """
     lost = [name for name in found if not found[name].proper[i]]
     if lost:
-        raised = [name for name in lost if found[name].status[i] in RAISED]
+        raised = [name for name in lost if found[name].status[i] in confirmations.RAISED]
         if raised:
             messages = [m[i] for name in raised if (m := found[name].messages)]
             message = next(filter(None, messages), "out of time")
@@ -168,7 +162,7 @@ def describe_disagreement(
 
 
 def _and(names: Sequence[str]) -> str:
-    return listed(list(map(describe_check, names)))
+    return listed(list(map(confirmations.describe_check, names)))
 
 
 def _moved(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

@@ -15,16 +15,7 @@ import numpy as np
 from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Array, Float
 
-from verifai_jax.features.continuous import (
-    OUTERMOST,
-    Continuous,
-    at_least,
-    check_ends,
-    check_numbers,
-    check_scale,
-    normal_score,
-    scipy_special,
-)
+from verifai_jax.features import continuous
 from verifai_jax.features.domain import MIN_REAL, Tuning, short
 from verifai_jax.features.ends import replace_where
 from verifai_jax.features.english import number
@@ -39,7 +30,7 @@ outermost probability of a coordinate, 2^-26, it is still a normal number of flo
 
 
 @dataclass(frozen=True, repr=False)
-class Normal(Continuous):
+class Normal(continuous.Continuous):
     """A normal distribution: `Normal(mean, std)`.
 
     A float32 coordinate reaches 5.5 standard deviations to either side, beyond which lies a
@@ -59,8 +50,8 @@ class Normal(Continuous):
     std: float
 
     def __post_init__(self) -> None:
-        check_numbers(self, "mean", "std")
-        check_scale(self, self.mean, self.std)
+        continuous.check_numbers(self, "mean", "std")
+        continuous.check_scale(self, self.mean, self.std)
 
     @property
     def support(self) -> tuple[float, float]:
@@ -70,7 +61,7 @@ class Normal(Continuous):
         return abs(value - self.mean) <= CENTRAL * self.std
 
     def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
-        return self.mean + self.std * normal_score(u)
+        return self.mean + self.std * continuous.normal_score(u)
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
         return ndtr((value - self.mean) / self.std)
@@ -80,7 +71,7 @@ class Normal(Continuous):
         return -(z**2) / 2 - HALF_LOG_2PI - math.log(self.std)
 
     def tail(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        return 2 * scipy_special().ndtr(
+        return 2 * continuous.scipy_special().ndtr(
             -np.abs((np.asarray(value, np.float64) - self.mean) / self.std)
         )
 
@@ -89,7 +80,7 @@ class Normal(Continuous):
 
 
 @dataclass(frozen=True, repr=False)
-class TruncatedNormal(Continuous):
+class TruncatedNormal(continuous.Continuous):
     """A normal distribution given that the value lies in `[low, high]`.
 
     **Arguments:**
@@ -112,9 +103,9 @@ class TruncatedNormal(Continuous):
     high: float
 
     def __post_init__(self) -> None:
-        check_numbers(self, "mean", "std", "low", "high")
-        check_scale(self, self.mean, self.std)
-        check_ends(self, self.low, self.high)
+        continuous.check_numbers(self, "mean", "std", "low", "high")
+        continuous.check_scale(self, self.mean, self.std)
+        continuous.check_ends(self, self.low, self.high)
         if self.high - self.low < 0.05 * self.std:
             raise ValueError(
                 "low and high are less than 0.05 standard deviations apart, where the "
@@ -158,8 +149,8 @@ class TruncatedNormal(Continuous):
     def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
         below, _, _, above = self._tails
         left, right = (1 - u, u) if self._mirrored else (u, 1 - u)
-        p = below + self._inside * at_least(left, OUTERMOST)
-        q = above + self._inside * at_least(right, OUTERMOST)
+        p = below + self._inside * continuous.at_least(left, continuous.OUTERMOST)
+        q = above + self._inside * continuous.at_least(right, continuous.OUTERMOST)
         lower = p < 0.5
         z = ndtri(jnp.where(lower, p, q))
         x = self.mean + self.std * jnp.where(lower ^ self._mirrored, z, -z)
@@ -196,7 +187,7 @@ class TruncatedNormal(Continuous):
 
 
 @dataclass(frozen=True, repr=False)
-class LogUniform(Continuous):
+class LogUniform(continuous.Continuous):
     """Positive numbers whose logarithm is uniform: learning rates, masses, stiffnesses.
 
     **Arguments:**
@@ -211,12 +202,12 @@ class LogUniform(Continuous):
     high: float
 
     def __post_init__(self) -> None:
-        check_numbers(self, "low", "high")
+        continuous.check_numbers(self, "low", "high")
         if self.low <= 0:
             raise ValueError(f"low of a LogUniform must be positive; got {self!r}")
         if self.low < MIN_REAL:
             raise ValueError(f"low of a LogUniform must be at least {MIN_REAL:zg}; got {self!r}")
-        check_ends(self, self.low, self.high)
+        continuous.check_ends(self, self.low, self.high)
 
     @property
     def support(self) -> tuple[float, float]:

@@ -18,15 +18,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
+from verifai_jax.rl import experience
 from verifai_jax.rl.algorithm import Number, Progress, check_values, static_field
-from verifai_jax.rl.experience import (
-    Episodes,
-    Transition,
-    advance,
-    observation_size,
-    progress,
-    start_episodes,
-)
 from verifai_jax.rl.observations import ObservationStatistics, mean_and_scale, normalise, update
 from verifai_jax.rl.optimizer import adam, annealed
 from verifai_jax.rl.policy import ACTIVATIONS, Layers, Policy, network, new_layers, scale_to_range
@@ -119,8 +112,8 @@ class SAC:
     def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "SACState":
         """Make the state before the first of `updates` updates."""
         policy_key, critic_key, reset_key, noise_key, key = jax.random.split(key, 5)
-        episodes = start_episodes(task, reset_key, self.environments)
-        size, actions = observation_size(task, episodes), _count(task)
+        episodes = experience.start_episodes(task, reset_key, self.environments)
+        size, actions = experience.observation_size(task, episodes), _count(task)
 
         def critic(key: Key[Array, ""]) -> Layers:
             return new_layers(key, (size + actions, *self.value_hidden, 1), gain=1.0)
@@ -158,7 +151,7 @@ class SAC:
                 Int[Array, ""],
                 tuple[Float[Array, "environments actions"], Key[Array, ""], Key[Array, ""]],
             ],
-        ) -> tuple["SACState", tuple[Transition, Float[Array, "environments k"]]]:
+        ) -> tuple["SACState", tuple[experience.Transition, Float[Array, "environments k"]]]:
             number, (noise, step_key, learn_key) = numbered
             carry, transition, observation = act(self, task, carry, noise, step_key)
             taken = (state.done * self.horizon + number + 1) * self.environments
@@ -179,7 +172,7 @@ class SAC:
         )
         statistics = update(state.statistics, observation) if self.normalise else state.statistics
         after = after._replace(statistics=statistics, key=key, done=state.done + 1)
-        return after, progress(transition)
+        return after, experience.progress(transition)
 
     def policy(self, task: Task, state: "SACState") -> Policy:
         """Return the policy learnt so far, without exploration."""
@@ -225,7 +218,7 @@ class SACState(NamedTuple):
     slow: Layers
     moments: PyTree
     statistics: ObservationStatistics
-    episodes: Episodes
+    episodes: experience.Episodes
     noise: Float[Array, "environments actions"]
     buffer: ReplayBuffer
     key: Key[Array, ""]
@@ -255,14 +248,16 @@ def act(
     state: SACState,
     noise: Float[Array, "environments actions"],
     key: Key[Array, ""],
-) -> tuple[SACState, Transition, Float[Array, "environments k"]]:
+) -> tuple[SACState, experience.Transition, Float[Array, "environments k"]]:
     """Take one step of each environment, and write the transitions into the buffer."""
     observation = jax.vmap(task.observe)(state.episodes.state)
     normalised = normalise(state.statistics, observation, sac.normalise)
     mean, log_std = _gaussian(sac, state.weights.policy, normalised)
     unit = jnp.tanh(mean + jnp.exp(log_std) * state.noise)
     assert isinstance(task.action, Continuous)
-    episodes, transition = advance(task, state.episodes, scale_to_range(task.action, unit), key)
+    episodes, transition = experience.advance(
+        task, state.episodes, scale_to_range(task.action, unit), key
+    )
     new = StoredTransitions(
         observation,
         transition.next_observation,
