@@ -279,7 +279,6 @@ def largest_hole(
     **Arguments:**
     - `points`: in the unit cube.
     - `parts`: the prior distributions of their columns.
-    - `seed`: the seed of the probes.
     - `among`: the only points that may be probes, where not all of the cube is allowed.
     """
     from scipy.spatial import KDTree

@@ -195,11 +195,8 @@ class Blocks:
         """Simulate rows of a policy on the host once more.
 
         **Arguments:**
-        - `policy`: its number.
-        - `points`: the points of the rows.
         - `numbers`: the numbers of the simulations, which their random keys come from.
         - `of_attack`: whether they are simulations of the attack, or samples.
-        - `attempt`: number of the repetition.
 
         **Returns:** the least robustness of each, NaN without a verdict; and whether it fails.
         """

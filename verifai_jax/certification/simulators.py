@@ -50,7 +50,6 @@ class Simulator(Protocol):
 
         **Arguments:**
         - `members`: the index in the group of each block's policy.
-        - `points`: the samples of each block.
         - `first`: the number of the first sample of each block, from which its random keys are
           made.
         - `key`: the key of all simulations.

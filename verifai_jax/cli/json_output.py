@@ -72,7 +72,6 @@ def show_result(found: Any, plot: Path | None, *names: str) -> None:
     """Print a result, give it as plain data, and draw it into a file where one is named.
 
     **Arguments:**
-    - `found`: what the Python API returned.
     - `plot`: the file of its picture, whose folder is made; None for no picture.
     - `names`: attributes to give; all fields that its `repr` shows when left out.
     """

@@ -26,7 +26,6 @@ def check_name(
 
     **Arguments:**
     - `what`: what it names, for the message: `the name of a signal`.
-    - `name`: name to check.
     - `lines`: whether it may have line breaks and other control characters.
     - `error`: type of the error to raise.
 
@@ -63,7 +62,6 @@ def check_fraction(
 
     **Arguments:**
     - `name`: name of the argument in the error message.
-    - `value`: value to check.
     - `zero`: whether 0 itself is allowed.
     - `one`: whether 1 itself is allowed.
     - `error`: type of the error to raise.
@@ -87,7 +85,6 @@ def check_positive(
 
     **Arguments:**
     - `name`: name of the argument in the error message.
-    - `value`: value to check.
     - `finite`: whether infinity is refused too.
     - `error`: type of the error to raise.
 

@@ -153,7 +153,6 @@ def printable(text: str, maximum: int | None = None) -> str:
     Line breaks and tabs stay.
 
     **Arguments:**
-    - `text`: the text.
     - `maximum`: characters that are kept, of its begin and its end; all when left out.
     """
     text = text if maximum is None else shorten(text, maximum)

@@ -202,7 +202,6 @@ def slopes_of(
     distribution and little in its middle.
 
     **Arguments:**
-    - `space`: the space of the features.
     - `u`: the point at which the gradient was taken.
     - `gradient`: by the coordinates.
     - `precision`: in which it was taken.

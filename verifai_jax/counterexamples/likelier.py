@@ -41,7 +41,6 @@ def draw_around_elite(candidates: Candidates, rng: np.random.Generator) -> None:
 
     **Arguments:**
     - `candidates`: simulates, and remembers what failed, within its limit.
-    - `rng`: the rng of the samples.
     """
     nominal, fruitless = candidates.nominal, 0
     free = nominal.cube.continuous

@@ -32,7 +32,6 @@ def decide(
 
     **Arguments:**
     - `found`: the rows, all of verdict `raised`; completed in place.
-    - `replayed`: the verdicts of each check.
     - `run`: robustness of the rows in the run, if that is known.
     - `untraceable`: what raised when a check was traced; empty if nothing did.
     - `may_refute`: whether a check simulates more finely than the run.

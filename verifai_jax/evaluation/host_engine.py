@@ -131,7 +131,6 @@ class HostEngine:
 
         **Arguments:**
         - `features`: `[n, ...]` each.
-        - `seeds`: the seeds of the simulations.
         - `keys`: that the seeds are made of, which a system needs that simulates batches.
         """
         with in_precision(self.precision):

@@ -364,7 +364,6 @@ def replay_block(
       made anew.
     - `words`: the two words of the key of the run's simulations.
     - `leaves`: the leaves of the features, `[n, ...]` each.
-    - `numbers`: the numbers of the rows.
 
     **Returns:** `rho`, `status`, `violated` and `messages` of the rows.
     """

@@ -47,7 +47,6 @@ def ends_within(
 
     **Arguments:**
     - `low`, `high`: the ends.
-    - `dtype`: the data type of the precision.
     - `closed`: which ends belong to the intervals, one of `CLOSED`.
     """
     ends = _ends(low, high, np.dtype(dtype), closed)

@@ -42,7 +42,6 @@ def given_features(space: FeatureSpace, rows: Rows, precision: str = "float32") 
     Everything is checked as it was written, in double precision, before it is converted.
 
     **Arguments:**
-    - `space`: the space of the features.
     - `rows`: a DataFrame with the columns of a table, a row of one, or dictionaries (one or
       several) that hold features by name or by the columns of a table.
     - `precision`: `"float32"` or `"float64"`, of their real numbers.
@@ -79,7 +78,6 @@ def given_rows(space: FeatureSpace, features: Mapping[str, Any]) -> Float[np.nda
     """Return rows that an engine simulates with exactly these features.
 
     **Arguments:**
-    - `space`: the space of the features.
     - `features`: `[n, ...]`, as `given_features` gives them.
 
     **Returns:** the points of the unit cube nearest to the features, and after each the real
@@ -101,7 +99,6 @@ def check_columns(
     """Check rows of a table `[n]`, and return their features in double precision.
 
     **Arguments:**
-    - `space`: the space of the features.
     - `columns`: by name; others than those of features are ignored.
     - `held`: whether features that the space holds at one value are checked too.
 

@@ -252,7 +252,6 @@ def read_reqif(path: Path, fields: Sequence[str]) -> list[dict[str, object]]:
     """Read the objects of a ReqIF file.
 
     **Arguments:**
-    - `path`: the path of the file.
     - `fields`: the fields of a requirement; attributes of other names are left out.
 
     **Returns:** a dictionary of texts for each object that has one of the fields. An object without
@@ -334,7 +333,6 @@ def reqif_document(
     **Arguments:**
     - `entries`: texts by field.
     - `fields`: that an object may have.
-    - `title`: the title of the document.
     """
     now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 

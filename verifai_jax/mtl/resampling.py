@@ -181,7 +181,6 @@ def joined(
 
     **Arguments:**
     - `stamps`: times of each clock in seconds, and the instant that they are counted from.
-    - `parts`: the columns of each clock.
     """
     origin = min(start for _, start in stamps)
     clocks = [seconds + float(start - origin) for seconds, start in stamps]

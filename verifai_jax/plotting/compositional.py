@@ -17,11 +17,7 @@ def plot_region(
     """Draw the samples of the region by the least error that fails, and the confirmed failures.
 
     **Arguments:**
-    - `result`: what `vj.perception.abstract` returned.
-    - `path`: file that the picture is written to, if given.
     - `features`: the columns across and up; by default the two that the region depends on most.
-
-    **Returns:** the figure.
 
     **Raises:** `UnknownNameError` for a column that the table has not.
     """

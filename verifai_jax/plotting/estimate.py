@@ -18,9 +18,6 @@ def plot_estimate(estimate: Estimate, path: str | Path | None = None) -> Figure:
 
     **Arguments:**
     - `estimate`: the estimate; levels and weights are drawn where it has any.
-    - `path`: file that the picture is written to, if given.
-
-    **Returns:** the figure.
     """
     levels = estimate.diagnostics.get("levels") or []
     weights = estimate.drawn.get("weights")

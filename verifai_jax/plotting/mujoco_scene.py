@@ -51,8 +51,6 @@ def film(
     """Write an animated GIF, in real time where its frames are not too many.
 
     **Arguments:**
-    - `motion`: what `record` returned.
-    - `path`: the path of the file; folders are made.
     - `size`: width and height in pixels; `SIZE` when left out.
     - `camera`: as for `frames`.
     - `fps`: frames a second; `FRAMES_PER_SECOND` when left out.
@@ -86,8 +84,6 @@ def strip(
     Those of a failure close in on the sample that decided it.
 
     **Arguments:**
-    - `motion`: what `record` returned.
-    - `path`: the path of the file; folders are made.
     - `count`: instants.
     - `size`: width and height of each in pixels.
     - `camera`: as for `frames`.
@@ -124,7 +120,6 @@ def frames(
     """Draw the motion at some samples.
 
     **Arguments:**
-    - `motion`: what `record` returned.
     - `samples`: their numbers.
     - `size`: width and height in pixels.
     - `camera`: the name of one of the model's; when left out, the one that sees best what moves
@@ -301,7 +296,6 @@ def best_view(motion: Motion, draw: Callable[..., Any], size: tuple[int, int]) -
     """Return the camera that sees best what moves.
 
     **Arguments:**
-    - `motion`: the motion of the model.
     - `draw`: what `mujoco_scene.canvas` gives, for pictures of this `size`.
     """
     mujoco = require("mujoco", extra="mujoco")

@@ -55,11 +55,7 @@ def plot_replay(
     (`vj.Signal`), then the others, as many as there is room for.
 
     **Arguments:**
-    - `replay`: what `run.replay` returned.
-    - `path`: file that the picture is written to, if given.
     - `signals`: the signals and Signal features to draw, in this order; chosen when left out.
-
-    **Returns:** the figure.
 
     **Raises:** `UnknownNameError` for a signal that does not exist; `ValueError` for none.
     """

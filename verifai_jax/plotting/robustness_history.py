@@ -22,10 +22,7 @@ def plot_robustness_history(
 
     **Arguments:**
     - `run`: a run, or runs by the label that the legend gives them.
-    - `path`: file that the picture is written to, if given.
     - `axes`: to draw into; those of a new figure when left out.
-
-    **Returns:** the figure.
     """
     runs = {"": run} if isinstance(run, Run) else run
     given: Any = axes

@@ -28,12 +28,8 @@ def plot_features(
     those without a verdict are grey crosses.
 
     **Arguments:**
-    - `run`: what `falsify` returned.
-    - `path`: file that the picture is written to, if given.
     - `features`: names; by default the `maximum` that distinguish failing from safe samples best.
     - `maximum`: features at most, where they are not named.
-
-    **Returns:** the figure.
 
     **Raises:** `UnknownNameError` for a feature that is not in the table.
     """

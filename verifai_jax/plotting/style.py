@@ -82,7 +82,6 @@ def name_points(
     A name that has no room at its point is moved up or down, and a line joins the two.
 
     **Arguments:**
-    - `axes`: with the points.
     - `names`: the names of the points at `x` and `y`, in the units of the data.
     - `low`, `high`: ends of a horizontal bar at each point, on which no name lies.
     """

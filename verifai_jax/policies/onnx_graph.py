@@ -179,7 +179,6 @@ def read_onnx(
 
     **Arguments:**
     - `path`: the path of the file, next to which tensors may be kept; None for bytes alone.
-    - `data`: the model.
     - `what`: its name, for errors.
     - `output`: name of the output that is meant, of several.
     - `memory`: `{input: output}` of what the network remembers; found by the shapes where None.

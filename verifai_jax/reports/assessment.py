@@ -100,7 +100,6 @@ def claims_tree(subject: str, headline: str, claims: Sequence[Mapping[str, Any]]
     """Draw the tree: the headline, the strategy, and a row for each claim.
 
     **Arguments:**
-    - `subject`: what the claims are about, the context.
     - `headline`: the goal at the root.
     - `claims`: as plain data.
     """

@@ -36,8 +36,6 @@ def claims_json(
     """Describe claims as plain data.
 
     **Arguments:**
-    - `subject`: what the claims are about.
-    - `claims`: the claims.
     - `chain`: last hash of the chain over all inputs of the report.
     - `about`: what `vj.trace_matrix` compares with what there is later, see `about_json`.
     """

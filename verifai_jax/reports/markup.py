@@ -51,8 +51,6 @@ def element(tag: str, *children: Child, **attributes: str | int | None) -> Marku
     """Return an element.
 
     **Arguments:**
-    - `tag`: its name.
-    - `children`: its content.
     - `attributes`: by name; `class_` is `class`, `aria_label` is `aria-label`, None is left out.
     """
     words = [
@@ -110,7 +108,6 @@ def picture(content: bytes, alternative: str, caption: str = "", kind: str = "pn
     """Return a figure with a picture inside of the page.
 
     **Arguments:**
-    - `content`: the content of the file.
     - `alternative`: text for readers who cannot see the picture.
     - `caption`: below it; the words again when left out.
     - `kind`: `"png"` or `"gif"`.

@@ -88,8 +88,6 @@ def run_page(
     """Make the report on a run.
 
     **Arguments:**
-    - `run`: the run.
-    - `about`: units and reasons of the features.
     - `traces`, `studies`, `modes`: as in `write_report`.
     - `words`: further ones of the command that builds the report again; None if there is no command
       for all of it.

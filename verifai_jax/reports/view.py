@@ -145,7 +145,6 @@ def trace_data(replay: Replay, label: str = "") -> dict[str, Any]:
     """Describe the trace of a replay: the signals of its formulas, their bounds, the instant.
 
     **Arguments:**
-    - `replay`: the replay.
     - `label`: words for the list of traces; the number of the row when left out.
     """
     trace, problem = replay.trace, replay.problem
@@ -190,7 +189,6 @@ def rows_to_trace(run: Run, maximum: int, first: Sequence[int] = ()) -> dict[int
     The worst ones that are claimed, those nearest to the bound on either side, those not claimed.
 
     **Arguments:**
-    - `run`: a run.
     - `maximum`: rows at most.
     - `first`: rows that come first, such as the failures that a report shows.
     """

@@ -32,7 +32,6 @@ def owner_names(
     **Arguments:**
     - `scenario`: Scenic's.
     - `variables`: names of variables by the identity of what they hold.
-    - `order`: random nodes.
     """
     owners: list[Any] = []
     random_owners = [node for node in order if is_constructed(node)]

@@ -22,7 +22,6 @@ def fingerprint(study: Study, options: Mapping[str, Any]) -> dict[str, Any]:
     Code is described by its name only.
 
     **Arguments:**
-    - `study`: the study that is swept.
     - `options`: options of the sweep, as plain data.
 
     **Returns:** nested dictionaries of plain data.

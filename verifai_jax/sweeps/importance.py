@@ -203,7 +203,6 @@ def hyperparameter_importance(
     - `hyperparameters`: names of their columns; those that do not vary are left out. `steps` is
       one of them where it varies.
     - `space`: the space of the study; None scales columns between their least and greatest entries.
-    - `name`: the name of the study.
     - `repeats`: number of times that the folds are drawn and each column is shuffled.
     - `seed`: the seed of folds, shuffles and forests.
     """

@@ -61,9 +61,7 @@ def make_proposer(
 
     **Arguments:**
     - `search`: a name, `"optuna:NAME"`, a `Search`, or an `OptunaSampler`.
-    - `space`: the space of the hyper-parameters.
     - `configurations`: number of proposals in all.
-    - `seed`: the seed of the proposals.
     - `batch`: configurations in a round.
 
     **Returns:** the proposer.

@@ -69,7 +69,6 @@ def write_sweep(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> Pat
     """Write a sweep to a folder, in place of one that it may hold.
 
     **Arguments:**
-    - `stored`: the sweep.
     - `table`: its table, the columns of the record.
     - `folder`: the folder; it is created.
 
@@ -167,7 +166,6 @@ def read_sweep(description: Mapping[str, Any], folder: Path) -> StoredSweep:
 
     **Arguments:**
     - `description`: the description of the folder, as `read_description` returns it.
-    - `folder`: the folder.
 
     **Raises:** `SweepFileError` where a file is missing or damaged.
     """

@@ -282,10 +282,7 @@ class Evidence:
         """Yield sentences on what has changed since.
 
         **Arguments:**
-        - `name`: the name of the formula.
-        - `formula`: its text now.
         - `about`: what it stands for now.
-        - `model`: the model of the problem now.
         """
         if (was := self.formulas[name]) != formula:
             yield f"{name}: the formula has changed since {self.name}: {was} then, {formula} now"

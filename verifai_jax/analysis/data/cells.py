@@ -64,7 +64,6 @@ def count_occupied(
     """Count the cells that have rows in them.
 
     **Arguments:**
-    - `n`: number of rows.
     - `rows`: the features in cells.
     - `allowed`: samples of the prior in the same cells, where it is not uniform on all of them:
       cells in which none of them lies do not count.

@@ -43,7 +43,6 @@ def check_space(space: Space, name: str, delayed: bool) -> None:
     """Refuse an action space for which no action can be checked, before anything is simulated.
 
     **Arguments:**
-    - `name`: the name of the environment.
     - `delayed`: whether actions arrive late, so that one has to stand for none.
 
     **Raises:** `ValueError`.
