@@ -22,7 +22,16 @@ Command = TypeVar("Command", bound=Callable[..., object])
 COMMON = ("as_json", "pictures", "progress", "keep_going")
 """Options about what a command prints and draws, and whether it goes on, not about its result."""
 
-RUN = click.argument("folder", metavar="RUN", type=click.Path(path_type=Path))
+PATH = click.Path(path_type=Path)
+"""A file or a folder, which need not exist."""
+
+
+def option(*names: str, **settings: Any) -> Callable[[Command], Command]:
+    """Return an option of a command; its help shows the default where there is one."""
+    return click.option(*names, show_default=settings.get("default") is not None, **settings)
+
+
+RUN = click.argument("folder", metavar="RUN", type=PATH)
 """The run folder that a command reads."""
 
 ROW = click.argument("row", type=int, required=False)
@@ -31,7 +40,7 @@ ROW = click.argument("row", type=int, required=False)
 TARGET = click.argument("target")
 """The problem, as FILE.py:NAME."""
 
-PROBLEM = click.option(
+PROBLEM = option(
     "--problem",
     "target",
     metavar="FILE.py:NAME",
@@ -39,27 +48,18 @@ PROBLEM = click.option(
 )
 """The problem of a run that does not record one of this project."""
 
-FOLDER = click.option(
-    "--folder",
-    "into",
-    type=click.Path(path_type=Path),
-    help="Folder to write to  [default: the run's]",
-)
+FOLDER = option("--folder", "into", type=PATH, help="Folder to write to  [default: the run's]")
 """Where a command that reads a run writes."""
 
-RUN_FOLDER = click.option(
-    "--folder",
-    type=click.Path(path_type=Path),
-    help="Run folder to write  [default: runs/NAME-1, -2, ...]",
+RUN_FOLDER = option(
+    "--folder", type=PATH, help="Run folder to write  [default: runs/NAME-1, -2, ...]"
 )
 """Where a command that makes a run writes it."""
 
-PICTURES = click.option(
-    "--pictures/--no-pictures", default=True, show_default=True, help="Draw pictures."
-)
+PICTURES = option("--pictures/--no-pictures", default=True, help="Draw pictures.")
 """Pictures can be left out."""
 
-KEEP_GOING = click.option(
+KEEP_GOING = option(
     "--keep-going", is_flag=True, help="Simulate on where all of the first simulations raise."
 )
 PROGRESS = click.option(
@@ -67,76 +67,64 @@ PROGRESS = click.option(
 )
 """The progress bar can be forced or left out."""
 
-SEED = click.option("--seed", type=int, default=0, show_default=True, help="Seed of all chance.")
+SEED = option("--seed", default=0, help="Seed of all chance.")
 """The seed of everything random in a command."""
 
 
-ONLY = click.option(
+ONLY = option(
     "--only",
     metavar="NAMES",
     help="Features to vary, comma-separated; the others stay at their nominal values.",
 )
 """Features that vary."""
 
-BATCH = click.option("--batch", type=int, help="Simulations per call  [default: chosen]")
+BATCH = option("--batch", type=int, help="Simulations per call  [default: chosen]")
 """Simulations per call of the simulator."""
 
-MAX_SECONDS = click.option(
-    "--max-seconds", type=float, help="Seconds at most, compilation included."
-)
+MAX_SECONDS = option("--max-seconds", type=float, help="Seconds at most, compilation included.")
 """A limit of time."""
 
-STOP_AFTER = click.option("--stop-after", type=int, help="Stop at that many counterexamples.")
+STOP_AFTER = option("--stop-after", type=int, help="Stop at that many counterexamples.")
 """A number of failures that ends a run."""
 
-PRECISION = click.option(
-    "--precision", type=click.Choice(["float32", "float64"]), default="float32", show_default=True
-)
+PRECISION = option("--precision", type=click.Choice(["float32", "float64"]), default="float32")
 """Floating-point numbers of the simulations."""
 
-BACKEND = click.option(
-    "--backend", help="mjx or native, for a MuJoCo model  [default: the faster one]"
-)
+BACKEND = option("--backend", help="mjx or native, for a MuJoCo model  [default: the faster one]")
 """Simulator of a system that has several."""
 
-ENGINE = click.option(
+ENGINE = option(
     "--engine",
     type=click.Choice(["auto", "xla", "native"]),
     default="auto",
-    show_default=True,
     help="native: code by this machine's C++ compiler, auto: for many simulations.",
 )
 """What a traced system is compiled by."""
 
-CLUSTER = click.option(
+CLUSTER = option(
     "--cluster",
     metavar="ADDRESS",
     help="Simulate on a cluster: dask://HOST:PORT, ray://HOST:PORT or slurm.",
 )
 """A cluster whose workers do the work."""
 
-PLOT = click.option(
-    "--plot", type=click.Path(path_type=Path), metavar="PNG", help="Draw the result into a PNG."
-)
+PLOT = option("--plot", type=PATH, metavar="PNG", help="Draw the result into a PNG.")
 """File of the one picture of a result."""
 
-PROVED = click.option(
+PROVED = option(
     "--proved",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="JSON",
     help="What verify wrote with --into: spend nothing on what it proved.",
 )
 """File of a verification."""
 
-REPORT = click.option(
-    "--report",
-    type=click.Path(path_type=Path),
-    metavar="HTML",
-    help="Write the evidence report into an HTML file.",
+REPORT = option(
+    "--report", type=PATH, metavar="HTML", help="Write the evidence report into an HTML file."
 )
 """File of the evidence report on a result."""
 
-ERRORS = click.option(
+ERRORS = option(
     "--errors",
     type=click.IntRange(1),
     metavar="PAIRS",
@@ -144,24 +132,22 @@ ERRORS = click.option(
 )
 """Simulations by which the parts of an error are measured."""
 
-ODD = click.option(
+ODD = option(
     "--odd",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="YAML",
     help="The operational design domain, a file of OpenODD: say what is covered of it.",
 )
 """The file of a domain."""
 
-EVEN_IF_CHANGED = click.option(
+EVEN_IF_CHANGED = option(
     "--even-if-changed",
     is_flag=True,
     help="The model was changed on purpose: go on with it, and note what differs.",
 )
 """For commands that go on with what another model may have simulated."""
 
-SET = click.option(
-    "--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search."
-)
+SET = option("--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search.")
 """Options of a search that is given by name."""
 
 
@@ -177,25 +163,18 @@ def all_of(*decorators: Callable[[Any], Any]) -> Callable[[Command], Command]:
 
 
 PARAMETER_CHOICE = all_of(
-    click.option(
+    option(
         "--aim",
         type=click.Choice(("robustness", "probability")),
         default="robustness",
-        show_default=True,
         help="Robustness against an attack, or the least failure probability.",
     ),
-    click.option("--margin", type=float, default=0.0, show_default=True, help="Robustness wanted."),
-    click.option(
-        "--attack", default="cross_entropy", show_default=True, help="Search that attacks."
-    ),
-    click.option(
-        "--held-out", type=int, default=2000, show_default=True, help="Simulations of the result."
-    ),
-    click.option(
+    option("--margin", default=0.0, help="Robustness wanted."),
+    option("--attack", default="cross_entropy", help="Search that attacks."),
+    option("--held-out", default=2000, help="Simulations of the result."),
+    option(
         "--mass",
-        type=float,
         default=0.999,
-        show_default=True,
         help="Probability of the part of the prior that is attacked; 1 for all of it.",
     ),
     click.option(
@@ -211,8 +190,8 @@ PARAMETER_CHOICE = all_of(
 
 
 NAMES = all_of(
-    click.option("--const", "constants", multiple=True, metavar="NAME=NUMBER"),
-    click.option("--define", "definitions", multiple=True, metavar="NAME=FORMULA"),
+    option("--const", "constants", multiple=True, metavar="NAME=NUMBER"),
+    option("--define", "definitions", multiple=True, metavar="NAME=FORMULA"),
 )
 """Names that a formula may use."""
 

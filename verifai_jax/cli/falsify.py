@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from verifai_jax.cli import arguments
+from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.exit_codes import BROKEN, INTERRUPTED, CommandError
 from verifai_jax.cli.gates import RATE, Gate, check_gate, exceeds, fail_on
 from verifai_jax.cli.json_output import command, describe_run, give_result
@@ -34,20 +35,20 @@ _PARTS = (
 
 @command()
 @click.argument("target", required=False)
-@click.option("--search", help="Name of the search  [default: auto]")
+@option("--search", help="Name of the search  [default: auto]")
 @arguments.SET
-@click.option("--budget", type=int, help="Simulations at most  [default: 10000]")
+@option("--budget", type=int, help="Simulations at most  [default: 10000]")
 @arguments.BATCH
 @arguments.SEED
 @arguments.ONLY
 @arguments.MAX_SECONDS
 @arguments.STOP_AFTER
-@click.option("--within", type=float, help="Stop when the failure rate is known as closely.")
-@click.option("--decide", type=float, help="Stop when the rate is clearly above or below this.")
-@click.option("--warm-start", type=click.Path(path_type=Path), help="Run to learn from first.")
-@click.option(
+@option("--within", type=float, help="Stop when the failure rate is known as closely.")
+@option("--decide", type=float, help="Stop when the rate is clearly above or below this.")
+@option("--warm-start", type=PATH, help="Run to learn from first.")
+@option(
     "--resume",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Run folder to go on with; with a larger --budget the run of that budget and this batch.",
 )
 @arguments.EVEN_IF_CHANGED
@@ -56,7 +57,7 @@ _PARTS = (
 @arguments.ENGINE
 @arguments.CLUSTER
 @arguments.PROVED
-@click.option(
+@option(
     "--shard",
     metavar="I/N",
     help="Simulate part I of N alone, as a job of an array; merge makes the run of them.",
@@ -66,17 +67,16 @@ _PARTS = (
     default=True,
     help="Claim only what closer replays confirm  [default: confirm]",
 )
-@click.option("--diverse", is_flag=True, help="Look for failures of different kinds.")
-@click.option(
+@option("--diverse", is_flag=True, help="Look for failures of different kinds.")
+@option(
     "--diverse-by",
     type=click.Choice(["inputs", "behaviour"]),
     help="Of kinds that differ in this  [default: inputs]",
 )
-@click.option(
+@option(
     "--objective",
     type=click.Choice(["robustness", "likelihood"]),
     default="robustness",
-    show_default=True,
     help="Failures that break the property by most, or the likeliest.",
 )
 @arguments.RUN_FOLDER

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from verifai_jax.cli.arguments import option
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.json_output import give_result
 from verifai_jax.core.text import printable
@@ -22,12 +23,12 @@ Command = TypeVar("Command", bound=Callable[..., object])
 def fleet_options(command: Command) -> Command:
     """Add the options of many requirements on many recordings."""
     files = click.Path(path_type=Path, dir_okay=False)
-    for option in (
+    for each in (
         click.option("--jobs", type=click.IntRange(1), default=1, help="Processes that judge."),
-        click.option("--junit", type=files, help="File of the verdicts as JUnit XML."),
-        click.option("--report", type=files, help="HTML file of the report."),
+        option("--junit", type=files, help="File of the verdicts as JUnit XML."),
+        option("--report", type=files, help="HTML file of the report."),
     ):
-        command = option(command)
+        command = each(command)
     return command
 
 
