@@ -41,7 +41,6 @@ FAR = 2.0
 """Greatest robustness that learners see, in medians of its size."""
 NEAR = 0.99
 """Share of the rows that have another row within the reach of one."""
-
 Points = pd.DataFrame | Mapping[str, Any]
 Matrix = Float[np.ndarray, "n d"]
 Margin = Float[np.ndarray, " n"]

@@ -58,7 +58,6 @@ class Coverage(Drawn, InNotebook):
 
     _picture = "coverage", "plot_coverage"
     """How often each cell is occupied, and the least occupied pair."""
-
     table: pd.DataFrame
     untried: pd.DataFrame
     untried_count: int

@@ -36,7 +36,6 @@ class Diverse(Drawn, InNotebook):
 
     _picture = "clusters", "plot_diverse"
     """The rows among all, in their order, and the distances."""
-
     samples: Samples
     rows: Int[np.ndarray, " k"]
     distances: Float[np.ndarray, " k"]

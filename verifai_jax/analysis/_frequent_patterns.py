@@ -56,7 +56,6 @@ class FrequentPatterns(Drawn, InNotebook):
 
     _picture = "frequent_patterns", "plot_frequent_patterns"
     """The shares of the most distinctive combinations, and those expected."""
-
     samples: Samples
     items: tuple[Item, ...]
     combinations: tuple[tuple[int, ...], ...]

@@ -50,7 +50,6 @@ class Importance(Drawn, InNotebook):
 
     _picture = "overview", "plot_importance"
     """The losses as bars."""
-
     table: pd.DataFrame
     scores: dict[str, float]
     missing: dict[str, str]

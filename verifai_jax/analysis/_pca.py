@@ -67,7 +67,6 @@ class Components(Drawn, InNotebook):
 
     _picture = "pca", "plot_components"
     """The rows along the first two components, and the loadings."""
-
     samples: Samples
     pivot: Float[np.ndarray, " k"]
     directions: Float[np.ndarray, "m k"]

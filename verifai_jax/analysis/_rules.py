@@ -94,7 +94,6 @@ class Rules(Drawn, InNotebook):
 
     _picture = "panels", "plot_rules"
     """The rules over the two features that they use most."""
-
     rules: tuple[Rule, ...]
     coverage: float
     precision: Rate | None

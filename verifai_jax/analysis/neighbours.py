@@ -50,7 +50,6 @@ class Neighbours(Drawn, InNotebook):
 
     _picture = "clusters", "plot_neighbours"
     """The rows among the others, over the two features that vary most."""
-
     samples: Samples
     rows: Int[np.ndarray, " k"]
     distances: Float[np.ndarray, " k"]

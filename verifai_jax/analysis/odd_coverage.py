@@ -31,7 +31,6 @@ MAX_CELLS = 2**30
 """Cells of an attribute at most, for which a pair of cells is one number."""
 CANDIDATES = 4096
 """Points of the domain among which the next ones are chosen."""
-
 Codes = dict[str, np.ndarray]
 """The cell of each row by attribute; -1 outside."""
 

@@ -74,7 +74,6 @@ class Analysis(Drawn):
     _picture = "overview", "plot_overview"
     """The failures over the two most important features, with the boxes of the rules, the
     representatives of clusters, and the importances as bars."""
-
     name: str
     parts: tuple[Part, ...]
     samples: Samples | None

@@ -34,7 +34,6 @@ Labels: TypeAlias = PyTree
 """Labels of inputs, each leaf with a leading axis `[n]`."""
 Transformation: TypeAlias = Callable[[Inputs, Labels, Key[Array, ""]], tuple[Inputs, Labels]]
 """A transformation of labelled inputs that keeps the labels true, or corrects them."""
-
 MARGIN = "margin"
 """Signal of the problem of a network: minus the wrongness."""
 _RESERVED = (*RESERVED, "arm", "seed", "wrongness")

@@ -45,7 +45,6 @@ MAX_KEPT = 1000
 """Counterexamples of a policy that are kept, the worst ones."""
 ROWS = 256
 """Rows whose features are computed at a time, so that one shape compiles."""
-
 ProgressReport = Callable[[int, int, str], None]
 
 

@@ -37,7 +37,6 @@ from verifai_jax.search.uniform import uniform_points
 
 Arrays = Mapping[str, np.ndarray]
 Remember = Callable[[str, Callable[[], dict[str, np.ndarray]]], Arrays]
-
 STREAM = 0x5AFE
 """Sets the random numbers of a certificate apart from those of a training with the same seed."""
 DRAWN = 4096

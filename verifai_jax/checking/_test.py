@@ -25,7 +25,6 @@ from verifai_jax.search import Search
 
 MARK = "verifai_jax_check"
 """Attribute of a test function by which the pytest plugin knows it."""
-
 TESTED = "verifai_jax_problem"
 """Attribute of a test function with its problem, or the name of it."""
 

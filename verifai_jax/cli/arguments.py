@@ -16,12 +16,9 @@ from verifai_jax.cli.exit_codes import BROKEN, CommandError
 if TYPE_CHECKING:
     from verifai_jax import Problem, Run
     from verifai_jax.core.executors import Executor
-
 Command = TypeVar("Command", bound=Callable[..., object])
-
 COMMON = ("as_json", "pictures", "progress", "keep_going")
 """Options about what a command prints and draws, and whether it goes on, not about its result."""
-
 PATH = click.Path(path_type=Path)
 """A file or a folder, which need not exist."""
 
@@ -33,13 +30,10 @@ def option(*names: str, **settings: Any) -> Callable[[Command], Command]:
 
 RUN = click.argument("folder", metavar="RUN", type=PATH)
 """The run folder that a command reads."""
-
 ROW = click.argument("row", type=int, required=False)
 """A row of its table."""
-
 TARGET = click.argument("target")
 """The problem, as FILE.py:NAME."""
-
 PROBLEM = option(
     "--problem",
     "target",
@@ -47,18 +41,14 @@ PROBLEM = option(
     help="Problem of the run  [default: the one it records]",
 )
 """The problem of a run that does not record one of this project."""
-
 FOLDER = option("--folder", "into", type=PATH, help="Folder to write to  [default: the run's]")
 """Where a command that reads a run writes."""
-
 RUN_FOLDER = option(
     "--folder", type=PATH, help="Run folder to write  [default: runs/NAME-1, -2, ...]"
 )
 """Where a command that makes a run writes it."""
-
 PICTURES = option("--pictures/--no-pictures", default=True, help="Draw pictures.")
 """Pictures can be left out."""
-
 KEEP_GOING = option(
     "--keep-going", is_flag=True, help="Simulate on where all of the first simulations raise."
 )
@@ -66,33 +56,24 @@ PROGRESS = click.option(
     "--progress/--no-progress", default=None, help="Show a progress bar  [default: on a terminal]"
 )
 """The progress bar can be forced or left out."""
-
 SEED = option("--seed", default=0, help="Seed of all chance.")
 """The seed of everything random in a command."""
-
-
 ONLY = option(
     "--only",
     metavar="NAMES",
     help="Features to vary, comma-separated; the others stay at their nominal values.",
 )
 """Features that vary."""
-
 BATCH = option("--batch", type=int, help="Simulations per call  [default: chosen]")
 """Simulations per call of the simulator."""
-
 MAX_SECONDS = option("--max-seconds", type=float, help="Seconds at most, compilation included.")
 """A limit of time."""
-
 STOP_AFTER = option("--stop-after", type=int, help="Stop at that many counterexamples.")
 """A number of failures that ends a run."""
-
 PRECISION = option("--precision", type=click.Choice(["float32", "float64"]), default="float32")
 """Floating-point numbers of the simulations."""
-
 BACKEND = option("--backend", help="mjx or native, for a MuJoCo model  [default: the faster one]")
 """Simulator of a system that has several."""
-
 ENGINE = option(
     "--engine",
     type=click.Choice(["auto", "xla", "native"]),
@@ -100,17 +81,14 @@ ENGINE = option(
     help="native: code by this machine's C++ compiler, auto: for many simulations.",
 )
 """What a traced system is compiled by."""
-
 CLUSTER = option(
     "--cluster",
     metavar="ADDRESS",
     help="Simulate on a cluster: dask://HOST:PORT, ray://HOST:PORT or slurm.",
 )
 """A cluster whose workers do the work."""
-
 PLOT = option("--plot", type=PATH, metavar="PNG", help="Draw the result into a PNG.")
 """File of the one picture of a result."""
-
 PROVED = option(
     "--proved",
     type=PATH,
@@ -118,12 +96,10 @@ PROVED = option(
     help="What verify wrote with --into: spend nothing on what it proved.",
 )
 """File of a verification."""
-
 REPORT = option(
     "--report", type=PATH, metavar="HTML", help="Write the evidence report into an HTML file."
 )
 """File of the evidence report on a result."""
-
 ERRORS = option(
     "--errors",
     type=click.IntRange(1),
@@ -131,7 +107,6 @@ ERRORS = option(
     help="Say how wrong the number can be, by so many pairs of simulations for each part.",
 )
 """Simulations by which the parts of an error are measured."""
-
 ODD = option(
     "--odd",
     type=PATH,
@@ -139,14 +114,12 @@ ODD = option(
     help="The operational design domain, a file of OpenODD: say what is covered of it.",
 )
 """The file of a domain."""
-
 EVEN_IF_CHANGED = option(
     "--even-if-changed",
     is_flag=True,
     help="The model was changed on purpose: go on with it, and note what differs.",
 )
 """For commands that go on with what another model may have simulated."""
-
 SET = option("--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search.")
 """Options of a search that is given by name."""
 
@@ -187,8 +160,6 @@ PARAMETER_CHOICE = all_of(
     BACKEND,
 )
 """Options of `synthesize` and `repair`: keywords of both functions."""
-
-
 NAMES = all_of(
     option("--const", "constants", multiple=True, metavar="NAME=NUMBER"),
     option("--define", "definitions", multiple=True, metavar="NAME=FORMULA"),

@@ -19,8 +19,6 @@ from verifai_jax.cli.next_folder import given_or_next
 if TYPE_CHECKING:
     from verifai_jax import Decided, Problem, Run, Within
     from verifai_jax.search import Search
-
-
 _RESUMES = (
     *("resume", "target", "only", "budget", "max_seconds", "stop_after", "within", "decide"),
     *("even_if_changed", "cluster", "fail_on"),
@@ -115,7 +113,6 @@ def falsify(
 
     if pictures:
         while_compiling(figure.load)
-
     stop_when = _stopping_rule(within, decide)
     if shard is not None:
         arguments.refuse_others(_PARTS, "needs all rows of a run; --shard has a part")

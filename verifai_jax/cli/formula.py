@@ -13,12 +13,9 @@ from verifai_jax.cli.monitor_fleet import load_requirements
 
 if TYPE_CHECKING:
     from verifai_jax import Formula
-
 End = Literal["hold", "truncate"]
-
 FILES = click.argument("recordings", metavar="[RECORDING]...", nargs=-1, type=PATH)
 """Recordings: files, or folders of them."""
-
 ASKED = arguments.all_of(
     option("--problem", metavar="FILE.py:NAME", help="A problem, instead of recordings."),
     option(

@@ -18,7 +18,6 @@ from verifai_jax.cli.json_output import give_result
 from verifai_jax.core.errors import nearest_names
 
 Command = TypeVar("Command", bound=Callable[..., object])
-
 RATE = "rate"
 """Name of the gate with a bound."""
 

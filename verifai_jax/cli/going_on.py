@@ -21,7 +21,6 @@ from verifai_jax.cli.json_output import as_plain
 
 if TYPE_CHECKING:
     from verifai_jax.evaluation.unfinished import Unfinished
-
 WORDS = "verifai_jax.words"
 """Entry of a context that has the words of the command line."""
 FOLDER = Path("runs") / "unfinished"

@@ -179,7 +179,5 @@ def main(traceback: bool) -> None:
 for _command in COMMANDS:
     _command.epilog = EPILOG
     main.add_command(_command)
-
-
 if __name__ == "__main__":
     main(prog_name="verifai-jax")

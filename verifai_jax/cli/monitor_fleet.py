@@ -16,7 +16,6 @@ from verifai_jax.core.text import printable
 
 if TYPE_CHECKING:
     from verifai_jax.mtl import Judgement, Requirement
-
 Command = TypeVar("Command", bound=Callable[..., object])
 
 

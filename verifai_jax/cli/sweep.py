@@ -17,7 +17,6 @@ from verifai_jax.cli.next_folder import given_or_next
 
 if TYPE_CHECKING:
     from verifai_jax import Sweep
-
 _RESUMES = (
     *("resume", "target", "configurations", "max_seconds", "cache", "even_if_changed", "cluster"),
     "fail_on",

@@ -34,7 +34,6 @@ from verifai_jax.search.proposals import Proposals
 from verifai_jax.search.uniform import Uniform
 
 Made: TypeAlias = Problem | Callable[[Any], Problem]
-
 NUDGE = 2.0**-22
 """Part of the cube by which a sample is moved to see how rounding grows: the rounding of a feature
 in single precision. Simulations run in double precision, whose own rounding is far smaller."""

@@ -18,7 +18,6 @@ from verifai_jax.statistics.paired_rates import PairedRates
 
 if TYPE_CHECKING:
     import pandas as pd
-
 WORSE, BETTER, SAME, UNDECIDED = "worse", "better", "the same", "undecided"
 """Verdicts on the second of two problems."""
 

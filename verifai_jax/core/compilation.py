@@ -30,31 +30,25 @@ XlaOptimization = Literal["most", "little", "least"]
 """How much XLA does to make a program fast on a processor. `little` computes what `most` does, on
 some processors to the last bit, in programs without long chains of products and sums; `least`
 rounds each product."""
-
 _OPTIONS: dict[XlaOptimization, dict[str, Any]] = {
     "most": {},
     "little": {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1},
     "least": {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0},
 }
-
 _WHOLE_LOOPS = {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
 """Without the pass that splits a loop over cores: each time it is waited for takes longer than a
 step of a simulation."""
 _WIDE = {"xla_cpu_prefer_vector_width": 512}
 """The widest vectors of any processor, of which XLA takes half by itself: with them simulations ran
 up to 1.25 times as fast."""
-
 _running: dict[int, tuple[str, float]] = {}
 """What is being compiled: a name for people, and when it began."""
 _lock = threading.Lock()
-
 _waited = 0.0
 """Seconds that this process has waited for programs."""
-
 LONG = 0.4
 """Seconds of waiting for a program, from which on work is done that is needed later only: it would
 delay a result for which programs need but be loaded."""
-
 _meanwhile: dict[Callable[[], object], float] = {}
 """What is done at the next wait for a program, and after how many seconds of it."""
 

@@ -38,7 +38,6 @@ class Events:
 
     # JAX rebuilds the class with placeholders and with batches, which have other shapes.
     __no_type_check__ = True
-
     kinds: Int[Array | np.ndarray, " slots"]
     waits: Float[Array | np.ndarray, " slots"]
     parameters: dict[str, Any]

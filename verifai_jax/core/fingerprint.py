@@ -36,8 +36,6 @@ _CUSTOM = ("custom_jvp_call", "custom_vjp_call")
 """Primitives of functions that bring their own derivative."""
 _NAMED = ("UnspecifiedValue", "PRNGImpl", "Mesh", "AbstractMesh", "PyTreeDef", "Device", "FTTuple")
 """Classes of JAX whose text says all of them; the last one groups the operands of a loop (0.12)."""
-
-
 _ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")
 """Addresses in memory, which differ between processes."""
 

@@ -6,7 +6,6 @@ from typing import Any, TypeVar
 from jax.extend.core import Literal
 
 V = TypeVar("V")
-
 CALLS = frozenset({
     "checkpoint", "closed_call", "core_call", "custom_vmap_call", "jit", "pjit", "remat", "remat2",
 })  # fmt: skip

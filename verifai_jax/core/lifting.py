@@ -20,7 +20,6 @@ from jaxtyping import Array, Float
 
 CAPACITY = 256
 """Numbers of a program that are lifted; further ones stay constants."""
-
 T = TypeVar("T")
 
 

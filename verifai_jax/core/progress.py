@@ -29,15 +29,12 @@ from verifai_jax.core.text import printable
 if TYPE_CHECKING:
     from rich.progress import Progress, Task, TaskID
     from rich.text import Text
-
 P = ParamSpec("P")
 R = TypeVar("R")
-
 EVERY = 60.0
 """Seconds between two lines where nothing is drawn."""
 MOMENT = 2.0
 """Seconds after which work is worth going on with: what takes less is as soon done anew."""
-
 _ongoing: ContextVar["ProgressBar | None"] = ContextVar("ongoing", default=None)
 """The bar of the verb that was called; the others within it show themselves there."""
 

@@ -29,7 +29,6 @@ _CODE = (".py", ".pyc", ".so", ".pyd", ".pth")
 """Endings of files that are imported; those have records of their own."""
 _OPENS = ("open", "sqlite3.connect", "ctypes.dlopen")
 """Events of Python by which a file is opened."""
-
 _read: dict[str, set[str]] = {}
 _loaded: dict[str, set[str]] = {}
 _watching = False

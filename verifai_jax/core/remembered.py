@@ -29,10 +29,8 @@ from verifai_jax.core.fingerprint import identity
 
 MAX_BYTES = 64 * 2**20
 """Size of a program that is kept at most."""
-
 SEAL = 32
 """Bytes of the checksum in front of a program."""
-
 _SETTINGS = (
     "jax_enable_x64",
     "jax_default_matmul_precision",

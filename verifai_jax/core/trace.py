@@ -29,14 +29,11 @@ from verifai_jax.core.text import format_seconds
 
 if TYPE_CHECKING:
     import pandas as pd
-
 Samples: TypeAlias = (
     Real[Array | np.ndarray | jax.ShapeDtypeStruct, "time *k"]
     | Bool[Array | np.ndarray | jax.ShapeDtypeStruct, "time *k"]
 )
 """A signal or its form, one row a sample; truth values count as +1 and -1."""
-
-
 Leaf: TypeAlias = Array | np.ndarray | jax.ShapeDtypeStruct | np.integer | int | None
 """A part of a trace."""
 
@@ -89,7 +86,6 @@ class Trace(InNotebook):
     _internal = frozenset((
         "between", "between_until", "finite", "held", "hold", "stride",
     ))  # fmt: skip
-
     signals: Mapping[str, Samples]
     dt: float | None = None
     times: Real[Array | np.ndarray, " time"] | None = None

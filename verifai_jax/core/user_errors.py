@@ -38,13 +38,11 @@ MAX_TRACEBACK = 100_000
 """The same for a message that begins with a traceback and ends with the error."""
 MAX_NAMES = 12
 """Names that a message lists."""
-
 ONCE_FOR_ALL = "JAX traces the code once for all simulations, so its values are not known yet"
 AS_PYTHON = "; or run the system as plain Python, without gradients, by vj.blackbox"
 AS_NATIVE = (
     '; or run it with backend="native", which calls a controller in Python, without gradients'
 )
-
 TRACING: tuple[tuple[type[Exception], str], ...] = (
     (
         jax.errors.TracerBoolConversionError,
@@ -80,13 +78,10 @@ TRACING: tuple[tuple[type[Exception], str], ...] = (
 )
 """Errors of JAX about values that it traces, each with what to do; the special before the general.
 """
-
-
 WRITES = (
     f"it writes a value into an array of NumPy, and {ONCE_FOR_ALL}. Use jnp in place of np, and "
     "array = array.at[i].set(value)"
 )
-
 TRACING_BY_WORDS = {
     "Shapes must be 1D sequences of concrete": (
         f"it makes an array of a length that is a value, and {ONCE_FOR_ALL}. Take the greatest "

@@ -25,10 +25,8 @@ from verifai_jax.core.text import format_seconds
 HOLDS = ("linear", "constant", "pchip", "pulse")
 """Courses between control points: lines, the value of the one before, a monotone cubic through
 them, or the value of the one before for a while and then 0."""
-
 HELD = ("constant", "pulse")
 """Courses that jump: within a step of an integrator they keep the value of its beginning."""
-
 Features = TypeVar("Features")
 
 
@@ -51,11 +49,9 @@ class Waveform:
 
     # JAX rebuilds the class with placeholders and with batches, which have other shapes.
     __no_type_check__ = True
-
     knots: Float[Array | np.ndarray, "knots *shape"]
     hold: str = field(default="linear", metadata={"static": True})
     duration: float | None = field(default=None, metadata={"static": True})
-
     times: tuple[float, ...] | None = field(default=None, metadata={"static": True})
     width: float | None = field(default=None, metadata={"static": True})
 
@@ -200,7 +196,6 @@ class WaveformWithinStep(Waveform):
     """
 
     __no_type_check__ = True
-
     begin: Any = 0.0
     now: Any = 0.0
 

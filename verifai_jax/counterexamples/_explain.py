@@ -49,7 +49,6 @@ class Explained(Drawn, InNotebook):
 
     _picture = "counterexamples", "plot_explanation"
     """The deciding signal with its bound and instant, and the features."""
-
     row: int
     formula: str
     rho: float

@@ -28,7 +28,6 @@ from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
-
 FAILING, FIXED, WITHOUT_VERDICT, INVALID, OTHER = (
     "failing",
     "fixed",

@@ -17,7 +17,6 @@ from verifai_jax.counterexamples.candidates import Candidates
 
 Point = Float[np.ndarray, " d"]
 Points = Float[np.ndarray, "n d"]
-
 PARENTS = 6
 """Failures from which changes are tried, the likeliest ones."""
 TRIED = 256

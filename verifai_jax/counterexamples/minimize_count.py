@@ -19,7 +19,6 @@ from verifai_jax.counterexamples.candidates import Candidates, Tangent
 Point = Float[np.ndarray, " d"]
 Points = Float[np.ndarray, "n d"]
 Results = Float[np.ndarray, "m d"]
-
 LEVELS = 5
 """Values of one feature alone that growth begins with."""
 BEAM = 6

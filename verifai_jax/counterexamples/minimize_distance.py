@@ -32,7 +32,6 @@ Point = Float[np.ndarray, " d"]
 Points = Float[np.ndarray, "n d"]
 Departure = Float[np.ndarray, " k"]
 Departures = Float[np.ndarray, "n k"]
-
 TURNS = (1.0, 0.75, 0.5, 0.3, 0.15, 0.05)
 """Shares of the way to the linearised boundary's nearest point,"""
 STRETCHES = (1.0, 1.003, 1.015, 1.06)

@@ -45,7 +45,6 @@ RADII = (0.01, 0.1, 1.0)
 """Divergences in nats for which the worst probability is shown."""
 FINEST = 4
 """The step is divided by that; an error of first order or better shrinks by as much at least."""
-
 Judged = tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]
 """Which samples fail, and which have a verdict."""
 Number = Estimate | Rate | Certificate | Compared

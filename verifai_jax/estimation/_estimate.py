@@ -43,10 +43,8 @@ if TYPE_CHECKING:
     from verifai_jax.core.executors import Executor
     from verifai_jax.verification import Verification
     from verifai_jax.verification.rest import Rest
-
 GRADIENTS_FROM = 3
 """Continuous coordinates from which the searches for failing regions take gradients."""
-
 CHEAP_BATCH = 4096
 """Simulations of a cheap model at once."""
 WITHIN = 1.5

@@ -28,7 +28,6 @@ from verifai_jax.statistics.binomial import exact_interval
 
 Handover = Mapping[str, str]
 """Features of a part, with the signals, or features, of the part before that they come from."""
-
 TRIES = 32
 """Draws of a part's own features until its constraint accepts them together with a beginning."""
 CONFIRMED = 16

@@ -33,7 +33,6 @@ DIRECTION = 0.3
 """Part of the greatest singular value of the normals from which a direction counts."""
 MIN_WEIGHT = 0.02
 """Least weight of a chain or a centre, in parts of the greatest."""
-
 Around: TypeAlias = tuple[Gaussian, Gaussian, *tuple[Gaussian | Marginals, ...]]
 """Components fitted to the failures of a region: the second without correlations."""
 

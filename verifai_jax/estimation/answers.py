@@ -24,7 +24,6 @@ CHAIN = 10
 """States of a chain: each level is about a tenth as probable as the previous one."""
 UNDERSTATED = 1.6
 """Factor on the relative error of a run: chains start from those of the previous level."""
-
 Cheap: TypeAlias = Callable[[Float[np.ndarray, "n d"]], Float[np.ndarray, " n"]]
 """From points of the unit cube to the robustness of a cheap model."""
 

@@ -18,7 +18,6 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 if TYPE_CHECKING:
     from verifai_jax.verification.rest import Rest
-
 Evaluate: TypeAlias = Callable[
     [Float[np.ndarray, "n d"]],
     tuple[Shaped[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]],
@@ -34,7 +33,6 @@ Differentiate: TypeAlias = Callable[
     ],
 ]
 """The same, and the gradient `[n, d]` of the robustness by the coordinates of the unit cube."""
-
 MAX_DRAWN = 4_000_000
 """Points drawn from the prior in search of accepted ones, at most, for each one wanted."""
 _CONSTRAINT_BATCH = 4096

@@ -22,7 +22,6 @@ from verifai_jax.statistics.binomial import simulations_until
 
 if TYPE_CHECKING:
     pass
-
 METHODS = {
     "monte_carlo": "Monte Carlo",
     "importance": "importance sampling",
@@ -67,7 +66,6 @@ class Estimate(Drawn, InNotebook):
 
     _picture = "estimate", "plot_estimate"
     """The interval, the splitting levels and the weights, as far as there are any."""
-
     name: str
     probability: float | None
     low: float

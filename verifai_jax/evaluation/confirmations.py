@@ -21,7 +21,6 @@ from verifai_jax.core.trace import Status
 
 if TYPE_CHECKING:
     import pandas as pd
-
 VERDICTS = ("confirmed", "refuted", "fragile", "raised", "unexamined")
 """Verdicts of closer replays; see `Confirmations`."""
 UNDECIDED = ("fragile", "raised", "unexamined")
@@ -191,7 +190,6 @@ class Confirmations(InNotebook):
     """
 
     _internal = frozenset(("put", "refuse", "blank"))
-
     name: str
     numbers: Int[np.ndarray, " n"]
     run_rho: Float[np.ndarray, " n"]

@@ -50,7 +50,6 @@ from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     from verifai_jax.core.executors import Executor
-
 ROWS = 256
 """Rows that are examined in any case, ..."""
 COST = 4096
@@ -80,7 +79,6 @@ is compiled for it."""
 CHECKPOINT = "confirmer"
 """Entry of a checkpoint: rows examined, how far replays moved one, the worst row, whether one came
 again otherwise, and whether one did not fail again."""
-
 Check: TypeAlias = tuple[Replays | HostReplays, int]
 """One kind of replay: in the precision of these replays, with a so many times smaller step."""
 

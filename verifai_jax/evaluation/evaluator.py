@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from verifai_jax.evaluation.journal import Journal
     from verifai_jax.evaluation.native_engine import NativeEngine
     from verifai_jax.evaluation.unfinished import Part
-
-
 NOT_NATIVE = (
     "simulated without native code, which is made of systems that JAX traces, in single precision "
     "and in this process"

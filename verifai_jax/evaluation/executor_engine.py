@@ -45,7 +45,6 @@ MAX_DROPPED = 100
 ever for one that mixes up its answers."""
 MAX_AHEAD = 1 << 22
 """Rows at most that are on their way at a time: a bound on the memory that they take."""
-
 SHIPMENTS: Slot[tuple[str, str | None], Any] = Slot("shipments")
 """The problem as it is sent, by kind of executor and target."""
 

@@ -39,7 +39,6 @@ class Replay(InNotebook):
     """
 
     _internal = frozenset(("changed", "finding"))
-
     problem: Problem
     row: int | None
     features: dict[str, Any]

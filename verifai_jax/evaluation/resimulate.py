@@ -35,7 +35,6 @@ from verifai_jax.systems.base import System
 
 if TYPE_CHECKING:
     from verifai_jax.core.executors import Executor, Shipment
-
 ONE_BY_ONE = 16
 """Rows up to which they are replayed one by one: that program is compiled much sooner."""
 SEEDS = 32

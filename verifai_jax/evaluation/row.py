@@ -304,7 +304,6 @@ class RowFunction(NamedTuple):
 SMALL = 16
 """Numbers that a monitor may hold to be worth carrying: one with windows of samples, which it
 moves at every step, holds more."""
-
 Monitor = Callable[[PyTree, Key[Array, ""]], tuple[Float[Array, " formulas"], Int[Array, ""]]]
 """A function `(features, key) -> robustness, status`."""
 
@@ -321,7 +320,6 @@ def streaming_monitor(problem: Problem) -> Monitor | None:
     except ValueError:
         # It looks ahead without end; or its clock is wrong, which the engine says better.
         return None
-
     form = problem.form()
     # A part of the state is finite where the last state is, which the status says.
     known_finite, count = ((), None) if form is None else (form.finite, form.length)

@@ -65,7 +65,6 @@ class BlockMode(NamedTuple):
 ENGINES: Slot[tuple[BlockMode, int], Engine] = Slot("engines of blocks")
 """Engines by mode and number of devices."""
 HOST_ENGINES: Slot[BlockMode, HostEngine] = Slot("host engines of blocks")
-
 # An executor may work in threads of one process. A compiled block keeps all cores busy by itself,
 # and a simulator is not made for two simulations at a time.
 computing = threading.Lock()

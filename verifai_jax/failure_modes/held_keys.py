@@ -35,7 +35,6 @@ TYPICAL = 0.5
 FOLLOWED = 300
 """Failures of which those that fail under a held key are followed to their regions, at most; they
 are simulated in a fourth of the budget."""
-
 Held = Callable[[int, int], LimitState]
 """From the number of a random key and a budget to the limit state under that key."""
 

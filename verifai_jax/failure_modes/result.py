@@ -158,7 +158,6 @@ class Modes(Drawn, InNotebook):
 
     _picture = "modes", "plot_modes"
     """The probabilities with their intervals, and the failures of each mode."""
-
     name: str
     modes: tuple[Mode, ...]
     probability: float | None

@@ -32,7 +32,6 @@ class Array(Domain):
     """
 
     arguments = ("domain", "length")
-
     domain: Domain
     length: int
 

@@ -87,7 +87,6 @@ class Box(_Between):
     """
 
     arguments = ("low", "high")
-
     low: float | Sequence[float] | np.ndarray
     high: float | Sequence[float] | np.ndarray
     closed: str = "both"
@@ -234,7 +233,6 @@ class DiscreteBox(_Between):
     """
 
     arguments = ("low", "high")
-
     low: int | Sequence[int] | np.ndarray
     high: int | Sequence[int] | np.ndarray
 

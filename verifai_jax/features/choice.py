@@ -330,7 +330,6 @@ class Constant(Domain):
     """
 
     arguments = ("value",)
-
     value: float | bool | str | PyTree
 
     def __post_init__(self) -> None:

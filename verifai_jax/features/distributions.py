@@ -45,7 +45,6 @@ class Normal(continuous.Continuous):
     """
 
     arguments = ("mean", "std")
-
     mean: float
     std: float
 
@@ -96,7 +95,6 @@ class TruncatedNormal(continuous.Continuous):
     """
 
     arguments = ("mean", "std", "low", "high")
-
     mean: float
     std: float
     low: float
@@ -197,7 +195,6 @@ class LogUniform(continuous.Continuous):
     """
 
     arguments = ("low", "high")
-
     low: float
     high: float
 

@@ -33,10 +33,8 @@ MIN_REAL = float(np.finfo(np.float32).tiny)
 """Smallest normal float32 number: XLA treats smaller ones as zero."""
 MAX_REAL = float(np.finfo(np.float32).max)
 """Largest float32 number."""
-
 Numbers: TypeAlias = float | Sequence | np.generic | np.ndarray | jax.Array
 """A number or an array of them, as a person, a table or a system writes it."""
-
 Value = TypeVar("Value")
 
 
@@ -83,7 +81,6 @@ class Domain(ForUsers, abc.ABC):
         "refine", "refined", "rounded", "sequences", "settled", "signals", "spans", "tail",
         "tailed", "to_columns", "tuning", "uniform", "used", "weights", "without", "words",
     ))  # fmt: skip
-
     arguments: ClassVar[tuple[str, ...] | None] = None
     """Attributes from which it can be rebuilt; None for a domain defined by a user."""
 

@@ -21,10 +21,8 @@ from verifai_jax.core.errors import unknown_name
 
 CLOSED = ("both", "left", "right", "neither")
 """Which ends of an interval belong to it, as in pandas."""
-
 End: TypeAlias = float | tuple[float, ...]
 """An end of an interval, or of several; infinite for an open range."""
-
 Reals = TypeVar("Reals", jax.Array, np.ndarray)
 """Real numbers, of JAX or of NumPy."""
 

@@ -73,7 +73,6 @@ class LogNormal(Positive):
     """
 
     arguments = ("mean", "std")
-
     mean: float
     std: float
 
@@ -120,7 +119,6 @@ class Weibull(Positive):
     """
 
     arguments = ("shape", "scale")
-
     shape: float
     scale: float
 
@@ -159,7 +157,6 @@ class Exponential(Positive):
     """
 
     arguments = ("mean",)
-
     mean: float
 
     def __post_init__(self) -> None:
@@ -195,7 +192,6 @@ class Triangular(Continuous):
     """
 
     arguments = ("low", "mode", "high")
-
     low: float
     mode: float
     high: float

@@ -28,10 +28,8 @@ from verifai_jax.features.space import FeatureSpace
 
 if TYPE_CHECKING:
     import pandas as pd
-
 Rows: TypeAlias = "pd.DataFrame | pd.Series | Iterable[Any] | Mapping[str, Any]"
 """Features of simulations: the feature columns of a table, a row of one, or dictionaries."""
-
 TABLE_COLUMNS = ("row", "rho", "violated", "status", "verdict", "suggested", "message")
 """Columns of a table other than its features, which a dictionary made of a row may hold."""
 

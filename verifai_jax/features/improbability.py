@@ -31,7 +31,6 @@ from verifai_jax.features.signal import Signal
 from verifai_jax.features.space import FeatureSpace
 
 Points = Float[np.ndarray, "n d"]
-
 SLIGHT = 0.02
 """Departure of the ends of a box from its middle: what breaks ties between values as likely."""
 REACH, NODES = 5.4, 2161

@@ -19,7 +19,6 @@ ROUNDINGS = 8
 """Roundings by which the map from coordinates to a feature may fail to rise."""
 TOGETHER = 512
 """Points that are converted at once: one program serves any number."""
-
 Corners = Float[np.ndarray, "n dim"]
 
 

@@ -37,7 +37,6 @@ class Reactive(Domain):
     """
 
     arguments = ("inputs", "hidden", "bounds", "scale")
-
     inputs: tuple[tuple[str, float, float], ...]
     hidden: int
     bounds: tuple[float, float]

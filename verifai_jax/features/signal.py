@@ -32,7 +32,6 @@ from verifai_jax.features.domain import Domain, Row, as_numbers, indexed, on_dev
 DEFAULT_KNOTS = 16
 """Control points of a signal that says nothing else: enough for a few swings, and few enough to be
 searched."""
-
 Course = tuple[str, float | None, tuple[float, ...] | None, float | None]
 """Hold, duration, times and width."""
 
@@ -64,7 +63,6 @@ class Signal(Domain):
     """
 
     arguments = ("domain", "knots", "hold", "duration")
-
     domain: Domain
     knots: int = DEFAULT_KNOTS
     hold: str = "linear"

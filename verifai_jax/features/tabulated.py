@@ -99,7 +99,6 @@ class Gamma(Positive):
     """
 
     arguments = ("shape", "scale")
-
     shape: float
     scale: float
 
@@ -171,7 +170,6 @@ class Beta(Continuous):
     """
 
     arguments = ("a", "b", "low", "high")
-
     a: float
     b: float
     low: float = 0.0
@@ -277,7 +275,6 @@ class Empirical(Continuous):
     """
 
     arguments = ("values", "ranks", "count")
-
     values: tuple[float, ...]
     ranks: tuple[float, ...]
     count: int

@@ -257,7 +257,6 @@ OPTIONS = ("to", "wait", "weight", "after", "at_most", "guard")
 """Entries of an event that are no parameters."""
 TAKEN = ("kind", "kinds", "wait", "waits", "time", "times", "length")
 """Names that a parameter cannot have, because a table or a value uses them."""
-
 Guard = Callable[[Past], bool]
 """A function that says whether an event may happen after a past."""
 

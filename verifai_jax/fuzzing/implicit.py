@@ -28,22 +28,16 @@ FINITE = "finite"
 """The signal that is positive where all signals are finite, and its property."""
 COMPLETED = "completed"
 """The signal that is positive in a simulation that ended properly, and its property."""
-
 RANGE = "range_"
 """Beginning of the name of the property that a signal stays in its range."""
-
 HOLDS = 1e6
 """The value of these signals where all is well: more than any formula's robustness, which leads."""
-
 Ranges = Mapping[str, tuple[float, float]]
 """The range within which each signal must stay."""
-
 Cells = Mapping[str, tuple[float, float, int]]
 """For each signal the low and the high end of its cells, and their number."""
-
 CELLS_OF_A_RANGE = 4
 """Default number of cells of a signal with a range."""
-
 MAX_CUT = 4
 """Signals with ranges that are divided into cells by default, at most."""
 

@@ -241,7 +241,6 @@ def _everywhere_backward(
 
 
 _everywhere.defvjp(_everywhere_forward, _everywhere_backward)
-
 # Compiled on their own, so that plain calls on arrays are fast too; inlined within a larger `jit`.
 _root_compiled = jax.jit(_root, static_argnums=0, inline=True)
 _everywhere_compiled = jax.jit(_everywhere, static_argnums=0, inline=True)

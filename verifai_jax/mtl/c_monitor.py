@@ -152,7 +152,6 @@ static inline double vj_reach(
 
 #endif
 """
-
 MONITOR = r"""
 typedef struct {
   double out[@outputs];

@@ -87,7 +87,6 @@ class _Follows(abc.ABC, Generic[Said]):
 
     @abc.abstractmethod
     def _said(self, rows: Rows) -> list[Said]: ...
-
     def start(self) -> Callable[[Mapping[str, Any]], Said]:
         """Return what takes one sample of a run after another, and says something of each."""
         return self._columns.follow(lambda row: self._said(row)[0])

@@ -29,7 +29,6 @@ from verifai_jax.mtl.setting import check_trace
 from verifai_jax.mtl.tree import missing_case, postorder
 
 Values = Float[np.ndarray, " n"]
-
 SNAP = 1e-9
 """Share of the shortest distance of samples within which two times are one: sums of decimals are
 off by some units in the last place, and times that differ on purpose by far more."""

@@ -412,7 +412,6 @@ def surface(f: Formula) -> tuple[str, tuple[Formula, ...], Interval | None]:
 
 TRUE = Constant(True)
 """The formula that always holds."""
-
 FALSE = Constant(False)
 """The formula that never holds."""
 

@@ -41,7 +41,6 @@ KEPT, GENERATIONS = 32, 12
 """Traces that each generation of a search goes on from, and generations."""
 MAX_SAMPLES = 20_000
 """Samples of a free trace at most: one of more has a clock much finer than its windows."""
-
 Signals = dict[str, Values]
 
 

@@ -18,7 +18,6 @@ from verifai_jax.mtl.requirements import Requirement
 
 if TYPE_CHECKING:
     import pandas as pd
-
 SHARES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
 SHOWN = 10
 """Rows of each kind that the summary lists."""

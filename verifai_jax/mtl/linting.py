@@ -38,7 +38,6 @@ always holds, and one that never does, are suspicious: 2.5 lets a limit of 30 m/
 go from 0 to 10, and finds 120 km/h where they go from 0 to 33 m/s, and degrees for radians."""
 STILL = 0.2
 """Share of the value of a signal that never changes, which stands for the width of its range."""
-
 Check = Iterator["Finding"]
 
 

@@ -37,7 +37,6 @@ from verifai_jax.mtl.words import OPERATORS
 
 if TYPE_CHECKING:
     import pandas as pd
-
 OTHER_WORDS = {
     "always": "eventually", "eventually": "always", "historically": "once", "once": "historically",
     "until": "weak_until", "weak_until": "until", "and": "or", "or": "and", "implies": "and",
@@ -47,7 +46,6 @@ OTHER_WORDS = {
 REVERSED = {">": "<", ">=": "<=", "<": ">", "<=": ">=", "==": "!=", "!=": "=="}
 MOVED = 0.1
 """Share by which a bound is moved, either way."""
-
 Change: TypeAlias = tuple[str, str, Formula]
 """A kind of change, what was changed into what, and the formula."""
 

@@ -43,7 +43,6 @@ _WORDS = re.compile(r'"[^"\n]*"|[\[\],:]|\?([A-Za-z_]\w*)')
 _START, _END = 1e-300, 1e300
 """Times of parameters while their values are unknown: multiples of these, below and above any that
 a person writes, so that an interval with one of them and another number ends after it starts."""
-
 _CLOSED = {">": ">=", "<": "<=", "!=": "!="}
 _OPEN = {">=": ">", "<=": "<", "==": "=="}
 

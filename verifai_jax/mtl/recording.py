@@ -31,8 +31,6 @@ from verifai_jax.mtl.resampling import (
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
 ENDINGS = (".csv", ".parquet", ".npz", ".mcap", ".nc", ".zarr", ".h5", ".hdf5")
 """Endings of files that are recordings."""
 

@@ -21,7 +21,6 @@ from verifai_jax.mtl.setting import since_first
 
 Method = Literal["hold", "linear"]
 Missing = Literal["hold", "drop", "interpolate"]
-
 MAX_SAMPLES = 100_000_000
 """Samples that a resampled trace may have: a signal of so many takes 800 MB in double precision."""
 
@@ -65,7 +64,6 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
     cell = np.searchsorted(clock, elapsed + tolerance, side="right") - 1
     on_clock = np.abs(clock[cell] - elapsed) <= tolerance
     passed = np.flatnonzero(~((index[cell] == np.arange(len(elapsed))) & on_clock))
-
     signals, inner, notes = {}, {}, dict(trace.notes)
     for name, recorded in trace.signals.items():
         values = np.asarray(recorded)

@@ -30,7 +30,6 @@ class Semantics:
 
     # JAX rebuilds the class with placeholders, which are no numbers.
     __no_type_check__ = True
-
     kind: Kind
     tau: Array | float | None = None
     error: float | None = None
@@ -39,7 +38,6 @@ class Semantics:
 
 #: Quantitative semantics by min and max: positive where the formula holds, negative where not.
 hard = Semantics("hard")
-
 #: +1 where the formula holds, -1 where not, NaN where a signal is NaN. At robustness 0 the
 #: comparison decides: `>=` holds, `>` does not.
 boolean = Semantics("boolean")

@@ -181,10 +181,8 @@ class Tree(Node):
 
     word: ClassVar[str] = ""
     """Its operator, a key of `OPERATORS`; none for a leaf."""
-
     timeless: ClassVar[bool] = False
     """True for a kind of node that itself looks at the instant alone."""
-
     interval: Interval
     """The interval of an operator that takes one."""
 

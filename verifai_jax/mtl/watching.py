@@ -32,7 +32,6 @@ from verifai_jax.mtl.streams import Plan, streams
 R = TypeVar("R")
 Numbers: TypeAlias = Sequence[float] | np.ndarray | ctypes.Array[ctypes.c_double]
 """One number a formula."""
-
 FLAGS = ("-x", "c", "-std=c99", "-O2", "-ffp-contract=off")
 """Not contracted: a product and a sum in one operation are rounded once, and NumPy rounds twice."""
 LIBRARY = r"""

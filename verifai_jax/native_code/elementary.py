@@ -32,7 +32,6 @@ OPERATORS = {
     "exp2": "exponential({} * 0.693147180559945309f)",
 }
 """C operators, of vectors and single numbers."""
-
 FUNCTIONS = {
     "max": "greater({}, {})",
     "min": "lesser({}, {})",
@@ -68,9 +67,7 @@ FUNCTIONS = {
     "clamp": "lesser({2}, greater({0}, {1}))",
 }
 """Functions of the prelude, whose operands are all vectors or all single numbers."""
-
 COMPARISONS = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
-
 _FOLDED: dict[str, Callable[..., Any]] = {
     "add": np.add,
     "sub": np.subtract,

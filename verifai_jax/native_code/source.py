@@ -85,7 +85,6 @@ INLINE void give(U bits, unsigned *to, long at, long end) {
   else for (int l = 0; at + l < end; l++) to[at + l] = bits[l];
 }
 """
-
 _FUNCTION = r"""
 extern "C" int width() { return K * W; }
 /* Rows `begin` to `end` of a total; each result in a row of its own. 1: there is no memory. */

@@ -89,7 +89,6 @@ Number: TypeAlias = np.generic | float
 Elements: TypeAlias = Any
 """An object array of elements; those of random keys are pairs of elements."""
 Value: TypeAlias = Elements | Memory
-
 _NAME = re.compile(r"\b[a-z]+\d+\b")
 TYPES = {"f": ("F", "float"), "i": ("I", "int"), "u": ("U", "unsigned"), "b": ("I", "int")}
 """C types of each kind: of a vector, and of a single number."""

@@ -19,15 +19,10 @@ from jaxtyping import Array, Float, PyTree
 
 Number: TypeAlias = PyTree
 """A number, or an array `[]`, which may be traced."""
-
 Vector: TypeAlias = PyTree
 """Three numbers, or an array `[3]`, which may be traced."""
-
 TINY = 1e-12
-
 Tree = TypeVar("Tree")
-
-
 Description = TypeVar("Description")
 
 

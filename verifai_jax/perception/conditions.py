@@ -16,7 +16,6 @@ from verifai_jax.perception.camera import Number, Vector, described, vector
 
 LUMINANCE = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in ITU-R BT.601."""
-
 DROPS = 24
 SPOTS = 12
 

@@ -12,7 +12,6 @@ from verifai_jax.evaluation.replay import Replay
 from verifai_jax.plotting.replay import decisive_instant
 
 Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]
-
 MAX_FRAMES = 150
 """Frames of a film without a given frame rate; a longer film is played faster."""
 MAX_WANTED = 1000

@@ -81,7 +81,6 @@ def plot_replay(
     clock = np.asarray(trace.clock())
     decisive = decisive_instant(formulas[name], trace, replay.problem.end)
     to_blame = _predicates_to_blame(replay)
-
     figure = new_figure(figsize=(8, 1.2 + 1.45 * len(shown)))
     panels = figure.subplots(len(shown), 1, sharex=True, squeeze=False).ravel()
     for axes, signal in zip(panels, shown, strict=True):

@@ -10,7 +10,6 @@ from verifai_jax.core.figure import Axes, Figure
 from verifai_jax.plotting.style import new_figure, show_or_save
 
 EGO, OTHERS, GROUND = "#d1495b", "#3a6ea5", "#b8b8b8"
-
 MARGIN = 4.0
 """Metres around the objects."""
 

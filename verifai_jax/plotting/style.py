@@ -17,9 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
 else:
     Axis = object
-
 Positions = Float[np.ndarray, " n"]
-
 SAFE = "#3a9e7d"
 FAILING = "#d1495b"
 WITHOUT_VERDICT = "#7f7f7f"

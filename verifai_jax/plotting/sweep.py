@@ -24,7 +24,6 @@ from verifai_jax.sweeps.summary import format_failures
 
 if TYPE_CHECKING:
     import pandas as pd
-
 LOOKS = {
     "safe": (style.SAFE, "o"),
     "undecided": (style.WITHOUT_VERDICT, "D"),

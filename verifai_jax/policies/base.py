@@ -27,7 +27,6 @@ from verifai_jax.policies.tracing import number_type, traced
 
 Compute = Callable[[PyTree, PyTree, PyTree], tuple[Any, PyTree]]
 """A pure function `(weights, observation, memory) -> (outputs, memory)`."""
-
 ACTIONS = {
     "outputs": "the outputs themselves",
     "argmax": "the index of the greatest output",
@@ -104,7 +103,6 @@ class Normaliser:
 
     # JAX rebuilds the class with placeholders.
     __no_type_check__ = True
-
     mean: Float[Array | np.ndarray, "*k"]
     scale: Float[Array | np.ndarray, "*k"]
     clip: float | None = dataclasses.field(default=None, metadata={"static": True})
@@ -133,7 +131,6 @@ class Policy:
     """
 
     __no_type_check__ = True
-
     weights: PyTree
     compute: Compute = dataclasses.field(metadata={"static": True})
     initial_memory: PyTree = None

@@ -31,7 +31,6 @@ from verifai_jax.rl.policy import Policy as OwnPolicy
 from verifai_jax.rl.policy import load_policy
 
 Network = Callable[[dict[str, Array], PyTree], PyTree]
-
 FORMATS = (".zip", ".onnx", ".safetensors", ".pt", ".pth", ".npz")
 
 

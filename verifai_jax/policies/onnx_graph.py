@@ -26,7 +26,6 @@ from verifai_jax.policies.onnx_node import Node
 from verifai_jax.policies.onnx_operators import OPERATORS, output_size
 
 Values = dict[str, Any]
-
 OPSET = 18
 """The operator set of the graphs that `writing` makes; runtimes since 2023 read it."""
 

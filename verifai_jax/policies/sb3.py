@@ -21,7 +21,6 @@ from verifai_jax.policies.pickled import Name, Record, array_of, read_pickle
 from verifai_jax.policies.torch_archive import open_archive, read_member, read_state
 
 Weights = Mapping[str, np.ndarray]
-
 _KINDS = (
     # What is there, the hidden layers, the last layer (None: the last of the hidden ones), the
     # features.

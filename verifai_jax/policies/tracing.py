@@ -26,7 +26,6 @@ Jaxpr = Any
 """A `jax.core.Jaxpr`, its equations, variables and their forms: JAX does not export the classes."""
 Value: TypeAlias = str | np.ndarray
 """The name of a value that depends on the observation or the weights, or a known array."""
-
 _SAME = {
     "add": "Add", "sub": "Sub", "mul": "Mul", "div": "Div", "max": "Max", "min": "Min",
     "pow": "Pow", "neg": "Neg", "exp": "Exp", "log": "Log", "tanh": "Tanh", "logistic": "Sigmoid",

@@ -47,10 +47,8 @@ class Slopes(NamedTuple):
 
 DEPENDENCE: Slot[None, Slopes] = Slot("dependence")
 """How the robustness of a problem depends on the features."""
-
 KEY: Slot[None, bool] = Slot("dependence on the key")
 """Whether the verdict of a simulation depends on its random key."""
-
 _FLAT = frozenset({"ceil", "floor", "nextafter", "round", "sign", "stop_gradient"})
 """Steps with real results whose derivative is zero."""
 

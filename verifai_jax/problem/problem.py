@@ -89,7 +89,6 @@ class Problem(InNotebook):
         "black_box", "draws", "form", "made_in", "monitored", "on_backend",
         "programs", "requirement_entries", "sources",
     ))  # fmt: skip
-
     name: str
     space: FeatureSpace
     system: System
@@ -399,7 +398,6 @@ class Problem(InNotebook):
 
 FORM: Slot[None, Trace | None] = Slot("form")
 """The form of the traces of a problem's system."""
-
 BACKENDS: Slot[str, Problem] = Slot("backends")
 """The same problem on each backend of its system."""
 

@@ -234,7 +234,6 @@ _BY_ORACLE = {
         "a claim is said to bear a greater shift of the prior than it does",
     ),
 }
-
 HAZARDS = {
     f"E{number:02}": hazard
     for number, hazard in enumerate(

@@ -32,8 +32,6 @@ DRAWN = ("clusters", "importance", "coverage")
 """Analyses of the table that a report draws."""
 MAX_FEATURES = 40
 """Features of a failure that are listed one by one."""
-
-
 _AGAIN = "Each can be simulated again from its row, bit for bit."
 _NOT_AGAIN = "Not all rows give their numbers when they are simulated again."
 

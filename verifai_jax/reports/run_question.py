@@ -23,8 +23,6 @@ ENDS = {
 """Meaning of the end of a trace for the formulas."""
 NO_REASON = "not stated"
 """Cell of a missing unit or reason."""
-
-
 DEMANDED = ("text", "source", "severity", "rationale", "links")
 """What is shown of a requirement."""
 

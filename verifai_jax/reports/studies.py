@@ -25,7 +25,6 @@ from verifai_jax.plotting.mujoco_motion import can_draw
 from verifai_jax.reports.view import rows_to_trace, trace_data
 
 Result = TypeVar("Result")
-
 MAX_FAILURES = 5
 """Failures that are shown one by one."""
 TRACES = 24

@@ -27,7 +27,6 @@ POLICIES_PER_DEVICE = 8
 """Policies that a device simulates at a time."""
 EPISODES = 32
 """Episodes of a mean return, when nothing else is said."""
-
 Totals = tuple[State, Float[Array, "..."], Bool[Array, "..."]]
 """States, rewards so far, and the episodes that are over."""
 

@@ -39,8 +39,6 @@ RUNS_PER_ACCELERATOR = 64
 """Training runs under one `vmap` on an accelerator; a CPU core is busy with one."""
 SLICE_SECONDS = 2.0
 """Seconds that a call into compiled code lasts at most, about; one can interrupt between calls."""
-
-
 PyTreeDef: TypeAlias = jax.tree_util.PyTreeDef  # pyright: ignore[reportInvalidTypeForm]
 """The structure of a pytree; its own name of the class is a variable to type checkers."""
 Shapes = tuple[tuple[tuple[int, ...], str], ...]

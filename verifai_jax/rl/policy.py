@@ -34,10 +34,8 @@ from verifai_jax.rl.task.task import Action, Continuous, Discrete
 Layer = tuple[Float[Array | np.ndarray, "... _ _"], Float[Array | np.ndarray, "... _"]]
 Layers = tuple[Layer, ...]
 """Weights `[inputs, outputs]` and biases `[outputs]` of each layer, first layer first."""
-
 ACTIVATIONS: dict[str, Callable[[ArrayLike], Array]] = {"tanh": jnp.tanh, "relu": jax.nn.relu}
 """Functions between the layers, by name. All are 0 at 0."""
-
 _KINDS: dict[str, type[Discrete] | type[Continuous]] = {
     "discrete": Discrete,
     "continuous": Continuous,
@@ -68,7 +66,6 @@ class Policy:
 
     # JAX rebuilds the class with stacked arrays and placeholders, which have other shapes.
     __no_type_check__ = True
-
     layers: Layers
     mean: Float[Array | np.ndarray, " k"] | None
     scale: Float[Array | np.ndarray, " k"] | None

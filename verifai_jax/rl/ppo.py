@@ -49,7 +49,6 @@ class PPO:
     # JAX rebuilds the class with stacked numbers and placeholders in place of numbers.
     __no_type_check__ = True
     actions: ClassVar[tuple[type, ...]] = (Discrete, Continuous)
-
     learning_rate: Number = 2.5e-4
     discount: Number = 0.99
     gae_lambda: Number = 0.95
@@ -144,7 +143,6 @@ class Weights:
 
     # JAX rebuilds the class with stacked arrays and placeholders, which have other shapes.
     __no_type_check__ = True
-
     policy: Layers
     critic: Layers
     log_std: Float[Array, " size"] | None

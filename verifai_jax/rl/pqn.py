@@ -58,7 +58,6 @@ class PQN:
     # JAX rebuilds the class with stacked numbers and placeholders in place of numbers.
     __no_type_check__ = True
     actions: ClassVar[tuple[type, ...]] = (Discrete,)
-
     learning_rate: Number = 2e-3
     discount: Number = 0.99
     q_lambda: Number = 0.9

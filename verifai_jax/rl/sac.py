@@ -60,7 +60,6 @@ class SAC:
     # JAX rebuilds the class with stacked numbers and placeholders in place of numbers.
     __no_type_check__ = True
     actions: ClassVar[tuple[type, ...]] = (Continuous,)
-
     learning_rate: Number = 1e-3
     discount: Number = 0.99
     target_rate: Number = 0.01
@@ -195,7 +194,6 @@ class Weights:
 
     # JAX rebuilds the class with stacked arrays and placeholders, which have other shapes.
     __no_type_check__ = True
-
     policy: Layers
     critics: Layers
     log_temperature: Float[Array, ""]
@@ -313,7 +311,6 @@ def total_loss(
     """Add up three losses, each with a gradient for its own part of the weights only."""
     fixed = jax.lax.stop_gradient(weights)
     temperature = jnp.exp(fixed.log_temperature)
-
     mean, log_std = _gaussian(sac, fixed.policy, batch.next_observation)
     next_action = jnp.tanh(mean + jnp.exp(log_std) * noise[0])
     next_value = jnp.min(_values(sac, slow, batch.next_observation, next_action), axis=0)
@@ -322,13 +319,11 @@ def total_loss(
     target = jax.lax.stop_gradient(sac.reward_scale * batch.reward + discount * next_value)
     value = _values(sac, weights.critics, batch.observation, batch.action)
     value_error = jnp.sum(jnp.mean(jnp.square(value - target), axis=1)) / 2  # eq. 5
-
     mean, log_std = _gaussian(sac, weights.policy, batch.observation)
     action = jnp.tanh(mean + jnp.exp(log_std) * noise[1])
     log_probability = squash_log_prob(mean, log_std, noise[1])
     worth = jnp.min(_values(sac, fixed.critics, batch.observation, action), axis=0)
     policy_loss = jnp.mean(temperature * log_probability - worth)  # eq. 9
-
     wanted = sac.target_entropy * noise.shape[2]
     excess = jax.lax.stop_gradient(jnp.mean(-log_probability) - wanted)
     return value_error + policy_loss + weights.log_temperature * excess  # eq. 18, of the logarithm

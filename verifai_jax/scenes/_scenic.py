@@ -18,10 +18,8 @@ from verifai_jax.scenes.sampling import Sampling
 
 MIN_CHANCE = 2e-6
 """Probability of a soft requirement to be off, or on, at least."""
-
 FAST, SLOW = 16_384, 1024
 """Points from which the weights of soft requirements are fitted, compiled and in Python."""
-
 ROUNDS = 200
 """Rounds of that fit at most."""
 

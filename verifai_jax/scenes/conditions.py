@@ -50,7 +50,6 @@ OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
     ast.Eq: operator.eq,
     ast.NotEq: operator.ne,
 }
-
 CALLS = ("abs", "min", "max", "sin", "cos", "tan", "sqrt", "hypot", "floor", "exp", "atan2")
 
 

@@ -13,13 +13,10 @@ from verifai_jax.scenes.graph import children, field, is_constructed, is_random,
 
 FIRST = ("position", "yaw", "parentOrientation", "heading", "orientation", "width", "length")
 """Properties that give their name to a value before others that depend on it too."""
-
 FRAME = ("position", "center", "heading", "width", "length", "radius", "angle")
 """Parts of a region that may be random."""
-
 ANGLES = ("yaw", "parentOrientation", "heading", "orientation", "pitch", "roll")
 """Properties that a person calls the heading."""
-
 LOCAL = ("offsetLocally", "offsetRotated", "offsetRadially")
 """Operations in which a vector is measured from another place, in axes of its own."""
 

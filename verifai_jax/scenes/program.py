@@ -26,8 +26,6 @@ from verifai_jax.systems.blackbox._blackbox import BlackBox, PooledBlackBox, Vec
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
 HostSystem = BlackBox | PooledBlackBox | VectorisedBlackBox
 
 
@@ -255,13 +253,10 @@ class ScenicProgram:
 
 POSE = ("position", "orientation", "parentOrientation", "heading", "yaw", "pitch", "roll")
 """Properties that `at` and `facing` set together."""
-
 UNWRITTEN = frozenset((*POSE, "shape", "regionContainedIn", "lastActions", "sensors"))
 """Properties that are written otherwise, or that say nothing about a scene that is drawn."""
-
 SIZE = ("width", "length", "height")
 """Properties that may come from a shape which is not written."""
-
 SHAPES = ("CylinderShape", "ConeShape", "SpheroidShape")
 """Shapes that are known by their name and the size of the object."""
 

@@ -35,11 +35,8 @@ from verifai_jax.scenes.sampling import LOCK, Refused, Sampling, _plain
 from verifai_jax.scenes.values import Unsupported, as_vec, is_plain
 
 Check = Callable[[Values], Any]
-
 MAX_DECISIONS = 100_000
 """Decisions of Scenic that are kept: a run asks about some points more than once."""
-
-
 FIRST_SHOWN, SHOWN_EVERY = 2.0, 10.0
 """Seconds of one round of decisions after which a line says so, and seconds between such lines."""
 

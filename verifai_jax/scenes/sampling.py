@@ -31,7 +31,6 @@ from verifai_jax.scenes.naming import leaf_names, owner_names, unique
 
 SEED = "seed"
 """Name of the feature that seeds what has no inverse."""
-
 COMPUTED = {
     *("OperatorDistribution", "AttributeDistribution", "FunctionDistribution"),
     *("MethodDistribution", "VectorOperatorDistribution", "VectorMethodDistribution"),
@@ -39,10 +38,8 @@ COMPUTED = {
     *("MultiplexerDistribution", "Options", "VerifaiOptions", "UniformDistribution"),
 }
 """Distributions of Scenic that draw nothing themselves."""
-
 GUESSES = 64
 """Random positions that are tried for what a scene does not tell."""
-
 LOCK = threading.RLock()
 """Held while Scenic computes."""
 

@@ -56,7 +56,6 @@ SMOOTH = frozenset({
 """Operations with derivatives of all orders that jax.experimental.jet knows."""
 CHOOSING = {"select_n": (1, None), "dynamic_slice": (0, 1), "gather": (0, 1)}
 """Operations that are smooth in these operands alone; the others choose among them."""
-
 _solution = Primitive("flow")
 _solution.multiple_results = True
 

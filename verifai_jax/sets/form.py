@@ -29,7 +29,6 @@ from jax.typing import DTypeLike
 
 Reals = np.ndarray
 """Numbers of double precision, `[boxes, *shape]`; `[1, *shape]` if they are those of all boxes."""
-
 SLACK = 2.0**-45
 """Share of a number by which a result is widened for the rounding of its own bounds."""
 

@@ -25,9 +25,7 @@ Equation: TypeAlias = Any
 Program: TypeAlias = Any
 """A `Jaxpr` or a `ClosedJaxpr`."""
 Rule: TypeAlias = Callable[["Interpreter", Equation, list[Value]], list[Value]]
-
 Known: TypeAlias = Callable[[Program], Callable[[list[Value]], list[Value]] | None]
-
 RULES: dict[str, Rule] = {}
 """What each primitive does with sets, by its name."""
 

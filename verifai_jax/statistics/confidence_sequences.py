@@ -35,15 +35,12 @@ from verifai_jax.statistics.binomial import Rate, check_counts
 
 ATOM = 0.75
 """Weight of rate 0 in the mixture for upper bounds."""
-
 UNDECIDED = "undecided"
 """Verdict of a policy whose interval contains the failure rate that is allowed."""
-
 SAFE = "safe"
 """Beginning of the verdict `safe@p`."""
 UNSAFE = "unsafe"
 """Verdict of a policy that fails more often than is allowed."""
-
 Counts = Real[np.ndarray, "*#n"] | float
 """Numbers of samples, one or many; fractions where they are expectations."""
 

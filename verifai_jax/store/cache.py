@@ -25,7 +25,6 @@ from verifai_jax.store.locks import write_lock
 from verifai_jax.store.log import Arrays, Log
 
 log = logging.getLogger("verifai_jax.cache")
-
 _NOTE = "note:"
 """What the names of notes begin with."""
 _ABOUT = "about"

@@ -19,7 +19,6 @@ from verifai_jax.core.text import one_line
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
 _CHECKSUM = "checksum"
 """Entry of a record with the checksum of the others."""
 

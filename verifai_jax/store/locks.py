@@ -23,7 +23,6 @@ try:
     import fcntl
 except ImportError:
     fcntl = None
-
 LOCK = "writer.lock"
 """Name of the file in a folder that is being written."""
 _NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}

@@ -31,7 +31,6 @@ from verifai_jax.store.files import DamagedError, checksum, write_complete
 
 Arrays: TypeAlias = Mapping[str, np.ndarray]
 """An entry: arrays of numbers or texts, by name."""
-
 MARK = b"VJX1"
 """First bytes of each frame."""
 HEADER = struct.Struct("<4sIQI")

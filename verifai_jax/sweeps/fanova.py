@@ -13,7 +13,6 @@ from jaxtyping import Float
 
 if TYPE_CHECKING:
     from sklearn.ensemble import ExtraTreesRegressor
-
 _MAX_ENTRIES = 2**22
 """Pairs of boxes times inputs in one block of memory."""
 

@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from sklearn.ensemble import ExtraTreesRegressor
 
     from verifai_jax.analysis._pca import Components
-
-
 TARGETS = {"failure_rate": "failing", "nominal_return": "return"}
 """Columns that are explained, with their names in the summary."""
 MIN_ROWS_TO_LEARN = 10

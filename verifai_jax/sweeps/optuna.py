@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
     from optuna.samplers import BaseSampler
     from optuna.trial import Trial
-
 _SAMPLERS = {
     "tpe": "TPESampler",
     "random": "RandomSampler",

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
     from optuna.storages import BaseStorage
     from optuna.trial import FrozenTrial
-
 METRICS = ("upper end of the failure probability", "nominal return")
 """Names of a trial's values."""
 DIRECTIONS = ("minimize", "maximize")

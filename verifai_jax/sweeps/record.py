@@ -12,10 +12,8 @@ from verifai_jax.rl.policy import Policy
 
 if TYPE_CHECKING:
     from verifai_jax.certification.result import Certificates
-
 TrainedPolicy: TypeAlias = Policy | LoadedPolicy
 """A policy of an algorithm of `rl`, or of anybody's function."""
-
 TRAINED, NONFINITE, STOPPED = "trained", "nonfinite", "stopped"
 """Statuses of a row: trained, with a number that is not finite, and stopped here by halving.
 

@@ -68,7 +68,6 @@ class Sweep(Drawn):
 
     _picture = "sweep", "plot_sweep"
     """Return against failure probability, learning curves and importances."""
-
     record: SweepRecord
     study: Study | None = None
     space: FeatureSpace | None = None

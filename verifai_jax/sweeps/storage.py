@@ -31,7 +31,6 @@ from verifai_jax.sweeps.record import Curve, SweepRecord, TrainedPolicy
 
 if TYPE_CHECKING:
     import pandas as pd
-
 RECORD = "sweep.json"
 """File of everything that is neither table, policy nor curve."""
 TABLE = "table.parquet"

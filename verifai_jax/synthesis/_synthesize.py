@@ -44,7 +44,6 @@ from verifai_jax.synthesis.results import Synthesis
 
 if TYPE_CHECKING:
     import pandas as pd
-
 CANDIDATES = 32
 """Choices of parameters at a time, and at most in the table at the end."""
 STARTS = 4

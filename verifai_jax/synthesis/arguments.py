@@ -87,7 +87,6 @@ def attack_search(problem: Problem, search: str | Search, loop: Parametric) -> S
         search = searches.named(search)
     if loop.environment is None:
         return search
-
     checked = check_search(problem, search) if loop.problem.black_box else search
     if not isinstance(checked, Search):
         raise TypeError(f"attack must be a name or a search like CrossEntropy(); got {search!r}")

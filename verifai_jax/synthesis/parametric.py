@@ -33,7 +33,6 @@ from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
-
 ROWS = 64
 """Rows of a table made at a time, so that one shape compiles."""
 MAX_DIFFERENTIATED = 64

@@ -27,8 +27,6 @@ SLICES = 8
 """Looks at what is proved before the parameters come closer."""
 ENOUGH = 0.9
 """Share of the box without known failures at which a proved one is wide enough."""
-
-
 Corner: TypeAlias = Float[np.ndarray, " dim"]
 
 

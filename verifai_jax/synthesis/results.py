@@ -224,7 +224,6 @@ class Repair(Drawn, InNotebook):
 
     _picture = "repair", "plot_repair"
     """The worst robustness that each attack found."""
-
     name: str
     before: Any
     parameters: Any

@@ -25,13 +25,10 @@ from verifai_jax.systems.channels import Link, Passing
 
 KnownSignals: TypeAlias = tuple[str, ...] | Mapping[str, int] | None
 """Names of signals, or names with their numbers of components, 1 for a scalar; None if unknown."""
-
 Features: TypeAlias = PyTree
 """The features of one simulation, as `FeatureSpace.unflatten` gives them; or of a batch."""
-
 Seed: TypeAlias = Key[Array, ""] | int | None
 """A random key of JAX; for a system on the host, an integer seed will also do."""
-
 Carry = TypeVar("Carry")
 
 
@@ -91,7 +88,6 @@ class System(ForUsers):
         "refined", "renewed", "reverse_hint", "simulate_batch", "simulate_each", "switches",
         "traced_factor", "unroll", "why_error", "why_not", "with_backend", "with_links", "workers",
     ))  # fmt: skip
-
     black_box: bool = False
     # About 1 MB of a trace with 200 samples and two signals.
     lanes: int = 512

@@ -43,7 +43,6 @@ def strategy(space: FeatureSpace, nominal: Mapping[str, Any] | None = None) -> A
     middle[list(space.lengths)] = 0.0
     if nominal is not None:
         middle = np.array(space.point_of(space.coerce(nominal)))
-
     # Whether an item is there is drawn by itself, so that each can be shrunk away.
     counted = {length for length, *_ in space.cube.sequences}
     middle[list(counted)] = 1.0

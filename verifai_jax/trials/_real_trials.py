@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from verifai_jax.core.executors import Executor
-
 UNLIKELY = 1e-3
 """Probability below which trials are not taken for samples of the prior."""
 MIN_TRIALS = 10

@@ -27,7 +27,6 @@ from verifai_jax.trials.reading import FAILED, TrialTable, table_of, verdicts_of
 
 if TYPE_CHECKING:
     import pandas as pd
-
 POSTERIOR = 1000
 """Samples of the posterior that are returned."""
 TAIL = 1e-3

@@ -20,7 +20,6 @@ from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
-
 STYLE = """body{font:10pt sans-serif;margin:1.5cm}table{border-collapse:collapse;width:100%}
 td,th{border:1px solid #888;padding:4px 6px;text-align:left}thead{display:table-header-group}
 tr{page-break-inside:avoid}"""

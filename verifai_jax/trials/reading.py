@@ -13,10 +13,8 @@ from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
-
 TrialTable: TypeAlias = "str | Path | pd.DataFrame"
 """Trials: the path of a CSV or Parquet file, or a data frame, with a row for each."""
-
 FAILED, RECORDING = "failed", "recording"
 """Columns that say whether a trial failed, or which recording says so."""
 WORDS = {

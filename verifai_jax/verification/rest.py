@@ -21,8 +21,6 @@ from verifai_jax.verification.boxes import BROKEN, OUTSIDE, Boxes
 MARGIN = 2.0**-20
 """Distance from the faces of a box within which a point of float32 does not count as in it: the
 rounding of a point, and of the edges of discrete features."""
-
-
 Node: TypeAlias = tuple[int, float, list[int], np.ndarray, np.ndarray]
 """A cut: its coordinate, where it is, the nodes below and above it; the corners of what is decided
 where there is no cut any more."""

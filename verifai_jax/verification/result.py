@@ -63,7 +63,6 @@ class Verification(Drawn, InNotebook):
 
     _picture = "verification", "plot_verification"
     _internal = frozenset(("check_same", "left", "loosest", "note"))
-
     name: str
     columns: tuple[str, ...]
     boxes: Boxes = field(repr=False)

@@ -61,7 +61,6 @@ class Clusters(Drawn, InNotebook):
 
     _picture = "clusters", "plot_clusters"
     """The clusters over the two columns that tell them apart best."""
-
     samples: Samples
     assigned: Int[np.ndarray, " n"]
     method: str

@@ -25,7 +25,6 @@ from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
-
 RESAMPLES = 200
 """Bootstrap samples behind an interval."""
 MAX_SHOWN = 20

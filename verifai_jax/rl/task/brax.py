@@ -27,7 +27,6 @@ from verifai_jax.systems.environments.brax_model import explain_errors
 if TYPE_CHECKING:
     from brax.envs.base import Env
     from brax.envs.base import State as BraxState
-
 Option = float | str
 """A keyword argument of an environment: a number or text."""
 

@@ -60,7 +60,6 @@ class OdeTask:
     """
 
     weights: ClassVar[tuple[str, ...]] = ()
-
     loop: Ode
     action: Action
     time_limit: int

@@ -31,7 +31,6 @@ from verifai_jax.systems.blackbox import worker_process
 from verifai_jax.systems.blackbox.worker_process import START, main_guard, pickled_setup
 
 log = logging.getLogger("verifai_jax.workers")
-
 WORKER_ENVIRONMENT = {
     "JAX_PLATFORMS": "cpu",
     "OMP_NUM_THREADS": "1",
@@ -44,13 +43,10 @@ POLL_SECONDS = 0.5
 """Time between two checks that a silent worker is alive."""
 SLOW_IMPORT_SECONDS = 30.0
 """Time until the log says that a worker is still importing."""
-
 DROPPED = "an answer of a worker belonged to another simulation and was dropped"
 """The note of a simulation before whose answer there came one to another question."""
-
 REMEMBERED = 1 << 16
 """Simulations whose workers a pool remembers."""
-
 # True in a worker that still imports the simulator.
 _numbers = itertools.count()
 

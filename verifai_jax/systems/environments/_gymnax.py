@@ -23,14 +23,12 @@ from verifai_jax.systems.environments.policy_loop import PolicyLoop, check_versi
 from verifai_jax.systems.pytree_checks import check_like, outline
 
 OLDEST = (1, 0, 1)
-
 Env: TypeAlias = Any
 """A `gymnax` Environment; gymnax is an optional package, so its types cannot be imported here."""
 Params: TypeAlias = Any
 """The parameters of an environment, a dataclass of its own."""
 Space: TypeAlias = Any
 """A space of `gymnax.environments.spaces`."""
-
 # Parameters that gymnax stores but that follow from others; it does not recompute them.
 DERIVED: dict[str, dict[str, Callable[[Any], Any]]] = {
     "CartPole-v1": {

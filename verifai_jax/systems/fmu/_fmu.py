@@ -31,10 +31,8 @@ from verifai_jax.systems.fmu.library import FMUError, Instance
 
 if TYPE_CHECKING:
     import pandas as pd
-
 Controller: TypeAlias = Callable[[float, dict[str, float], Features], Mapping[str, float]]
 """From time, outputs by name and features to inputs by name."""
-
 _instances: dict[tuple[Path, bool, str], Instance] = {}
 """Instances of this process, which the next simulation resets and uses again."""
 
@@ -51,7 +49,6 @@ class FMUSimulation:
     controller: Controller | None
     reuse: bool
     description: Description = field(repr=False)
-
     exact_step = True
     """The steps belong to the FMU and its controller."""
 

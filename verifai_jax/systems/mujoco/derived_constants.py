@@ -23,7 +23,6 @@ from verifai_jax.systems.mujoco.part_paths import GEOM_MASS, MjModel
 
 _PLANE, _HFIELD, _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = range(7)
 _SHAPES = (_SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX)
-
 Leaves = dict[str, Float[Array, "..."]]
 
 

@@ -55,7 +55,6 @@ def rollout(loop: Loop, features: Features, key: Seed) -> Trace:
         qacc_warmstart=jnp.zeros_like(start["qvel"]),
         sensordata=blank.sensordata,
     )
-
     progress = loop.initial_progress(features, key)
     arrays = {name: jnp.zeros(shape, physics.qpos.dtype) for name, shape in loop.shapes.items()}
     form: Sample = jax.eval_shape(lambda: loop.sample(jnp.int32(0), arrays, progress, features)[0])

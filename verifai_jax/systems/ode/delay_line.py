@@ -31,7 +31,6 @@ class DelayLine:
 
     # JAX rebuilds the class with placeholders and with batches, which have other shapes.
     __no_type_check__ = True
-
     values: Float[Array | np.ndarray, "n *shape"]
     latest: Float[Array | np.ndarray, ""]
     period: float = field(metadata={"static": True})

@@ -45,7 +45,6 @@ class LookupTable:
 
     # JAX rebuilds the class with placeholders and with batches, which have other shapes.
     __no_type_check__ = True
-
     axes: tuple[tuple[float, ...], ...] = field(metadata={"static": True})
     values: Float[Array | np.ndarray, "*grid"]
     beyond: str = field(default="clip", metadata={"static": True})

@@ -23,7 +23,6 @@ Inputs: TypeAlias = tuple[PyTree, PyTree]
 """The control and the features of a step."""
 BISECTIONS = 12
 """Halvings of the step on a cubic through its ends; one of Newton's steps follows."""
-
 SHORT = 20
 """Operations of the dynamics up to which XLA compiles the stages of `rk4` written out; where there
 are more, a loop over the stages compiles faster."""
@@ -147,13 +146,11 @@ class _Step:
         still = replace(still, time=_still(time), dt=_still(dt))
         share, first, slope, course = still.located(_still(end), happens)
         reached = self.advance(self.derivative, time, self.state, share * dt)
-
         # The instant moves with all that the guard there depends on, and the state with it.
         value = _chosen(first, self.guards(time + share * dt, reached))
         moves = (value - _still(value)) / slope
         share = share - moves
         reached = jax.tree.map(lambda leaf, rate: leaf - rate * moves, reached, course)
-
         instant = time + share * dt
         jumped = self.reset(first, instant, reached)
         rest = self.advance(self.derivative, instant, jumped, (1 - share) * dt)

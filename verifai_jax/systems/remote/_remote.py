@@ -29,7 +29,6 @@ from verifai_jax.systems.remote.connection import Batch, File, Rules, server_con
 from verifai_jax.systems.remote.server import Server
 
 log = logging.getLogger("verifai_jax.remote")
-
 MAX_BYTES = 16 << 20
 """Bytes of one message of a client, unless `remote` is given another limit."""
 MAX_MEMORY = 256 << 20

@@ -276,7 +276,6 @@ def keep_alive(sock: socket.socket) -> None:
 
 
 log = logging.getLogger("verifai_jax.remote")
-
 REMINDER = 10.0
 """Seconds without a client until the log says so; then twice as long, up to 60."""
 

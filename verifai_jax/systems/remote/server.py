@@ -23,7 +23,6 @@ from verifai_jax.systems.remote import connection, wire
 from verifai_jax.systems.remote.connection import Absence, Batch, Client, Point, Rules, keep_alive
 
 log = logging.getLogger("verifai_jax.remote")
-
 TICK = 0.1
 """Seconds between two checks of timeouts."""
 MAX_LOGGED = 20
