@@ -95,7 +95,6 @@ class _RayFuture(concurrent.futures.Future):
         reference.future().add_done_callback(self._finish)
 
     def cancel(self) -> bool:
-        """Take the task out of Ray's queue."""
         if self.done():
             return False
         self._ray.cancel(self._reference)

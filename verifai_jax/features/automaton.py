@@ -370,7 +370,6 @@ class Automaton(Domain):
         return self._written.from_columns(row, name)
 
     def facts(self, name: str) -> Facts:
-        """Return what is known of the events' columns: kinds, and bounds over all their kinds."""
         found = {f"{name}.length": {**integer_facts(0, self.max_events), "length": True}}
         for item in indexed(name, self.max_events):
             # An absent event is a choice of its own.

@@ -116,7 +116,6 @@ class Categorical(Domain):
 
     @cached_property
     def numeric(self) -> bool:
-        """True if a value is the choice itself rather than its index in `choices`."""
         return self._dtype.kind != "O"
 
     @cached_property

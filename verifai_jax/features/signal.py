@@ -177,11 +177,6 @@ class Signal(Domain):
         return tuple(f"{part} {time}" for time in times for part in parts)
 
     def spans(self, duration: float) -> list[tuple[float, float]]:
-        """Return from when to when each control point changes the function, in seconds.
-
-        **Arguments:**
-        - `duration`: the duration of the simulation in seconds; that of the signal comes first.
-        """
         length = self.duration or duration
         return acting_spans(self.knots, self.hold, self.times, self.width, length)
 
@@ -219,7 +214,6 @@ class Signal(Domain):
         return replace(self, knots=count - factor + 1 if self.hold == "linear" else count)
 
     def refine(self, value: Waveform, factor: int) -> Waveform:
-        """Convert a value to one of `refined(factor)`: the same function of time."""
         return value.refined(factor)
 
     def waveform(self, knots: Float[Array | np.ndarray, "*knots"]) -> Waveform:

@@ -72,7 +72,6 @@ class CheckedSystem(System):
         self.backends, self.backend, self.likely = system.backends, system.backend, system.likely
 
     def why_slow_to_compile(self, gradient: bool) -> str:
-        """Say what the system says."""
         return self.system.why_slow_to_compile(gradient)
 
     @property

@@ -69,10 +69,6 @@ class FunctionRuns(TrainingRuns):
             )
 
     def add(self, values: Mapping[str, object], seed: int) -> int:
-        """Add a training.
-
-        **Returns:** its number.
-        """
         steps = whole_number(values.get(STEPS, self._trainer.steps), STEPS)
         key = digest({name: values[name] for name in sorted(values)})
         checkpoints = self.study.checkpoints_of(steps)
@@ -97,7 +93,6 @@ class FunctionRuns(TrainingRuns):
             self.forget(numbers)
 
     def forget(self, numbers: Sequence[int]) -> None:
-        """Delete the folders of trainings that do not continue."""
         for number in numbers:
             shutil.rmtree(self._folder_of(number), ignore_errors=True)
 

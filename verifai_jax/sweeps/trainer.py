@@ -327,12 +327,10 @@ class FunctionTrainer(Trainer):
 
     @property
     def name(self) -> str:
-        """Its name."""
         return getattr(self.train, "__name__", type(self.train).__name__)
 
     @property
     def evaluation_task(self) -> Task | None:
-        """Task on which nominal returns are measured; None for those of the learning curve."""
         return self.nominal
 
     @property
@@ -341,7 +339,6 @@ class FunctionTrainer(Trainer):
         return {self.name: self.train}
 
     def algorithms_in(self, space: FeatureSpace) -> tuple[str, ...]:
-        """Return its name, whatever the space calls an algorithm."""
         return (self.name,)
 
     def used_hyperparameters(self, values: Mapping[str, Any]) -> tuple[str, ...]:
@@ -349,7 +346,6 @@ class FunctionTrainer(Trainer):
         return tuple(values)
 
     def untrained_policy(self, name: str) -> Any:
-        """Return the example."""
         return load(self.example, observation=self.observation)
 
     def check(self, space: FeatureSpace) -> None:

@@ -71,7 +71,6 @@ class Gymnax(PolicyLoop):
         return _as_action(action, self.env.action_space(self.params), self.name)
 
     def _configured(self, features: Features) -> Params:
-        """Return the environment's parameters under the features of an instant."""
         params = self.params
         if self.features:
             fields = {field: features[name] for name, field in self.features.items()}

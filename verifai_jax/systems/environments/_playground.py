@@ -40,7 +40,6 @@ class Playground(Brax):
 
     @property
     def reverse_hint(self) -> str:
-        """A sentence on why derivatives in reverse mode may not exist."""
         return f"{self.name}: MJX's constraint solver loops until it converges"
 
     def _configured(self, features: Features) -> Any:

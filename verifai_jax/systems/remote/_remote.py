@@ -74,7 +74,6 @@ class Remote(System):
         return max(1, len(self.clients))
 
     def abstract(self, features: Features) -> Trace | None:
-        """Return the form of the traces, if it is given."""
         return self.rules.declared.abstract()
 
     def __call__(self, features: Features, key: Seed = None) -> Trace:
