@@ -29,8 +29,6 @@ def check_name(
     - `lines`: whether it may have line breaks and other control characters.
     - `error`: type of the error to raise.
 
-    **Returns:** the name.
-
     **Raises:** `error` for anything but a text that is not empty and that UTF-8 can hold.
     """
     if not isinstance(name, str) or not name:
@@ -66,8 +64,6 @@ def check_fraction(
     - `one`: whether 1 itself is allowed.
     - `error`: type of the error to raise.
 
-    **Returns:** the value, a number.
-
     **Raises:** `error` unless `0 < value < 1`, or the value is an end that is allowed.
     """
     if is_number(value) and (0 < value < 1 or (zero and value == 0) or (one and value == 1)):
@@ -87,8 +83,6 @@ def check_positive(
     - `name`: name of the argument in the error message.
     - `finite`: whether infinity is refused too.
     - `error`: type of the error to raise.
-
-    **Returns:** the value, a number.
 
     **Raises:** `error` unless `value > 0`.
     """
@@ -126,10 +120,7 @@ def check_count(
 def check_options(
     budget: object, batch: object, seed: object, max_seconds: object, stop_after: object
 ) -> None:
-    """Refuse numbers out of range.
-
-    **Raises:** `ValueError`.
-    """
+    """Refuse numbers out of range."""
     for name, value in (("budget", budget), ("batch", batch), ("stop_after", stop_after)):
         if name == "stop_after" and value is None:
             continue

@@ -92,8 +92,6 @@ def load_target(target: str, kind: type[Kind]) -> Kind:
       the name may be left out where the file defines one object of this kind.
     - `kind`: class of the object.
 
-    **Returns:** the object.
-
     **Raises:** `TargetError` where there is no such file or module, or no single object to take;
     `UnknownNameError` for a name that the file does not define, with those that it does.
     """
@@ -131,8 +129,6 @@ def target_of_project(target: object, folder: Path, *, kind: str, remedy: str) -
     - `folder`: folder that records it.
     - `kind`: noun of the object, such as `"problem"`, for the message.
     - `remedy`: words on how to name the target by hand, for the message.
-
-    **Returns:** the target.
 
     **Raises:** `TargetError` for any other target.
     """

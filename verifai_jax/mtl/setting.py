@@ -73,10 +73,7 @@ def as_formula(formula: Formula | str) -> Formula:
 
 
 def check_trace(trace: object) -> None:
-    """Refuse anything that is not a trace, and say how to make one of it.
-
-    **Raises:** `TypeError`.
-    """
+    """Refuse anything that is not a trace, and say how to make one of it."""
     if isinstance(trace, Trace):
         return
     if hasattr(trace, "columns"):

@@ -162,11 +162,6 @@ def same(value: Elements) -> Any:
     return first if all(each is first for each in flat) else None
 
 
-def shape_of(value: Value) -> tuple[int, ...]:
-    """Return the shape of a value."""
-    return value.shape
-
-
 def names_in(value: Value) -> Iterator[str]:
     """Yield the names of the program of which a value is made, one as often as it occurs."""
     if isinstance(value, Memory):

@@ -55,8 +55,6 @@ def film(
     - `camera`: as for `frames`.
     - `fps`: frames a second; `FRAMES_PER_SECOND` when left out.
 
-    **Returns:** the path.
-
     **Raises:** `NoRenderer`; `UnknownNameError` for a camera that the model lacks.
     """
     check_film(size, fps)
@@ -87,8 +85,6 @@ def strip(
     - `count`: instants.
     - `size`: width and height of each in pixels.
     - `camera`: as for `frames`.
-
-    **Returns:** the path.
 
     **Raises:** as `film`.
     """

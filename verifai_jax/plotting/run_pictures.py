@@ -22,8 +22,6 @@ def write_run_pictures(run: Run, folder: str | Path) -> list[Path]:
 
     **Arguments:**
     - `folder`: to write into; made if missing.
-
-    **Returns:** the paths of the pictures.
     """
     folder = Path(folder)
     paths = [folder / "features.png", folder / "robustness.png"]
@@ -46,8 +44,6 @@ def write_replay_pictures(
     **Arguments:**
     - `folder`: to write into; made if missing.
     - `name`: the name of the files, without an ending; by default that of the row.
-
-    **Returns:** the paths of the pictures.
     """
     folder = Path(folder)
     name = name or ("replay" if replay.row is None else f"row-{replay.row}")

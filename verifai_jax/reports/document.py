@@ -78,8 +78,6 @@ def write_report(
       credibility with boxes to be filled in, and a page to be signed.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
 
-    **Returns:** the path of the HTML file.
-
     **Raises:** `UnknownNameError` for a unit or a reason of a feature that does not exist;
     `ValueError` for a number of simulations that is none, and for a run whose rows have changed
     since they were written;

@@ -209,10 +209,7 @@ class Sampling:
         return scene
 
     def check_own(self, scene: Any) -> None:
-        """Refuse a scene that does not come from this compilation of the program.
-
-        **Raises:** `ValueError`.
-        """
+        """Refuse a scene that does not come from this compilation of the program."""
         if not hasattr(scene, "sample") or not hasattr(scene, "dynamicScenario"):
             raise ValueError(f"a scene is one that Scenic draws; got {type(scene).__name__}")
         if scene.dynamicScenario is not self.scenario.dynamicScenario:

@@ -123,8 +123,6 @@ def evidence_below(failures: Counts, simulations: Counts, rate: Counts) -> Float
     - `failures`, `simulations`: numbers of samples, which broadcast; `failures` may be fractions,
       for what is expected of samples to come.
     - `rate`: rates to reject from above.
-
-    **Returns:** the logarithms.
     """
     from scipy.special import betainc, betaln
 
@@ -146,8 +144,6 @@ def evidence_above(failures: Counts, simulations: Counts, rate: Counts) -> Float
     The mixture has a density proportional to `t^(-1/2) (1-t)^(-1/2)` there.
 
     **Arguments:** as `evidence_below`, with rates to reject from below.
-
-    **Returns:** the logarithms.
     """
     from scipy.special import betaincc, betaln
 

@@ -64,8 +64,6 @@ def make_proposer(
     - `configurations`: number of proposals in all.
     - `batch`: configurations in a round.
 
-    **Returns:** the proposer.
-
     **Raises:** `UnknownNameError` for another name; `ValueError` for a search that needs gradients
     or does not fit this space; `TypeError` for something that is not a search; `MissingExtra`
     without Optuna.

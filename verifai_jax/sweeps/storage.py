@@ -71,8 +71,6 @@ def write_sweep(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> Pat
     - `table`: its table, the columns of the record.
     - `folder`: the folder; it is created.
 
-    **Returns:** the folder.
-
     **Raises:** `FolderInUse` where another process writes it; `OSError` for what the file system
     refuses, which leaves what was there.
     """

@@ -413,10 +413,7 @@ def _cast(present: object, value: object, name: str) -> object:
 
 
 def whole_number(value: object, name: str) -> int:
-    """Return a whole number that a hyper-parameter must be.
-
-    **Raises:** `ValueError`.
-    """
+    """Return a whole number that a hyper-parameter must be."""
     if not is_number(value) or int(value) != value:
         raise ValueError(f"{name} must be a whole number (DiscreteBox, Categorical); got {value!r}")
     return int(value)

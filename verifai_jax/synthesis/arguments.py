@@ -24,10 +24,7 @@ ATTACK = 20_000
 
 
 def check_numbers(margin: float, **counts: int) -> None:
-    """Check that numbers are in range.
-
-    **Raises:** `ValueError`.
-    """
+    """Check that numbers are in range."""
     if isinstance(margin, bool) or not isinstance(margin, int | float) or not margin >= 0:
         raise ValueError(f"margin must be a robustness of at least 0; got {margin!r}")
     for name, count in counts.items():

@@ -44,8 +44,6 @@ def check_space(space: Space, name: str, delayed: bool) -> None:
 
     **Arguments:**
     - `delayed`: whether actions arrive late, so that one has to stand for none.
-
-    **Raises:** `ValueError`.
     """
     if space is None:
         raise ValueError(f"{name} has no action_space, by which the policy's actions are checked")
