@@ -29,6 +29,8 @@ LINK = re.compile(r"(!?)\[([^\]\n]*(?:\n[^\]\n]*)?)\]\(([\w./-]+)(#[\w-]+)?\)")
 IMAGE = re.compile(r'(<img src=")([\w./-]+)(")')
 BLOCK = re.compile(r"(^```.*?^```)", re.DOTALL | re.MULTILINE)
 ANSI = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
+SECTIONS = ("**Returns:**", "**Raises:**", "**Yields:**")
+"""Beginnings of paragraphs that follow arguments, or each other, in a docstring."""
 LONGEST_OUTPUT = 6000
 """Characters of an output of a notebook that are shown."""
 
@@ -53,10 +55,10 @@ def on_config(config: Any) -> Any:
 
 
 class Sections(Extension):
-    """Lists that begin right below `**Arguments:**`, as those of docstrings do."""
+    """Sections of docstrings, `**Arguments:**` and others, without empty lines between them."""
 
     def extendMarkdown(self, md: Markdown) -> None:
-        """Add the empty line that Markdown needs in front of a list."""
+        """Add the empty lines that Markdown needs in front of a list and of a paragraph."""
         md.preprocessors.register(_Spaced(md), "sections", priority=15)
 
 
@@ -64,7 +66,9 @@ class _Spaced(Preprocessor):
     def run(self, lines: list[str]) -> list[str]:
         spaced: list[str] = []
         for line in lines:
-            if line.startswith("- ") and spaced and spaced[-1].startswith("**"):
+            before = spaced[-1] if spaced else ""
+            begins = line.startswith("- ") and before.startswith("**")
+            if begins or (before and line.startswith(SECTIONS)):
                 spaced.append("")
             spaced.append(line)
         return spaced

@@ -76,9 +76,7 @@ class Boundary(InNotebook):
 
         **Arguments:**
         - `points`: a dictionary of the features of one point, or a DataFrame of several.
-
         **Returns:** a number, or an array; NaN where no row lies near (`sampled`).
-
         **Raises:** `KeyError` for a feature that is missing.
         """
         frame = _frame(points, self.samples)
@@ -98,9 +96,7 @@ class Boundary(InNotebook):
 
         **Arguments:**
         - `count`: number of points.
-
         **Returns:** their features, with `probability` and `sampled`.
-
         **Raises:** `ValueError` for rows whose space is not known.
         """
         check_count("count", count)
@@ -155,9 +151,7 @@ def boundary(source: Source, *, seed: int = 0) -> Boundary:
     **Arguments:**
     - `source`: a run, its table, a DataFrame, or `Samples`; rows with a verdict count.
     - `seed`: the seed of the folds, and of the points of the prior.
-
     **Returns:** the `Boundary`.
-
     **Raises:** `ValueError` for fewer than ten failures, or ten safe rows.
     """
     samples = Samples.of(source, "all")

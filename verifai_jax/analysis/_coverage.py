@@ -123,7 +123,6 @@ def coverage(source: Source, *, cells: int = 10, seed: int = 0) -> Coverage:
     - `cells`: into how many equal parts the range of a feature is cut, fewer where rows are too few
       to fill them; a discrete feature of up to 20 values has a cell for each.
     - `seed`: the seed of everything that is drawn at random.
-
     **Returns:** a `Coverage`.
 
     Uniform means distributed by the prior: coordinates are those in which it is uniform, or shares

@@ -78,7 +78,6 @@ def diverse(
     - `k`: how many; all rows if there are no more.
     - `start`: the number of the first row, instead of that of the least robustness.
     - `scale`: as in `Samples.scaling`.
-
     **Returns:** a `Diverse`.
 
     Rows that equal a chosen one come last, at a distance of 0. Of rows that are equally far the

@@ -190,7 +190,6 @@ def frequent_patterns(
     An absent item of an array has no value.
 
     **Returns:** `FrequentPatterns`.
-
     **Raises:** `ValueError` for no unordered column and no
     `bins`; a `size` or number of bins below 1; a minimum outside (0, 1]; `against="prior"` without
     a space that knows the prior; more than 50 000 combinations.

@@ -104,7 +104,6 @@ def importance(
     - `repeats`: how often each feature is shuffled.
     - `seed`: the seed of everything that is drawn at random.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Returns:** an `Importance`.
 
     Half of the rows (4000 at most) train an ensemble of trees; the loss is measured on others. Two

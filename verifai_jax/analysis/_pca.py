@@ -241,9 +241,7 @@ def pca(
     - `scale`: `"range"` compares features by their range in the space, `"raw"` does not scale
       (VerifAI), `"standard"` gives the components of the correlation matrix, `"rows"` compares by
       the range of the rows.
-
     **Returns:** `Components`.
-
     **Raises:** `ValueError` for no ordered column, or more components than rows or columns.
     """
     samples = Samples.of(source, which, columns, space)

@@ -184,7 +184,6 @@ def rules(
     - `held_out`: share of the rows that are kept aside to measure coverage and precision, drawn by
       `seed` among failing and safe rows alike.
     - `seed`: the seed of the rows kept aside.
-
     **Returns:** `Rules`; with fewer than 10 failing or safe rows there are no rules, and the result
     says so. Nor does it have a box in which fewer than 3 of the failing rows kept aside lie, or
     failures are not clearly denser (by the interval of its precision) than everywhere. A condition

@@ -89,7 +89,6 @@ def k_closest(
       name the columns for that.
     - `k`: how many; None or more than there are gives all.
     - `scale`: as in `Samples.scaling`; `"rows"` is VerifAI's.
-
     **Returns:** `Neighbours`, the nearest first.
 
     Takes about `n log n` steps over up to 20 ordered columns, `n^2` over more.
@@ -133,9 +132,7 @@ def nearest(
       a row of the table, which need not be among those looked at.
     - `k`: how many; all rows if there are no more.
     - `scale`: as in `Samples.scaling`.
-
     **Returns:** `Neighbours`, the nearest first.
-
     **Raises:** `ValueError` for a `k` below 1, or a feature that is missing or none of the choices;
     `IndexError` for a row number that is not in the table.
     """
@@ -173,9 +170,7 @@ def random_rows(
     - `columns`, `which`, `space`: as in `Samples.of`.
     - `k`: how many.
     - `seed`: an integer, a NumPy generator or a `jax.random` key.
-
     **Returns:** `Neighbours`, in the order drawn.
-
     **Raises:** `ValueError` for a `k` below 1.
     """
     samples = Samples.of(source, which, columns, space)

@@ -62,7 +62,6 @@ class OddCoverage(InNotebook):
 
         **Arguments:**
         - `count`: number of points.
-
         **Returns:** their features, a row each, with `new`, the cells and pairs that each occupies.
         """
         check_count("count", count)
@@ -127,9 +126,7 @@ def odd_coverage(
     - `cells`: cells of a range; an integer of up to 20 values and literals have one a value.
     - `seed`: the seed of the points by which shares of a domain are measured whose conditions
       couple attributes, and of those of the prior.
-
     **Returns:** an `OddCoverage`.
-
     **Raises:** `ValueError` for no rows, and an attribute with a feature and without a range.
     """
     check_count("cells", cells, 2)

@@ -47,7 +47,6 @@ def read_odd(path: str | Path) -> OperationalDomain:
 
     **Arguments:**
     - `path`: the file. Without `features` each attribute is a feature of its last name.
-
     **Raises:** `FileNotFoundError`; `ValueError` naming the entry, for any other file.
     """
     path = Path(path)

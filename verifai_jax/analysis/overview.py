@@ -156,7 +156,6 @@ def analyze(
     - `source`: a run, its table, or a DataFrame with feature columns.
     - `seed`: the seed of everything that is drawn at random.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Returns:** an `Analysis`.
 
     Failures, rules, importance of features, clusters, principal components, frequent patterns,

@@ -61,7 +61,6 @@ class Outcome(NamedTuple):
         **Arguments:**
         - `metric`: the column to compare.
         - `reference`: the arm that is subtracted.
-
         **Returns:** the mean difference of each other arm, over the seeds in which both are finite.
         """
         other = self.values(reference, metric)

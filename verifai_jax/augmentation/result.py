@@ -95,10 +95,8 @@ class Augmentation(InNotebook):
         **Arguments:**
         - `metric`: name of a column that measures a network.
         - `reference`: the arm that is subtracted, or `"base"`.
-
         **Returns:** the mean difference of each other arm, over the seeds in which both are finite;
         without an interval where that is one seed.
-
         **Raises:** `UnknownNameError` for an arm or a metric that the table has not.
         """
         check_names("metric", [metric], self.metrics)
@@ -121,7 +119,6 @@ class Augmentation(InNotebook):
         **Arguments:**
         - `arm`: name of the arm.
         - `seed`: number of the seed.
-
         **Raises:** `UnknownNameError` for an arm that the table has not; `ValueError` for a seed.
         """
         check_names("arm", [arm], self.arms)
@@ -147,9 +144,7 @@ class Augmentation(InNotebook):
         **Arguments:**
         - `path`: file that the picture is written to, if given.
         - `metric`, `reference`: as in `compare`.
-
         **Returns:** the figure.
-
         **Raises:** as `compare`.
         """
         draw = lazy_import("verifai_jax.plotting.augmentation", "plot_arms")
@@ -168,9 +163,7 @@ class Augmentation(InNotebook):
         - `path`: file that the picture is written to, if given.
         - `arm`, `seed`: as in `examples`.
         - `count`: images at most.
-
         **Returns:** the figure.
-
         **Raises:** as `examples`; `ValueError` for inputs that are no images, or an arm that added
         nothing.
         """

@@ -73,7 +73,6 @@ class SupervisedTask:
     - `lanes`: inputs that are rendered together.
     - `black_box`: True where render, label, predict, wrongness, present and detected are plain
       Python that JAX cannot trace; they get NumPy arrays, and searches do without gradients.
-
     **Raises:** `TaskError` for an empty name, a function that is none, spaces that do not fit, or a
     feature with the name of a column of results.
     """

@@ -43,7 +43,6 @@ def flip(share: float = 0.5) -> Transformation:
 
     **Arguments:**
     - `share`: the share of images that are mirrored.
-
     **Raises:** `ValueError` for a share out of range.
     """
     check_fraction("share", share, zero=True, one=True)
@@ -63,7 +62,6 @@ def shift(pixels: int) -> Transformation:
 
     **Arguments:**
     - `pixels`: by which an image moves at most, in each direction.
-
     **Raises:** `ValueError` unless it is a positive integer.
     """
     check_count("pixels", pixels)
@@ -89,7 +87,6 @@ def brightness(max_change: float) -> Transformation:
 
     **Arguments:**
     - `max_change`: change of brightness at most, a share.
-
     **Raises:** `ValueError` for a share out of range.
     """
     return _scaled(max_change, jnp.zeros_like)
@@ -100,7 +97,6 @@ def contrast(max_change: float) -> Transformation:
 
     **Arguments:**
     - `max_change`: change of contrast at most, a share.
-
     **Raises:** `ValueError` for a share out of range.
     """
 

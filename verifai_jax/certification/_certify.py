@@ -336,7 +336,6 @@ def repeat_failures(
     **Arguments:**
     - `blocks`: that simulate the policies.
     - `sampled`, `attacked`: its simulations, whose verdicts are replaced.
-
     **Returns:** the counts, which as text say what that means of the system.
     """
     rows = [

@@ -74,7 +74,6 @@ class Blocks:
     - `lanes`: samples in a block.
     - `devices`: JAX devices to use; all of this process when left out.
     - `executor`: whose workers simulate; this process when left out.
-
     **Raises:** `ProblemError` as `Problem.check` does, naming the policy, before anything compiles;
     `ValueError` for policies whose problems have other features than the first.
     """
@@ -196,7 +195,6 @@ class Blocks:
         **Arguments:**
         - `numbers`: the numbers of the simulations, which their random keys come from.
         - `of_attack`: whether they are simulations of the attack, or samples.
-
         **Returns:** the least robustness of each, NaN without a verdict; and whether it fails.
         """
 

@@ -124,7 +124,6 @@ def simulate_blocks(
 
     **Arguments:** as of `ExecutorSimulator`, with the `policies` of these blocks by their numbers,
     and a `name` that sets policies by themselves apart from those of other simulators.
-
     **Returns:** `rho`, `status` and `violated` of each block; `messages` by policy; `seconds`.
     """
     indices = {number: index for index, (number, _) in enumerate(policies)}

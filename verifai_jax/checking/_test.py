@@ -57,10 +57,8 @@ def test(
     - `corpus`: folder of saved counterexamples, from the root of the project; by default
       `counterexamples`, or pytest's setting `vj_corpus`.
     - `rename`: new names of features that older files of the corpus have.
-
     **Returns:** a decorator of a test function, which is called after the test has passed; a
     parameter `run` gets the `Run`, and all others are pytest's fixtures.
-
     **Raises:** `TypeError` for something that is not a problem; `ValueError` for numbers out of
     range, and for a budget with which no test could pass.
     """

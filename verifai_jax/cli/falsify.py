@@ -232,7 +232,6 @@ def print_run(
     **Arguments:**
     - `options`: the options of the command that the record does not hold, to be given again on
       resuming.
-
     **Raises:** `CommandError` where no simulation has a verdict.
     """
     click.echo(run.summary())

@@ -241,9 +241,7 @@ def monitor_stream(
     - `dt`: the sampling period in seconds, instead of a column of times.
     - `show`: what prints a line.
     - `hold`: whether a gap keeps the last value of its signal.
-
     **Returns:** whether the formula holds; with the last sample held, if the samples have ended.
-
     **Raises:** `ValueError` for lines that are no evenly spaced samples; `CommandError` for a NaN.
     """
     from verifai_jax import mtl

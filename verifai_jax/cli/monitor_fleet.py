@@ -54,7 +54,6 @@ def monitor_fleet(
     **Arguments:**
     - `jobs`: processes that judge; more than one are started for it.
     - `options`: the options of `judge`: how recordings are read.
-
     **Raises:** `CommandError` where nothing has a verdict.
     """
     from verifai_jax import mtl

@@ -33,7 +33,6 @@ def connect(address: str) -> Iterator[Executor]:
     - `address`: `dask://HOST:PORT` of a scheduler; `ray://HOST:PORT` of a head node's client
       server, or `ray://auto` for the cluster that this machine is part of; `slurm`, with parameters
       of submitit where they are wanted: `slurm?slurm_partition=cpu&timeout_min=60&jobs=32`.
-
     **Raises:** `ValueError` for another address; `MissingExtra` where the package is not installed;
     `OSError` where there is no cluster.
     """
@@ -117,7 +116,6 @@ class RayExecutor:
       already, or else a new one on this machine, when left out.
     - `cpus`: cores that a block takes.
     - `gpus`: GPUs that a block takes.
-
     **Raises:** `MissingExtra` where Ray is not installed; what Ray raises where it cannot connect.
     """
 

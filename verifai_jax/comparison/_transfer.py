@@ -84,9 +84,7 @@ def transfer(
     - `batch`: pairs at once.
     - `precision`: the precision of the simulations.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Returns:** a `Transfer` with the table of all pairs.
-
     **Raises:** before anything is simulated, `ProblemError` for problems without a common feature
     or signal; `TypeError` for anything but a `Problem`; `ValueError` for numbers out of range
     and a search that needs gradients.

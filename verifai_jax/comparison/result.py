@@ -128,7 +128,6 @@ class Comparison(InNotebook):
         **Arguments:**
         - `path`: the path of the HTML file.
         - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`, `errors`.
-
         **Returns:** the path.
         """
         return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
@@ -230,7 +229,6 @@ class Transfer(InNotebook):
         **Arguments:**
         - `path`: the path of the HTML file.
         - `options`: the options of `reports.write_report`: `units`, `reasons`.
-
         **Returns:** the path.
         """
         return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
@@ -240,7 +238,6 @@ class Transfer(InNotebook):
 
         **Arguments:**
         - `path`: the picture that is written; none when left out.
-
         **Returns:** the figure.
         """
         return lazy_import("verifai_jax.plotting.transfer", "plot_transfer")(self, path)

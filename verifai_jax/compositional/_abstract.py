@@ -95,10 +95,8 @@ def abstract(
     - `seed`: the same seed gives the same result, bit for bit, on the same machine.
     - `images_per_simulation`: where it is not one at each sample of a trace.
     - `progress`: show a progress bar; by default on a terminal or in a notebook.
-
     **Returns:** the region, the images, the candidates and which of them fail in the loop, with the
     number of rendered images of each stage.
-
     **Raises:** before anything is rendered, `ProblemError` for parts that do not fit; `ValueError`
     for numbers out of range, or a search that cannot work on the space.
     """

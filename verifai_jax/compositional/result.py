@@ -80,7 +80,6 @@ class Compositional(InNotebook):
 
         **Arguments:**
         - `number`: 0 is the first that was found.
-
         **Raises:** `IndexError` where there are not as many.
         """
         failing = [run for run in self.simulations if len(run.table.counterexamples)]
@@ -111,9 +110,7 @@ class Compositional(InNotebook):
         **Arguments:**
         - `path`: file that the picture is written to, if given.
         - `features`: the columns; by default the two that the region depends on most.
-
         **Returns:** the figure.
-
         **Raises:** `UnknownNameError` for a column that the table has not.
         """
         draw = lazy_import("verifai_jax.plotting.compositional", "plot_region")

@@ -39,7 +39,6 @@ def replacing(path: str | Path, *, locked: bool = False) -> Iterator[Path]:
     **Arguments:**
     - `locked`: whether its folder is there and has no other writer. Then the file that a killed
       process leaves has a name that does not change, and the next writer takes it.
-
     **Raises:** `OSError` that names `path`, the reason and a remedy, for whatever the file system
     refuses.
     """
@@ -95,7 +94,6 @@ def unwritable(path: str | Path, error: OSError, more: str = "") -> OSError:
     **Arguments:**
     - `error`: the error of the file system; one of this function will do.
     - `more`: what becomes of the results, as a sentence.
-
     **Returns:** an error of the same kind and `errno`, whose message names the path, the reason
     and a remedy.
     """

@@ -28,7 +28,6 @@ def check_name(
     - `what`: what it names, for the message: `the name of a signal`.
     - `lines`: whether it may have line breaks and other control characters.
     - `error`: type of the error to raise.
-
     **Raises:** `error` for anything but a text that is not empty and that UTF-8 can hold.
     """
     if not isinstance(name, str) or not name:
@@ -63,7 +62,6 @@ def check_fraction(
     - `zero`: whether 0 itself is allowed.
     - `one`: whether 1 itself is allowed.
     - `error`: type of the error to raise.
-
     **Raises:** `error` unless `0 < value < 1`, or the value is an end that is allowed.
     """
     if is_number(value) and (0 < value < 1 or (zero and value == 0) or (one and value == 1)):
@@ -83,7 +81,6 @@ def check_positive(
     - `name`: name of the argument in the error message.
     - `finite`: whether infinity is refused too.
     - `error`: type of the error to raise.
-
     **Raises:** `error` unless `value > 0`.
     """
     if not (is_number(value) and value > 0 and not (finite and math.isinf(value))):
@@ -101,9 +98,7 @@ def check_count(
     - `value`: value to check; NumPy's integers are welcome, truth values and floats are not.
     - `minimum`: smallest value allowed.
     - `error`: type of the error to raise.
-
     **Returns:** the value as a Python integer.
-
     **Raises:** `error` for anything but an integer of at least `minimum`.
     """
     count = None

@@ -33,7 +33,6 @@ def spread_over_devices(
     - `split`: for each argument whether its leading axis is split; the others are given whole.
     - `devices`: JAX devices; all of this process when left out. Leading axes must be multiples of
       their number.
-
     **Returns:** a function of the whole arrays, to be traced by `jax.jit`; `function` itself where
     there is one device.
     """

@@ -31,7 +31,6 @@ class Drawn:
 
         **Arguments:**
         - `path`: file that the picture is written to, if given.
-
         **Returns:** the Matplotlib figure.
         """
         module, function = self._picture

@@ -51,7 +51,6 @@ def fingerprint(program: Any, derivatives: bool = True) -> str | None:
     - `program`: what JAX traced, with its constants.
     - `derivatives`: whether rules of derivatives are read too. They are traced for that, and only
       programs that differentiate this one depend on them.
-
     **Returns:** the hash in hexadecimal digits; None if a part of the function is opaque, such
     as a call of Python from the device.
     """
@@ -264,7 +263,6 @@ def as_function(program: Any, step: Any) -> tuple[Callable[..., list[Any]], list
     **Arguments:**
     - `program`: a `Jaxpr`.
     - `step`: one of its equations.
-
     **Returns:** the function, of one array for each variable, which returns the step's results; and
     the variables, each once.
     """
@@ -286,7 +284,6 @@ def of_some(
     - `call`: the other function, of arrays.
     - `values`: all of its arguments.
     - `indices`: numbers of those that the function takes; the others keep their values.
-
     **Returns:** the function, which returns those results that can have a derivative.
     """
 

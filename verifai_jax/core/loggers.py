@@ -28,7 +28,6 @@ class CSVLogger:
 
     **Arguments:**
     - `path`: the path of the file; one that is there is continued.
-
     **Raises:** `ValueError` for a file that is there and has no column `step`.
     """
 

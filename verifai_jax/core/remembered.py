@@ -50,7 +50,6 @@ def remembered_as(kind: str, *values: object) -> str | None:
     - `kind`: of the program, for people who look into the folder.
     - `values`: everything that determines the program, besides this package and JAX; see
       `identity`.
-
     **Returns:** the name; None if a value has no identity, or nothing is kept on disk.
     """
     if cache_folder() is None or None in values:
@@ -79,7 +78,6 @@ def lower_or_recall(
     - `arguments`: their shapes and types.
     - `form`: the structure of what it returns; left out for tuples, lists and dictionaries of
       arrays.
-
     **Raises:** what tracing raises.
     """
     if name is None:

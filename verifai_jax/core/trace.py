@@ -172,7 +172,6 @@ class Trace(InNotebook):
         - `time`: the column of sample times in seconds, or the name of the index; dates and
           durations become seconds since the first.
         - `dt`: the sampling period in seconds, instead of a column of times.
-
         **Raises:** `ValueError` for a frame without rows, numbers or sample times, and for times
         that do not increase.
         """
@@ -316,9 +315,7 @@ def check_code(name: str, value: Any, wanted: str) -> int | None:
 
     **Arguments:**
     - `name`, `wanted`: what it is and what it must be, for the message.
-
     **Returns:** the number where it is known and a single one, else None.
-
     **Raises:** `ValueError` for texts, fractions, truth values and lists.
     """
     if value is None:

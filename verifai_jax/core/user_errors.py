@@ -145,7 +145,6 @@ def check_called_with(
     - `role`: what the function is, for the message: "dynamics".
     - `function`: what was given; None if nothing was.
     - `arguments`: names of the arguments.
-
     **Raises:** `ValueError`, with what it takes and where it is defined.
     """
     if function is None:

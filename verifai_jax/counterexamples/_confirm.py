@@ -68,9 +68,7 @@ def confirm(
       few replays; of more, the worst and those nearest to zero, until the rest
       is far from it (see `evaluation.confirmer.Confirmer`).
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Returns:** a `Confirmation` for a row, `Confirmations` for all; after Ctrl-C what is finished.
-
     **Raises:** `ValueError` for a run without its problem, a row that is not a counterexample, an
     engine that does not fit; `IndexError` for a row that is not in the table.
     """

@@ -103,7 +103,6 @@ def explain(
     nominal features only the gradient tells what matters.
 
     **Returns:** an `Explained`.
-
     **Raises:** `ValueError` for a run without its problem or without a counterexample, a row that
     is none, or has no verdict when simulated again.
     """
@@ -204,7 +203,6 @@ def slopes_of(
     - `u`: the point at which the gradient was taken.
     - `gradient`: by the coordinates.
     - `precision`: in which it was taken.
-
     **Returns:** the derivative for each coordinate, in the unit of its number, NaN for choices,
     integers and lengths; and twice the width of the middle half, which is the whole of a Box.
     """

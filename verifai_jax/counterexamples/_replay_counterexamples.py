@@ -150,7 +150,6 @@ def replay_counterexamples(
     - `folder`: that `run.save_counterexamples` wrote into, or one file of it.
     - `rename`: new names of features by their old ones.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Raises:** `FileNotFoundError` for a place that does not exist; `TypeError` for something that
     is no `Problem`.
     """

@@ -188,9 +188,7 @@ def save_counterexamples(
     - `shrink`: whether each is first shrunk towards the nominal features, where these are known.
     - `budget`: simulations to shrink one with, at most.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Returns:** the paths of the files, none twice.
-
     **Raises:** `ValueError` for a run without its problem or without a counterexample.
     """
     problem = problem_of(run)
@@ -271,7 +269,6 @@ def read_corpus(folder: str | Path) -> tuple[dict[Path, SavedCounterexample], di
     Every file whose name ends in `.json`, in whatever case, belongs to it; what is hidden does not.
 
     **Returns:** the counterexamples by path, and what is wrong with the other files.
-
     **Raises:** `FileNotFoundError` where there is no such place.
     """
     location = Path(folder)

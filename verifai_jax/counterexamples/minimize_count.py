@@ -232,7 +232,6 @@ def minimize_count(candidates: Candidates, starts: Points, rng: np.random.Genera
     - `candidates`: simulates, and remembers what failed.
     - `starts` `[m, d]`: failing points to begin with.
     - `rng`: for random candidates.
-
     **Returns:** failing points `[n, d]`, the fewest departures first, then the nearest.
     """
     nominal = candidates.nominal

@@ -78,7 +78,6 @@ def minimize_distance(
     - `rng`: for random candidates.
     - `keep_nominal`: whether coordinates that are nominal stay so.
     - `rounds`: batches at most.
-
     **Returns:** the points reached `[n, d]`, one for each start.
     """
     nominal = candidates.nominal

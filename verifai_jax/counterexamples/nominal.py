@@ -47,7 +47,6 @@ class Nominal:
         **Arguments:**
         - `problem`: says what is nominal.
         - `nominal`: nominal values that override those of the problem.
-
         **Raises:** `ValueError` where neither names all features, or one is outside the space.
         """
         space = problem.space

@@ -26,7 +26,6 @@ def remove_items(candidates: Candidates, u: Float[np.ndarray, " d"]) -> Float[np
 
     **Arguments:**
     - `candidates`: simulates, and remembers what failed.
-
     **Returns:** the failing point with the least difference in items from nominal that was found.
     """
     nominal = candidates.nominal

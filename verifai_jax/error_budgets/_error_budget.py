@@ -80,9 +80,7 @@ def error_budget(
       the upper end (0 of a difference).
     - `seed`: the seed of the pairs: other samples than those of the result.
     - `confidence`: with which all intervals hold together.
-
     **Returns:** the `ErrorBudget`.
-
     **Raises:** `TypeError` for another result; `ValueError` for options out of range, a comparison
     without its baseline, and solvers with other features or formulas.
     """

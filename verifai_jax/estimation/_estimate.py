@@ -107,11 +107,9 @@ def estimate(
       `"slow"` then, and end at `within=1.5` where nothing else is said.
     - `proved`: what `verify` found of this problem, or the file of it. Where it showed that no
       point fails, or that all do, nothing is estimated, and all simulations are of the rest.
-
     **Returns:** the estimate with its interval and a guaranteed bound. Ctrl-C gives the estimate
     from the finished simulations. A simulation without a verdict (not finite, raised, out of time)
     is no failure in the estimate, and counts as one at the upper ends of interval and bound.
-
     **Raises:** before anything compiles, `TypeError` for something that is no `Problem`, and
     `ValueError` for options out of range, unknown names, a problem whose parts do not fit, a
     constraint that refuses every sample, or a verification of another problem.

@@ -73,9 +73,7 @@ def sequence(
     - `batch`: simulations at once.
     - `precision`: `"float32"` or `"float64"`.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Returns:** a `SequenceEstimate`.
-
     **Raises:** before anything is simulated, `ValueError` for fewer than two parts, for a run whose
     rows are no samples of the prior and for numbers out of range; `UnknownNameError` for features
     and signals that do not exist.

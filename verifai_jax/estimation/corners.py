@@ -40,7 +40,6 @@ def approach_corner(
     - `z`: failures.
     - `planes`: planes of a failure, at most.
     - `halvings`: halvings of each way.
-
     **Returns:** failures, none farther from the origin than its start, and the unit normals of the
     planes of each.
     """

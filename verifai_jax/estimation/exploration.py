@@ -93,9 +93,7 @@ def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int)
 
     **Arguments:**
     - `simulations`: number of them, about.
-
     **Returns:** the failures; empty if no descent found one.
-
     **Raises:** `Ended` where time is over.
     """
     begin = limit_state.simulations

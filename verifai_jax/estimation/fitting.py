@@ -55,7 +55,6 @@ def weigh_together(
     - `states`: number of states, which are alike and so worth less than they count.
     - `worth`: independent points that all of them are worth.
     - `weight`: the weight of the samples.
-
     **Returns:** weights of the states, then of the samples; the more the samples are worth, the
     less the states count.
     """

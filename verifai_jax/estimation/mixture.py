@@ -146,7 +146,6 @@ def optimal_shares(
       part, which is 1.
     - `weight`: weights of the failures, of sum one.
     - `defensive`: share of the defensive part.
-
     **Returns:** shares of the components, of sum one.
     """
     k = table.shape[1]

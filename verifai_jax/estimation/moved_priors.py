@@ -114,7 +114,6 @@ def share_out(
     **Arguments:**
     - `moves`: the mixture, in which all have equal parts.
     - `simulations`: number of simulations left; each stage takes a share of them.
-
     **Returns:** the proposal, with the promise of all stages together.
     """
     size = max(1, int(SHARE_OF_STAGE * simulations))

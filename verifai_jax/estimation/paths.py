@@ -50,9 +50,7 @@ def halve(
     **Arguments:**
     - `begin`: failures.
     - `end`: points that are taken not to fail; they are not simulated.
-
     **Returns:** the last failure found on each way, and a point just beyond it.
-
     **Raises:** `Ended` where time is over.
     """
     low, high = np.zeros((len(begin), 1)), np.ones((len(begin), 1))

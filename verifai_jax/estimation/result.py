@@ -112,10 +112,8 @@ class Estimate(Drawn, InNotebook):
         **Arguments:**
         - `p0`: failure probability to be shown, between 0 and 1.
         - `confidence`: the confidence of the bound; that of the estimate when left out.
-
         **Returns:** the number of samples in addition to those that `upper_bound` rests on; 0 if
         these show it already.
-
         **Raises:** `ValueError` unless `0 < p0 < 1`.
         """
         check_fraction("p0", p0)
@@ -200,7 +198,6 @@ class Estimate(Drawn, InNotebook):
         **Arguments:**
         - `path`: the path of the HTML file.
         - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`, `errors`.
-
         **Returns:** the path.
         """
         return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)

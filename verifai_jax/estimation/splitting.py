@@ -86,7 +86,6 @@ def run_splitting(
     - `first`: samples of the prior to begin with, and their score, failing and proper; drawn when
       left out.
     - `reserve`: simulations that are to be left over.
-
     **Returns:** the run; `stopped` says why it reached no failure.
     """
     run = SplittingRun()

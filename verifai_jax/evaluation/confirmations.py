@@ -70,7 +70,6 @@ def describe_checks(checks: Collection[str], *, of_step: bool = True) -> str:
     **Arguments:**
     - `checks`: their names, as in `Confirmations.checks`.
     - `of_step`: whether to say why there was none at a finer step.
-
     **Returns:** the end of a sentence, such as `in double precision and at a half and a quarter of
     the step`; empty without a check.
     """

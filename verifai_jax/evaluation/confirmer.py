@@ -156,7 +156,6 @@ class Confirmer:
         - `limit`: rows that are examined in all calls together; no limit when left out. Of more,
           the worst row and those nearest to zero are. A worse row than all before, together with
           some others, is examined beyond the limit, which is 1024 at least where the system wavers.
-
         **Raises:** as `FeatureSpace.from_row`, for columns that are no rows of this problem.
         """
         numbers = np.asarray(numbers, int)
@@ -198,7 +197,6 @@ class Confirmer:
         **Arguments:**
         - `columns`: the columns of all new rows, as the table will have them.
         - `first`: number of the first one in the run.
-
         **Returns:** which of the new rows violate the property, and what came of these.
         """
         violating = np.flatnonzero(columns["violated"])

@@ -175,7 +175,6 @@ class Evaluator:
           all or one each.
         - `first`: number of the first simulation; numbers go on from those before when left out.
         - `padded_to`, `keep_traces`, `journals`: as of `HostEngine.evaluate`, for a black box.
-
         **Raises:** `AlwaysRaises` where it was asked for.
         """
         start = self.simulations if first is None else first

@@ -60,7 +60,6 @@ class ExecutorEngine:
     - `given`: whether points are rows of given features, as of `CubePoints`.
     - `journal`: the journal of rows in flight, for a problem on the host.
     - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
-
     **Raises:** `TypeError` for anything that is not an executor; `ValueError` for one that cannot
     work here, or that cannot send the problem.
     """

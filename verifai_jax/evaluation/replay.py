@@ -118,7 +118,6 @@ class Replay(InNotebook):
         **Arguments:**
         - `path`: file that the picture is written to, if given.
         - `signals`: the signals, and features that are Signals, to draw; chosen when left out.
-
         **Raises:** `UnknownNameError` for a signal that does not exist.
         """
         return lazy_import("verifai_jax.plotting.replay", "plot_replay")(self, path, signals)
@@ -139,7 +138,6 @@ class Replay(InNotebook):
           left out.
         - `size`: width and height of a frame in pixels.
         - `fps`: frames a second; chosen when left out.
-
         **Raises:** `ValueError` for a problem without `draw` that has no MuJoCo model and is no
         environment of Gymnasium; `UnknownNameError` for a camera that the model lacks.
         """

@@ -112,7 +112,6 @@ class Replays:
         - `each`: features `[n, ...]` of all rows, as `FeatureSpace.features_of` gives them; the
           rows are simulated once with each.
         - `numbers`: the numbers of the rows, which their random keys come from.
-
         **Returns:** the verdicts of the rows, once for each.
         """
         together = self._together(len(numbers), len(each))
@@ -316,7 +315,6 @@ def finest_replays(
     **Arguments:**
     - `run`: precision of the run.
     - `key`, `executor`, `target`: as of `HostReplays`.
-
     **Returns:** the replays, None if they cannot be traced; notes on what is left out; what raised
     when it was traced, empty if nothing did.
     """
@@ -363,7 +361,6 @@ def replay_block(
       made anew.
     - `words`: the two words of the key of the run's simulations.
     - `leaves`: the leaves of the features, `[n, ...]` each.
-
     **Returns:** `rho`, `status`, `violated` and `messages` of the rows.
     """
     from verifai_jax.evaluation.worker import computing

@@ -191,7 +191,6 @@ def keeping(folder: Path, work: Mapping[str, Any]) -> Iterator[Unfinished]:
     **Arguments:**
     - `folder`: which is made, and removed once the work is done, or if nothing is in it.
     - `work`: the arguments of the call, as plain data.
-
     **Raises:** `FolderInUse` and `ValueError` as `locked_cache`; `CacheError` for a folder of
     other work.
     """

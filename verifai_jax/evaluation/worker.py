@@ -88,7 +88,6 @@ def evaluate_block(
     - `first`: number of the first row.
     - `u`: points of the unit cube.
     - `temperature`: the temperature of the smooth robustness, one for all or one each.
-
     **Returns:** arrays by the names of `ARRAYS`; the `leaves` of the features; `messages`; the
     `seconds` without compilation; the `processor`; the engine's `notes`; the `remarks` of the
     simulations; the `question` that this answers.

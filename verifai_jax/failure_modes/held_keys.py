@@ -93,9 +93,7 @@ def divide_under_keys(
     - `held`: the limit state under a key.
     - `samples`: weighted samples, of which there are failures.
     - `starts`: further points to begin from.
-
     **Returns:** the regions, None without any.
-
     **Raises:** `Ended` where time is over.
     """
     x = samples.x[samples.failing]

@@ -47,7 +47,6 @@ def name_mode(failures: pd.DataFrame, prior: pd.DataFrame) -> str:
     **Arguments:**
     - `failures`: features of failures of the mode, one a row.
     - `prior`: features of samples of the prior.
-
     **Returns:** the conditions, the one that fewest samples of the prior fulfil first; `"anywhere"`
     without one that tells the failures apart.
     """

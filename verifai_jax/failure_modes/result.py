@@ -89,7 +89,6 @@ class Mode(InNotebook):
         **Arguments:**
         - `path`: a file that is written too; none when left out.
         - `options`: `camera`, `size` and `fps`, as in `Replay.animate`.
-
         **Raises:** as `Replay.animate`.
         """
         return self.replay().animate(path, **options)

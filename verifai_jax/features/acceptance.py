@@ -39,7 +39,6 @@ def acceptance_rate(
     **Arguments:**
     - `where`: the constraint as a function of one point of the unit cube.
     - `accepts`: the same for many points, compiled.
-
     **Raises:** `ValueError` for a constraint that raises, does not return one truth value, or
     accepts none of the samples.
     """

@@ -81,7 +81,6 @@ class Box(_Between):
     - `closed`: which ends may be values: `"both"`, `"left"` (the range is half-open, without
       `high`), `"right"` or `"neither"`. Next to an end that is left out come the nearest numbers
       of the precision.
-
     **Raises:** `ValueError` for ends that are reversed, equal (use `Constant`), not finite,
     farther apart or nearer than float32 can hold, or of different lengths; for an unknown `closed`.
     """
@@ -227,7 +226,6 @@ class DiscreteBox(_Between):
 
     **Arguments:**
     - `low`, `high`: the ends, two integers or two sequences of one length; `low <= high`.
-
     **Raises:** `ValueError` for ends that are no integers, reversed, of different lengths, beyond
     32 bits, or with more than 2^20 values between them.
     """

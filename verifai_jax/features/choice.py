@@ -51,7 +51,6 @@ class Categorical(Domain):
     **Arguments:**
     - `choices`: numbers, texts or other objects, one by one.
     - `weights`: their probabilities; equally likely when left out.
-
     **Raises:** `ValueError` for no choices, the same choice twice, or weights that are not one
     positive number a choice with the sum one.
     """
@@ -324,7 +323,6 @@ class Constant(Domain):
 
     **Arguments:**
     - `value`: the only one, such as `9.8`, `[0, 1]`, `"dry"`.
-
     **Raises:** `ValueError` for a number that is not finite, or a value of another kind.
     """
 

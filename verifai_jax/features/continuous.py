@@ -73,7 +73,6 @@ class Continuous(Domain):
 
         **Arguments:**
         - `value`: numbers of double precision; minus infinity comes for those beyond the support.
-
         **Raises:** `NotImplementedError` for a distribution that does not say it.
         """
         raise NotImplementedError(f"{self!r} has no density")

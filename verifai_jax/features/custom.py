@@ -31,7 +31,6 @@ class Distribution(Continuous):
     - `inverse_cdf`: probability -> value, increasing.
     - `cdf`: value -> probability.
     - `name`: for people and JSON.
-
     **Raises:** `ValueError` for functions that raise, return no number, do not increase, are not
     finite inside, or are not each other's inverse.
     """

@@ -38,7 +38,6 @@ def log_density(space: FeatureSpace, rows: Mapping[str, Any]) -> Float[np.ndarra
     **Arguments:**
     - `space`: the space of the features.
     - `rows`: columns `[n]` by name; columns of no feature are ignored.
-
     **Raises:** `ValueError` for a row outside the space, and for a domain without a density, such
     as an automaton or one of the user's own.
     """
@@ -57,9 +56,7 @@ def tails(space: FeatureSpace, rows: Mapping[str, Any]) -> dict[str, np.ndarray]
 
     **Arguments:**
     - `space`, `rows`: as of `log_density`.
-
     **Returns:** probabilities `[n]` by the names of columns; NaN for an absent item.
-
     **Raises:** `ValueError` for a row outside the space.
     """
     check_columns(space, rows, held=False)

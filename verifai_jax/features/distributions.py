@@ -39,7 +39,6 @@ class Normal(continuous.Continuous):
     **Arguments:**
     - `mean`: the mean of the distribution.
     - `std`: its standard deviation, positive.
-
     **Raises:** `ValueError` for parameters that are not finite, a standard deviation that is not
     positive, or values that do not fit into float32.
     """
@@ -190,7 +189,6 @@ class LogUniform(continuous.Continuous):
 
     **Arguments:**
     - `low`, `high`: the ends; `0 < low < high`.
-
     **Raises:** `ValueError` for ends that are not finite, not positive, reversed or equal.
     """
 

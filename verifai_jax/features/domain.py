@@ -120,7 +120,6 @@ class Domain(ForUsers, abc.ABC):
         **Arguments:**
         - `value`: as `from_unit` gives it, or as a person writes it.
         - `name`: the name of the feature, for the message.
-
         **Raises:** `ValueError` for a value outside the domain, or of another kind.
         """
 

@@ -67,7 +67,6 @@ class LogNormal(Positive):
 
     **Arguments:**
     - `mean`, `std`: of the logarithm; the median is `exp(mean)`.
-
     **Raises:** `ValueError` for parameters that are not finite, a standard deviation that is not
     positive, or values that do not fit into float32.
     """
@@ -113,7 +112,6 @@ class Weibull(Positive):
     **Arguments:**
     - `shape`: positive; below 1 the density is infinite at zero.
     - `scale`: positive, in the unit of the value.
-
     **Raises:** `ValueError` for parameters that are not finite and positive, or values that do not
     fit into float32.
     """
@@ -151,7 +149,6 @@ class Exponential(Positive):
 
     **Arguments:**
     - `mean`: positive; one over the rate.
-
     **Raises:** `ValueError` for a mean that is not finite and positive, or values that do not fit
     into float32.
     """
@@ -187,7 +184,6 @@ class Triangular(Continuous):
 
     **Arguments:**
     - `low`, `mode`, `high`: `low <= mode <= high` and `low < high`.
-
     **Raises:** `ValueError` for numbers that are not finite or not in this order.
     """
 

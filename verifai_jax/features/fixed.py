@@ -20,7 +20,6 @@ class Fixed(Domain):
     - `domain`: the domain of the feature.
     - `value`: in the domain, as a person writes it.
     - `name`: the name of the feature, for messages.
-
     **Raises:** `ValueError` for a value outside the domain.
     """
 

@@ -43,9 +43,7 @@ def given_features(space: FeatureSpace, rows: Rows, precision: str = "float32") 
     - `rows`: a DataFrame with the columns of a table, a row of one, or dictionaries (one or
       several) that hold features by name or by the columns of a table.
     - `precision`: `"float32"` or `"float64"`, of their real numbers.
-
     **Returns:** the features, stacked along a leading axis `[n, ...]`.
-
     **Raises:** `ValueError` that names the first row and feature which is missing, unknown, outside
     its domain or refused by the constraint; `TypeError` for rows of another form.
     """
@@ -77,7 +75,6 @@ def given_rows(space: FeatureSpace, features: Mapping[str, Any]) -> Float[np.nda
 
     **Arguments:**
     - `features`: `[n, ...]`, as `given_features` gives them.
-
     **Returns:** the points of the unit cube nearest to the features, and after each the real
     numbers among its features; see `FeatureSpace.unflatten_given`.
     """
@@ -99,7 +96,6 @@ def check_columns(
     **Arguments:**
     - `columns`: by name; others than those of features are ignored.
     - `held`: whether features that the space holds at one value are checked too.
-
     **Raises:** as `given_features`.
     """
     for name in space.columns:

@@ -44,7 +44,6 @@ class Improbability:
 
     **Arguments:**
     - `space`: the space of the features.
-
     **Raises:** `NoDensityError` for a domain whose values have no density, such as an automaton.
     """
 

@@ -73,7 +73,6 @@ def from_plain(
     **Arguments:**
     - `data`: as `to_plain` gives it.
     - `distributions`: those with functions, by name.
-
     **Raises:** `ValueError` for an unknown kind, a distribution that is not given, missing parts,
     or what the domain itself refuses.
     """

@@ -115,9 +115,7 @@ class PointMaps:
 
         **Arguments:**
         - `u`: the point, `[dim]` with entries in `[0, 1]`.
-
         **Returns:** the features by name, as a system sees them.
-
         **Raises:** `ValueError` for a point of another shape.
         """
         u = as_real(u)
@@ -136,7 +134,6 @@ class PointMaps:
 
         **Arguments:**
         - `features`: by name; constant, fixed ones and events may be left out.
-
         **Returns:** the point, `[dim]`.
         """
         return self.root.to_unit(self.root.coerce(self.completed(features)))

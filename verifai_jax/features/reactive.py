@@ -31,7 +31,6 @@ class Reactive(Domain):
     - `hidden`: hidden units of a network with hyperbolic tangents; 0 for an affine function.
     - `bounds`: the bounds of the output.
     - `scale`: weights and biases are uniform from `-scale` to `scale`.
-
     **Raises:** `ValueError` for no inputs, ranges or bounds that are none, a negative number of
     hidden units, or a scale that is not positive.
     """

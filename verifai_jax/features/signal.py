@@ -56,7 +56,6 @@ class Signal(Domain):
     - `times`: the times of the control points in seconds, increasing. The first and the last value
       hold before and after them.
     - `width`: the width of a pulse in seconds; half the shortest distance of two when left out.
-
     **Raises:** `ValueError` for a domain that is not continuous, an unknown `hold`, too few knots
     (1 for constant and pulse, 2 for linear and pchip), a duration or width that is not positive,
     and times that do not increase, lie after the duration or are not as many as the knots.

@@ -52,7 +52,6 @@ class FeatureSpace(PointMaps, ForUsers):
     - `domains`: name -> `Domain`, in the order in which coordinates and columns come.
     - `where`: a constraint between features, a JAX function from features to one truth value. The
       prior is then that of the domains given that it holds, and only such points are simulated.
-
     **Raises:** `ValueError` for no features, bad names, or names that give one column twice;
     `TypeError` for a value that is not a domain, or a `where` that is not a function.
     """
@@ -96,7 +95,6 @@ class FeatureSpace(PointMaps, ForUsers):
         **Arguments:**
         - `rows`: columns `[n]` by name; others than those of features are ignored.
         - `precision`: `"float32"` or `"float64"`, of their real numbers.
-
         **Raises:** as `from_row`.
         """
         return features_of_rows(self.domains, rows, precision)
@@ -111,9 +109,7 @@ class FeatureSpace(PointMaps, ForUsers):
         **Arguments:**
         - `features`: numbers, lists, choices, dictionaries by name; constant, fixed ones and events
           may be left out.
-
         **Returns:** the features as `unflatten` gives them.
-
         **Raises:** as `check`.
         """
         self.check(features)
@@ -126,9 +122,7 @@ class FeatureSpace(PointMaps, ForUsers):
 
         **Arguments:**
         - `features`: as in `coerce`.
-
         **Returns:** the features as `unflatten` gives them.
-
         **Raises:** `ValueError` that names the first feature which is unknown, is missing or has
         another shape.
         """
@@ -173,7 +167,6 @@ class FeatureSpace(PointMaps, ForUsers):
 
         **Arguments:**
         - `seed`: the seed of the samples.
-
         **Raises:** `ValueError` for a constraint that raises, does not return one truth value, or
         accepts none of 65 536 samples, or of those that Python can decide in a minute.
         """
@@ -190,9 +183,7 @@ class FeatureSpace(PointMaps, ForUsers):
         **Arguments:**
         - `key`: a random key of JAX.
         - `count`: number of samples.
-
         **Returns:** the features by name, stacked along a leading axis `[count, ...]`.
-
         **Raises:** as `check_where`; `ValueError` for a count that is not a positive integer.
         """
         self.check_where()
@@ -220,7 +211,6 @@ class FeatureSpace(PointMaps, ForUsers):
         - `one`, `other`: features as `unflatten` gives them, or as a person writes them (numbers,
           lists, choices, dictionaries by name; constant, fixed ones and events may be left out), or
           rows of a table.
-
         **Raises:** `ValueError` that names the first feature which is missing, unknown or outside
         its domain, for values that a person wrote.
         """
@@ -237,7 +227,6 @@ class FeatureSpace(PointMaps, ForUsers):
 
         **Arguments:**
         - `values`: by name, as a person writes them.
-
         **Raises:** `ValueError` for an unknown feature, or a value outside its domain.
         """
         check_names("feature", values, self.domains)
@@ -253,7 +242,6 @@ class FeatureSpace(PointMaps, ForUsers):
         **Arguments:**
         - `features`: names of those that vary.
         - `nominal`: values of the others, by name, as a person writes them.
-
         **Raises:** `ValueError` for no or an unknown feature, or one without a nominal value.
         """
         if not features:
@@ -281,7 +269,6 @@ class FeatureSpace(PointMaps, ForUsers):
 
         **Arguments:**
         - `factor`: control points of the finer signals for one of the coarse ones.
-
         **Raises:** `ValueError` for a factor that is not a positive integer.
         """
         positive = isinstance(factor, int | np.integer) and not isinstance(factor, bool)
@@ -311,7 +298,6 @@ class FeatureSpace(PointMaps, ForUsers):
         - `data`: as `to_json` gives it.
         - `where`: the constraint, if the space has one.
         - `distributions`: those with functions of their own, by name.
-
         **Raises:** `ValueError` for data that describes no space, or code that is missing.
         """
         if not isinstance(data, Mapping) or "features" not in data:

@@ -93,7 +93,6 @@ class Gamma(Positive):
     **Arguments:**
     - `shape`: at least 0.05; below 1 the density is infinite at zero.
     - `scale`: positive, in the unit of the value; one over the rate.
-
     **Raises:** `ValueError` for parameters that are not finite and positive, a shape below 0.05, or
     values that do not fit into float32.
     """
@@ -164,7 +163,6 @@ class Beta(Continuous):
     **Arguments:**
     - `a`, `b`: at least 0.05 each; the mean is `low + (high - low) * a / (a + b)`.
     - `low`, `high`: the ends, which are no values themselves.
-
     **Raises:** `ValueError` for parameters that are not finite, `a` or `b` below 0.05, or ends that
     are reversed or equal.
     """
@@ -269,7 +267,6 @@ class Empirical(Continuous):
 
     **Arguments:**
     - `data`: finite numbers, at least two different ones.
-
     **Raises:** `ValueError` for fewer, for more than 65 536 different ones, or for what is no
     finite number.
     """

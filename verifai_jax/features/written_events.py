@@ -267,7 +267,6 @@ def read_event(entry: object, event: object) -> Transition:
     **Arguments:**
     - `entry`: its key, `(state, name)`.
     - `event`: its dictionary; see `Automaton`.
-
     **Raises:** `ValueError` or `TypeError`, which name the event and what is wrong with it.
     """
     if not (

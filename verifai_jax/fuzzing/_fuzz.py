@@ -67,7 +67,6 @@ def fuzz(
 
     **Returns:** the run: `run.coverage` says what was covered of how much, `run.corpus` has the
     rows that extended it, and `run.problem` the implicit properties.
-
     **Raises:** `ValueError` for ranges or cells that are none, both or neither of a problem and a
     space with a system; as `falsify`.
     """

@@ -251,7 +251,6 @@ def as_recorded(problem: Problem, derived: Mapping[str, Any]) -> Problem:
     - `problem`: with its own formulas alone; for a run without any its name, its space and its
       system count.
     - `derived`: `CheckedSystem.derived` of the run.
-
     **Raises:** `ValueError`, `TypeError`, `KeyError` for a record that describes no such problem.
     """
     ranges = {name: (low, high) for name, (low, high) in derived["ranges"].items()}

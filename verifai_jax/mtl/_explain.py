@@ -153,7 +153,6 @@ def explain(
       influence.
     - `tau`: temperature at which influence is measured; a tenth of the predicates' spread when
       left out.
-
     **Raises:** as `robustness`, and `ValueError` for a NaN among the samples that matter.
     """
     check_trace(trace)

@@ -99,7 +99,6 @@ def online(formula: Formula | str, dt: float, semantics: Semantics = hard) -> On
     **Arguments:**
     - `semantics`: `hard`, or `boolean`, by which all values are above zero where the formula holds
       and below where it does not, also where its robustness is exactly zero.
-
     **Raises:** `IntervalError` for an interval that is not a multiple of `dt`; `ValueError` for
     smooth semantics, and for an unbounded future operator within another temporal operator, which
     no bounded memory can follow.
@@ -188,7 +187,6 @@ def advance(
     - `now`: number of the sample.
     - `leaves`: margins of the plan's leaves.
     - `cells`: memory before the step.
-
     **Returns:** the result of each formula, NaN where it has none yet, and the memory after it.
     """
     step = _Step(now, leaves, cells)

@@ -235,9 +235,7 @@ def export_c(
     - `semantics`: `hard` or `boolean`.
     - `every`: whether each formula is asked at every instant, or at time 0.
     - `sizes`: number of components of each signal whose norm the formulas take.
-
     **Returns:** the text of the header.
-
     **Raises:** as `watch`; `ValueError` for a name that is not an identifier of C.
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):

@@ -146,7 +146,6 @@ def predictive_monitor(
     - `lags`: samples ago that a prediction sees.
     - `model`: a regressor of scikit-learn's kind; a quadratic function if None.
     - `seed`: the seed of the division into runs that teach and runs that calibrate.
-
     **Raises:** `ValueError` for too few runs without violation; `IntervalError` for a horizon that
     is not a multiple of the sampling period.
     """
@@ -227,7 +226,6 @@ def domain_monitor(
     - `alpha`: probability of an alarm in a run that is like the tested ones.
     - `lags`: samples ago that are compared too.
     - `seed`: the seed of the division into runs that are compared with and runs that calibrate.
-
     **Raises:** `ValueError` for too few runs, and for a NaN.
     """
     from scipy.spatial import KDTree

@@ -250,7 +250,6 @@ def dense_robustness(formula: Formula | str, trace: Trace, method: Method = "lin
     **Arguments:**
     - `trace`: with samples at any times; its last ones are held for ever.
     - `method`: what a signal is between two samples: `"linear"`, or `"hold"` for its last sample.
-
     **Raises:** `ValueError` for a NaN, for operators that count samples, and for expressions such
     as `x * y` or `sin(x)` of signals that are not held, which are not straight between samples.
     """

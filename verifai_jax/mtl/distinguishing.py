@@ -90,9 +90,7 @@ def distinguish(
     - `end`: what comes after the last sample, `"hold"` or `"truncate"`; of a problem it is its own.
     - `dt`, `duration`: of a free trace, in seconds; they follow from the windows when left out.
     - `budget`, `seed`: simulations of the search, and the seed of everything random in it.
-
     **Returns:** the trace, if one was found; that none was found proves nothing.
-
     **Raises:** `FormulaSyntaxError`; `ValueError` for recordings without the signals, and as
     `falsify` does; `ValueError` for windows that need a clock of too many samples.
     """

@@ -98,7 +98,6 @@ def examples(
     - `dt`, `duration`: of the traces, in seconds; they follow from the windows when left out.
     - `end`: what comes after the last sample, `"hold"` or `"truncate"`.
     - `seed`: the seed of the search.
-
     **Raises:** `FormulaSyntaxError`; `ValueError` for windows that need a clock of too many
     samples, and for a formula without signals.
     """

@@ -74,7 +74,6 @@ class FreeTraces:
         **Arguments:**
         - `like`: recordings whose values are levels too.
         - `dt`, `duration`: in seconds; both follow from the windows when left out.
-
         **Raises:** `ValueError` for windows that need a clock of more than 20 000 samples.
         """
         formulas = with_counted(*formulas)
@@ -136,7 +135,6 @@ class FreeTraces:
         **Arguments:**
         - `score`: the score of `[lanes]` traces.
         - `enough`: a score that ends the search.
-
         **Returns:** its signals `[time]`, and its score.
         """
         signals = self.drawn(rng)

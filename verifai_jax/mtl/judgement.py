@@ -105,7 +105,6 @@ class Judgement(InNotebook):
 
         **Arguments:**
         - `shares`: the shares of the recordings, from 0 (the least robustness) to 1 (the greatest).
-
         **Returns:** a row for each requirement: how many recordings have a verdict, how many fail,
         how many have none, and a column for each share, by the recording at that rank.
         """
@@ -137,7 +136,6 @@ class Judgement(InNotebook):
 
         **Arguments:**
         - `distance`: from which on a row is an outlier.
-
         **Returns:** rows of the table with their `distance`, the greatest first.
 
         Source: B. Iglewicz, D. Hoaglin, "How to Detect and Handle Outliers", ASQC 1993.

@@ -82,7 +82,6 @@ def judge(
       process pool must not fork.
     - `ended`: called with the index and the rows of each recording as it ends.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Raises:** `ValueError` for no requirement, no recording, `resample_to` without `method`;
     `FileNotFoundError` for a folder or a file that does not exist.
     """

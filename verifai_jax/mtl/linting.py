@@ -57,7 +57,6 @@ def lint(
     - `units`: the units of signals by name, in addition to those that recordings and names (`speed
       (m/s)`, `speed_kmh`) have.
     - `end`: what comes after the last sample, `"hold"` or `"truncate"`.
-
     **Raises:** `FormulaSyntaxError`; as `read` for what cannot be read.
     """
     requirements = tuple(r for r in requirements_of(formulas) if r.formula is not None)

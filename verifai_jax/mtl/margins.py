@@ -50,7 +50,6 @@ def margins(plan: Plan, sizes: Mapping[str, int]) -> Margins:
 
     **Arguments:**
     - `sizes`: number of components of the signals whose norm is taken.
-
     **Raises:** `ValueError` for a norm of a signal without a size.
     """
     made = _Builder(plan, sizes)

@@ -127,7 +127,6 @@ def mine(
     - `confidence`: the confidence of the interval for the rate of recordings that break it.
     - `budget`, `seed`: simulations of the search at most, and its seed, for a problem.
     - `progress`: whether to show one line of progress for a problem; see `core.progress`.
-
     **Raises:** `FormulaSyntaxError`; `ValueError` for more than two parameters, one in which the
     formula is not monotone, or one that nothing bounds or that no value satisfies.
     """

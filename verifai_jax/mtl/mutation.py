@@ -140,7 +140,6 @@ def mutants(
       times. Without any all mutants survive, each with an example of a trace that would kill it.
     - `end`: what comes after the last sample, `"hold"` or `"truncate"`.
     - `seed`: the seed of the free traces that are tried.
-
     **Raises:** `FormulaSyntaxError`; as `read`; `ValueError` for a recording without the signals or
     with gaps where they matter.
     """

@@ -176,7 +176,6 @@ def read_parametric(
 
     **Arguments:**
     - `constants`, `definitions`: as of `parse`.
-
     **Raises:** `FormulaSyntaxError` as `parse`; `ValueError` for a name that is both a number and a
     time, or a text without a parameter.
     """
@@ -299,7 +298,6 @@ def templates(words: str = "", domain: str | None = None) -> tuple[Template, ...
     - `words`: looked for in all that a template says, whatever their case; all templates when left
       out.
     - `domain`: the domain of the templates; every one when left out.
-
     **Raises:** `UnknownNameError` for a domain without templates.
     """
     library = _library()

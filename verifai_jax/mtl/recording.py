@@ -87,7 +87,6 @@ def read(
       value; `"interpolate"`, what is on the line between its neighbours; `"drop"`, the instant is
       left out. A gap stays one when left out.
     - `episode`: number of an episode of a LeRobot data set.
-
     **Raises:** `FileNotFoundError`; `MissingExtra` for a kind of file whose package is not
     installed; `ValueError` for another kind of file, no rows, a column that does not exist or holds
     no numbers, a text among numbers, times that do not increase, or `resample_to` without `method`.

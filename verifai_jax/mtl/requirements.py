@@ -126,7 +126,6 @@ def read_requirements(
     **Arguments:**
     - `constants`, `definitions`: further names; they come before those of the file.
     - `need_formulas`: whether an entry without a formula is refused.
-
     **Raises:** `FileNotFoundError`; `ValueError` that names the entry for one that is not as it
     should be, and for XML with a document type or entities, which are refused unread.
     """
@@ -167,7 +166,6 @@ def write_requirements(requirements: Iterable[Requirement], path: str | Path) ->
     """Write requirements to a CSV or a ReqIF file, which `read_requirements` reads again.
 
     **Returns:** the path.
-
     **Raises:** `ValueError` for another ending, and for what `read_requirements` would refuse.
     """
     path = Path(path)
@@ -253,11 +251,9 @@ def read_reqif(path: Path, fields: Sequence[str]) -> list[dict[str, object]]:
 
     **Arguments:**
     - `fields`: the fields of a requirement; attributes of other names are left out.
-
     **Returns:** a dictionary of texts for each object that has one of the fields. An object without
     an id has its identifier in the file as one. Its `links` are those that it has, and the targets
     of its relations.
-
     **Raises:** `ValueError` for a file that is not ReqIF, or declares a document type.
     """
     root = read_xml(path.read_bytes(), str(path))

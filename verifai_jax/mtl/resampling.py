@@ -37,7 +37,6 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
     - `trace`: with `times` or another period; NumPy or JAX arrays, not under `jit`.
     - `dt`: the new sampling period in seconds.
     - `method`: `"hold"` keeps each value until the next sample; `"linear"` interpolates.
-
     **Raises:** `ValueError` for a period that is not positive or makes more than 100 million
     samples, an unknown method, or sample times that do not increase or are not finite.
     """

@@ -58,7 +58,6 @@ def smooth(
       temperature follows from the certificate (see `certificate`).
     - `bound`: shift the value by the certificate so that it never exceeds the hard one (`"lower"`),
       never falls below it (`"upper"`), or leave it (`"none"`). The gradient is the same.
-
     **Raises:** `ValueError` unless exactly one of `tau` and `error` is given and positive.
     """
     if (tau is None) == (error is None):
@@ -79,7 +78,6 @@ def compared(comparison: str, left: Any, right: Any, boolean: bool, xp: ModuleTy
     - `left`, `right`: arrays that broadcast, or numbers.
     - `boolean`: whether the value is +1 where it holds and -1 where not, or else the margin.
     - `xp`: `jax.numpy`, or `numpy` on the host.
-
     **Returns:** the value, NaN where the margin is.
     """
     match comparison:

@@ -110,7 +110,6 @@ def streams(
     - `dt`: sampling period in seconds.
     - `semantics`: `hard` or `boolean`.
     - `every`: whether each formula is asked at every instant, or at time 0.
-
     **Raises:** `IntervalError` for an interval that is not a multiple of `dt`; `ValueError` for no
     formula, smooth semantics, a period that is not positive, and what no bounded memory can follow.
     """

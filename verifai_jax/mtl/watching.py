@@ -137,7 +137,6 @@ class Watch(Generic[R]):
         **Returns:** the robustness at time 0 if all stayed as it is now, or with `every` that at
         the newest instant that is decided, `delays` samples ago; NaN until the first one is
         decided.
-
         **Raises:** `UnknownNameError` for a signal that the sample lacks.
         """
         try:
@@ -154,7 +153,6 @@ class Watch(Generic[R]):
         """Take in many samples, `[time]` (or `[time, k]`) by signal name.
 
         **Returns:** what `step` would, sample by sample; a column a formula if there are several.
-
         **Raises:** `UnknownNameError` for a signal that is missing; `ValueError` for signals of
         several lengths.
         """
@@ -258,9 +256,7 @@ def watch(
     - `every`: whether each formula is asked at every instant, or at time 0. With it no formula may
       look ahead without end.
     - `sizes`: number of components of each signal whose norm the formulas take.
-
     **Returns:** a monitor; its results are numbers, or dictionaries for several formulas.
-
     **Raises:** `IntervalError` for an interval that is not a multiple of `dt`; `ValueError` for
     smooth semantics, for what looks ahead without end within another temporal operator, and for a
     norm without a size.

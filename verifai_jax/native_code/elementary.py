@@ -108,7 +108,6 @@ def expression(name: str, params: Params, kinds: list[str], out: str) -> tuple[s
     - `name`, `params`: of the primitive.
     - `kinds`: the kinds of its operands.
     - `out`: the kind of its result.
-
     **Raises:** `Untranslatable` for an unknown one.
     """
     if name in OPERATORS:

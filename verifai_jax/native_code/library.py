@@ -98,7 +98,6 @@ def library_name(fingerprint: str | None) -> str:
 
     **Arguments:**
     - `fingerprint`: the fingerprint of the program; None if it has none.
-
     **Raises:** `Unavailable` where there is no compiler, no cache folder, or no fingerprint.
     """
     tool = compiler()
@@ -118,7 +117,6 @@ def load(name: str, count: int, translate: Callable[[], str], quickly: bool = Fa
     - `count`: numbers that a simulation returns.
     - `translate`: makes the source.
     - `quickly`: whether to compile in half the time, for reverse sweeps.
-
     **Raises:** `Unavailable` where it cannot be compiled, kept or loaded.
     """
 

@@ -28,7 +28,6 @@ def translate(program: values.Program) -> str:
     **Arguments:**
     - `program`: a closed `Jaxpr` of the row `[d]`, the words `[2]` of a random key, the number of
       the simulation, a temperature, and numbers `[n]` that all share; it returns a vector of bits.
-
     **Raises:** `Untranslatable` for a program with a part that is unknown.
     """
     used = without_unused(program.jaxpr, [True] * len(program.jaxpr.outvars))

@@ -138,7 +138,6 @@ def detector(
     - `values`: numbers to estimate of an object.
     - `channels`: the channels of the convolutions, each of which halves the image.
     - `hidden`: units of the dense layers.
-
     **Raises:** `ValueError` for images that are smaller than the convolutions make of them.
     """
     height, width = shape

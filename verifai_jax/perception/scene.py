@@ -66,9 +66,7 @@ class Scene:
         - `conditions`: weather, lens and sensor; None is a clear day and a perfect camera.
         - `key`: the key of what differs from frame to frame (noise, rain).
         - `lens`: the key of what stays (dirt, dead pixels).
-
         **Returns:** red, green and blue in [0, 1].
-
         **Raises:** `ValueError` that names what does not fit.
         """
         conditions = check_scene(self, camera, conditions)

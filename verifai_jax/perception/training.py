@@ -62,9 +62,7 @@ def train_detector(
     - `noise`: standard deviation of what is added to each pixel, anew in each step.
     - `seed`: the seed of the weights, the order of the images and the noise.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Returns:** the network, and the loss of each step.
-
     **Raises:** `ValueError` where images and labels do not fit.
     """
     images = jnp.asarray(images, jnp.float32)

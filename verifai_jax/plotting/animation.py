@@ -66,7 +66,6 @@ def animate(
       out.
     - `size`: width and height of a frame in pixels.
     - `fps`: frames a second; chosen when left out.
-
     **Raises:** `ValueError` for any other problem without `draw`, for a path that does not end in
     `.gif`, a camera without a MuJoCo model, and invalid sizes; `UnknownNameError` for
     a camera that the model lacks; `mujoco_scene.NoRenderer` where MuJoCo cannot draw.

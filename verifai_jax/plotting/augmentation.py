@@ -23,7 +23,6 @@ def plot_arms(
 
     **Arguments:**
     - `metric`, `reference`: as in `Augmentation.compare`.
-
     **Raises:** as `Augmentation.compare`.
     """
     differences = result.compare(metric, reference)
@@ -71,7 +70,6 @@ def plot_montage(
     **Arguments:**
     - `arm`, `seed`: the arm, and the seed of its training.
     - `count`: images at most.
-
     **Raises:** `ValueError` for inputs that are not images, or an arm that added nothing.
     """
     check_count("count", count)

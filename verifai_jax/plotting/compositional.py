@@ -18,7 +18,6 @@ def plot_region(
 
     **Arguments:**
     - `features`: the columns across and up; by default the two that the region depends on most.
-
     **Raises:** `UnknownNameError` for a column that the table has not.
     """
     region, columns = result.region, list(result.problem.space.columns)

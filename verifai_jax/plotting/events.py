@@ -14,7 +14,6 @@ def plot_pairs(coverage: FuzzCoverage, path: str | Path | None = None) -> Figure
 
     **Arguments:**
     - `coverage`: the coverage of a run whose features have an automaton; the first one is drawn.
-
     **Raises:** `ValueError` for a run without an automaton.
     """
     if not coverage.automata:

@@ -48,7 +48,6 @@ def film_samples(
     **Arguments:**
     - `clock`: seconds of each sample.
     - `fps`: frames a second; None for `usual` many.
-
     **Returns:** the samples, and the milliseconds of each frame.
     """
     seconds = float(clock[-1] - clock[0])

@@ -30,7 +30,6 @@ def film_episode(
     - `replay`: the replay of a problem with an environment of Gymnasium.
     - `size`: width and height in pixels; those of the environment when left out.
     - `fps`: frames a second; `FRAMES_PER_SECOND` when left out.
-
     **Raises:** `ValueError` for an environment that draws no pictures.
     """
     film.check_film(size, fps)

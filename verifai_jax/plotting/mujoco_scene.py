@@ -54,7 +54,6 @@ def film(
     - `size`: width and height in pixels; `SIZE` when left out.
     - `camera`: as for `frames`.
     - `fps`: frames a second; `FRAMES_PER_SECOND` when left out.
-
     **Raises:** `NoRenderer`; `UnknownNameError` for a camera that the model lacks.
     """
     check_film(size, fps)
@@ -85,7 +84,6 @@ def strip(
     - `count`: instants.
     - `size`: width and height of each in pixels.
     - `camera`: as for `frames`.
-
     **Raises:** as `film`.
     """
     from PIL import Image
@@ -120,9 +118,7 @@ def frames(
     - `size`: width and height in pixels.
     - `camera`: the name of one of the model's; when left out, the one that sees best what moves
       (`mujoco_view.best_view`), of the model's or one that is made for it.
-
     **Returns:** a picture `[height, width, 3]` of each.
-
     **Raises:** `NoRenderer`; `UnknownNameError`.
     """
     mujoco = require("mujoco", extra="mujoco")

@@ -56,7 +56,6 @@ def plot_replay(
 
     **Arguments:**
     - `signals`: the signals and Signal features to draw, in this order; chosen when left out.
-
     **Raises:** `UnknownNameError` for a signal that does not exist; `ValueError` for none.
     """
     trace, formulas = replay.trace, replay.problem.formulas

@@ -30,7 +30,6 @@ def plot_features(
     **Arguments:**
     - `features`: names; by default the `maximum` that distinguish failing from safe samples best.
     - `maximum`: features at most, where they are not named.
-
     **Raises:** `UnknownNameError` for a feature that is not in the table.
     """
     table = run.table.all

@@ -160,7 +160,6 @@ class Policy:
         - `observation`: one observation, or a batch for a network of vectors.
         - `memory`: the memory of a policy that remembers; `initial_memory` at the start of an
           episode.
-
         **Raises:** `TypeError` for a memory that is missing, or that it does not have.
         """
         if self.initial_memory is None:
@@ -177,9 +176,7 @@ class Policy:
         **Arguments:**
         - `path`: ends in `.onnx`, in `.safetensors`, or in `.npz`, which needs no other package.
         - `observation`: an example of an observation, where the network does not say its size.
-
         **Returns:** the path.
-
         **Raises:** `PolicyError` for another ending, and for a policy that ONNX cannot express:
         one that draws random numbers, or that runs in Python.
         """

@@ -81,10 +81,8 @@ def policy(
       found by their shapes.
     - `stack`: observations that the policy sees at once, the newest last.
     - `batched`: a Python function takes a batch of observations.
-
     **Returns:** a `Policy`, which any system takes as its policy or controller (`policy.act`), or
     the `rl.Policy` of an `.npz`.
-
     **Raises:** `FileNotFoundError`; `PolicyError` for a file that is damaged or not supported, and
     for unused options. Nothing in a file is executed.
     """

@@ -39,7 +39,6 @@ def from_object(source: object, observation: ArrayLike | None, batched: bool) ->
     - `source`: see `policy`.
     - `observation`: an example, where the object cannot be translated without one.
     - `batched`: a Python function takes a batch of observations.
-
     **Raises:** `PolicyError` for something that is not a policy.
     """
     root = type(source).__module__.partition(".")[0]

@@ -181,9 +181,7 @@ def read_onnx(
     - `what`: its name, for errors.
     - `output`: name of the output that is meant, of several.
     - `memory`: `{input: output}` of what the network remembers; found by the shapes where None.
-
     **Returns:** the graph, its weights, and its memory at the start: zeros, or None.
-
     **Raises:** `PolicyError` for a damaged model, or one with unsupported operators.
     """
     package = require("onnx", extra="policies")

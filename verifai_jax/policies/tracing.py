@@ -68,9 +68,7 @@ def traced(
     - `weights`: pytree of arrays, which keep their paths in it as names.
     - `observation`: an example; several arrays by name become several inputs.
     - `memory`: pytree at the start of an episode; None for none.
-
     **Returns:** the graph, all its arrays by name, and its memory at the start.
-
     **Raises:** `PolicyError` for an operation that ONNX, or this translation of it, does not have.
     """
     named = observation if isinstance(observation, Mapping) else {"observation": observation}

@@ -50,7 +50,6 @@ class Behaviour:
       of all signals together that a trace visits are what it shows.
     - `formulas`: the formulas of which the clause nearest to breaking is shown too; none when left
       out.
-
     **Raises:** `ValueError` for a signal without a range, or too many cells together.
     """
 

@@ -43,7 +43,6 @@ class Guide:
     - `weight`: the weight of the term, above 0; with 1 the robustness of safe simulations says
       nothing.
     - `scale`: the size of values of the term that matters, in its unit.
-
     **Raises:** `TypeError` for a term that is neither; `ValueError` for a formula that does not
     parse, or numbers out of range.
     """

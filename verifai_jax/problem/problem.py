@@ -242,7 +242,6 @@ class Problem(InNotebook):
           value is the weakest, shortest and latest fault.
         - `by_simulator`: whether the simulator applies them itself, as `vj.faults.on_host` helps
           it to; for `remote`, and for a `blackbox` of one's own.
-
         **Raises:** `UnknownNameError` for a channel that the system does not have, with the nearest
         one; `ValueError` for a name that exists already, a fault that a channel cannot have, and
         a system whose loop is not known.
@@ -268,11 +267,9 @@ class Problem(InNotebook):
           `"features"`, a dictionary by name.
         - `key`: random key of the simulation; `jax.random.key(0)` when left out.
         - `formula`: name of the one formula to evaluate; the least over all when left out.
-
         **Returns:** a function `(point, key=key)` to a scalar: positive where the property holds,
         NaN where the simulation has no verdict. Whether a point lies in its domains, and keeps the
         constraint of the space, is not checked.
-
         **Raises:** `ProblemError` for a system that JAX does not trace; `UnknownNameError` for an
         `of` or a formula that does not exist; what `check` raises.
         """

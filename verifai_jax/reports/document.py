@@ -77,7 +77,6 @@ def write_report(
     - `assessment`: whether sections for an assessor follow: the claims as a tree, the nine steps of
       credibility with boxes to be filled in, and a page to be signed.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Raises:** `UnknownNameError` for a unit or a reason of a feature that does not exist;
     `ValueError` for a number of simulations that is none, and for a run whose rows have changed
     since they were written;

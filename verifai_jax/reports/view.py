@@ -56,7 +56,6 @@ def view_data(
     - `run`: a run with a row at least.
     - `traces`: by number of row, as `trace_data` describes them; these rows are among those shown.
     - `command`: the command that a number of a row follows, to simulate it again.
-
     **Returns:** plain data; `shown` and `simulations` tell how much it was thinned.
     """
     table = run.table.all

@@ -22,7 +22,6 @@ def explore(run: Run) -> Any:
 
     **Arguments:**
     - `run`: a run with a row at least.
-
     **Returns:** a widget of anywidget; without that package the figure of `run.plot()`.
     """
     try:

@@ -43,7 +43,6 @@ def evaluate(
     - `seed`: the seed of the episodes' starts and of what is random in their steps.
     - `episodes`: their number.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Returns:** `[episodes]`, the sum of rewards of each episode.
     """
     numbers, _ = numbers_of(task)
@@ -57,7 +56,6 @@ def mean_returns(
     """Measure the mean return of each policy's most likely actions over the same episodes.
 
     **Arguments:** as in `evaluate`.
-
     **Returns:** `[policies]`.
     """
     means = np.full(len(policies), np.nan)

@@ -98,7 +98,6 @@ def check_values(
     - `names`: fields to check.
     - `holds(value) -> bool`: the condition on each value.
     - `wanted`: the condition in words, which follow "must be".
-
     **Raises:** `ValueError`: "PPO's clip must be positive; got -1".
     """
     for name in names:

@@ -114,7 +114,6 @@ class BatchedTraining:
     - `devices`: JAX devices to spread them over; all of this process when left out.
     - `per_device`: runs under one `vmap` on a device; when left out 1 on CPUs, else 64.
     - `watch`: called every few seconds with the number of each run and its learning curve so far.
-
     **Raises:** `ValueError` for a configuration that cannot train.
     """
 
@@ -143,7 +142,6 @@ class BatchedTraining:
 
         **Arguments:**
         - `targets`: environment steps to reach, by number of the run.
-
         **Yields:** each number as it gets there, those of one structure after another. Between
         updates, every few seconds, it can be interrupted; numbers not yielded yet may be requested
         again.

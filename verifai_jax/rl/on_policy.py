@@ -38,7 +38,6 @@ def minibatch_epochs(
     - `key`: a random key, of the order.
     - `optimizer`, `rate`: the direction of a step, and its length.
     - `epochs`, `minibatches`: passes over the batch, and parts in a pass.
-
     **Returns:** weights, and the optimizer's state.
     """
     rows = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)

@@ -102,7 +102,6 @@ class Policy:
         """Write the policy as `.npz` (`save_policy`), or its action as `.onnx` or `.safetensors`.
 
         **Returns:** the path.
-
         **Raises:** `PolicyError` for another ending.
         """
         if Path(path).suffix == ".npz":
@@ -225,7 +224,6 @@ def load_policy(path: str | Path) -> Policy:
     """Read a policy that `save_policy` wrote. The file can hold numbers and text only.
 
     **Returns:** the policy, with JAX arrays of float32.
-
     **Raises:** `FileNotFoundError`; `PolicyFileError` for a file of another kind, and for arrays
     that are missing, not finite, or of shapes that do not fit to each other and to the actions.
     """
@@ -334,7 +332,6 @@ def policy_sources(path: str | Path) -> dict[str, Any]:
 
     **Returns:** plain data with the hashes of `files` and the `versions`; empty for a file that
     does not say so.
-
     **Raises:** `FileNotFoundError`; `PolicyFileError` for a file of another kind.
     """
     return _plain_data(path, "sources")

@@ -56,7 +56,6 @@ def scenic(
     - `features`: domains by name, in addition to what the program draws. It reads their values as
       global parameters while it runs: with `{"push": vj.Reactive({"gap": (0, 50)})}` a behavior
       asks `globalParameters.push(gap=...)` at each step, and a search learns how to answer.
-
     **Raises:** `MissingExtra` without Scenic; `ProgramError` for a program that does not compile,
     with Scenic's message, file and line, and for one that draws nothing at random; `ValueError`
     for a feature whose name the program has taken.

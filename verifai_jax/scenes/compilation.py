@@ -70,7 +70,6 @@ def compile_program(
     - `params`: global parameters to override.
     - `model`: Scenic module to use as world model instead of the program's own.
     - `scenario`: name of the modular scenario to compile, where there are several.
-
     **Raises:** `MissingExtra` without Scenic; `ProgramError` for a program that is not there or
     does not compile.
     """

@@ -68,7 +68,6 @@ class Condition:
     - `requirement`: Scenic's compiled one.
     - `tree`: its parsed condition.
     - `compiled`: the program.
-
     **Raises:** `Unsupported` for one of another file, whose text is not at hand.
     """
 

@@ -84,7 +84,6 @@ class ScenicProgram:
         **Arguments:**
         - `features`: as `space.unflatten` gives them, or as a person writes them and `features_of`
           gives them.
-
         **Raises:** `ValueError` for features whose names or shapes are not those of the space.
         """
         return self._outputs(self.space.convert(features))
@@ -94,7 +93,6 @@ class ScenicProgram:
 
         **Arguments:**
         - `function(scene, key) -> Trace`: pure JAX, of the numbers that `scenes` gives.
-
         **Raises:** `ValueError` for what cannot be called.
         """
         if not callable(function):
@@ -115,7 +113,6 @@ class ScenicProgram:
         - `function(scene) -> Trace`: of Scenic's `Scene`; `function(scene, seed)` with `seeded`.
         - `options`: those of `verifai_jax.blackbox`, such as `workers` and `timeout`. A worker
           compiles the program once.
-
         **Raises:** as `verifai_jax.blackbox`.
         """
         if not callable(function):
@@ -146,7 +143,6 @@ class ScenicProgram:
         - `timeout`: seconds of wall clock for one simulation; needs `workers`. A worker's first
           simulation compiles the program.
         - `options`: others of `verifai_jax.blackbox`.
-
         **Raises:** `ValueError` for steps, records or a step that can be none, and as
         `verifai_jax.blackbox`.
         """
@@ -178,7 +174,6 @@ class ScenicProgram:
         **Arguments:**
         - `run`: a `Run`, or its table.
         - `row`: number of the row, or the row itself.
-
         **Raises:** `IndexError` for a row that is not in the table, and as `scene`.
         """
         table = getattr(run, "table", run)

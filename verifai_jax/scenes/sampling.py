@@ -146,7 +146,6 @@ class Sampling:
 
         **Arguments:**
         - `features`: numbers and choices by name, as `FeatureSpace.unflatten` gives them.
-
         **Raises:** `Refused` where Scenic refuses the scene while it draws it.
         """
         distributions = sys.modules["scenic.core.distributions"]

@@ -68,7 +68,6 @@ def flow(
     **Arguments:**
     - `derivative(time, state)`: d state / d time; smooth in both.
     - `seconds`: the same in all boxes.
-
     **Raises:** `MissingRule` for dynamics that are not smooth, with the operation and its line.
     """
     leaves, tree = jax.tree.flatten(state)

@@ -118,7 +118,6 @@ def _sides(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     **Arguments:**
     - `noise`: `[boxes, numbers, symbols]`.
-
     **Returns:** `[boxes, numbers, numbers]`, each column a side, and `[boxes, numbers]`.
     """
     scale = np.abs(noise).sum(2)

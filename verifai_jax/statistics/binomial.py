@@ -63,9 +63,7 @@ def clopper_pearson(
     - `simulations`: samples in all, a number fixed beforehand.
     - `confidence`: probability with which the interval is to hold.
     - `undecided`: further samples that may have failed: without a verdict, for instance.
-
     **Returns:** the `Rate`.
-
     **Raises:** `ValueError` unless `0 <= failures <= failures + undecided <= simulations`,
     `simulations >= 1` and `0 < confidence < 1`.
 
@@ -102,7 +100,6 @@ def upper_bound(failures: int, simulations: int, confidence: float = 0.95) -> fl
     """Compute the one-sided Clopper-Pearson bound: the largest rate that is not excluded.
 
     **Arguments:** as `clopper_pearson`; no simulations, or nothing but failures, exclude nothing.
-
     **Returns:** the bound; without a failure about `3 / simulations` at a confidence of 95 %.
     """
     from scipy.special import betaincinv
@@ -118,9 +115,7 @@ def simulations_without_failure(rate: float, confidence: float = 0.95) -> int:
     **Arguments:**
     - `rate`: failure rate to exclude.
     - `confidence`: probability with which the statement is to hold.
-
     **Returns:** the least `n` with `(1 - rate)^n <= 1 - confidence`: about `3 / rate` at 95 %.
-
     **Raises:** `ValueError` unless `0 < rate < 1` and `0 < confidence < 1`.
     """
     check_fraction("rate", rate)
@@ -137,9 +132,7 @@ def simulations_until(
     - `p0`: failure rate to exclude.
     - `failures`, `simulations`: samples taken so far.
     - `confidence`: probability with which the statement is to hold.
-
     **Returns:** the least `n` for which `upper_bound(failures, simulations + n)` is at most `p0`.
-
     **Raises:** `ValueError` unless `0 < p0 < 1`.
     """
     check_fraction("p0", p0)

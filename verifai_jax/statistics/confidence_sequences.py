@@ -55,9 +55,7 @@ def anytime_interval(
     factor of 1.5 to 2.
 
     **Arguments:** as `clopper_pearson`, but anything may have decided the number of simulations.
-
     **Returns:** the `Rate`.
-
     **Raises:** `ValueError` unless `0 <= failures <= simulations`, `simulations >= 1` and
     `0 < confidence < 1`.
     """
@@ -87,9 +85,7 @@ def simultaneous_interval(
     - `simulations`: samples in all; anything may have decided their number.
     - `confidence`: probability with which all intervals are to hold.
     - `among`: number of rates, this one included.
-
     **Returns:** the `Rate`.
-
     **Raises:** `ValueError` unless `0 <= failures <= simulations`, `simulations >= 1`,
     `0 < confidence < 1` and `among >= 1`.
     """

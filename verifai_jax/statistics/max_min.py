@@ -26,7 +26,6 @@ def max_min_step(
     - `radius`: greatest change of a coordinate.
     - `free`: coordinates that may move.
     - `bounded`: whether they stay in the unit cube.
-
     **Returns:** the step; zero where nothing can be gained, or the solver finds nothing.
     """
     step = np.zeros_like(theta)

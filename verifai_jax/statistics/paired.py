@@ -67,9 +67,7 @@ def paired_difference(
       out.
     - `confidence`: probability with which the interval is to hold, if the differences are
       independent and normal.
-
     **Returns:** the `PairedDifference`.
-
     **Raises:** `ValueError` for lists of different lengths, or a confidence out of range.
 
     Source: Student, The probable error of a mean, Biometrika 6 (1908).

@@ -77,9 +77,7 @@ def paired_rates(
     - `undecided`: further pairs without both verdicts.
     - `at_any_time`: False for a number of pairs that was fixed beforehand, of which the interval is
       narrower.
-
     **Returns:** the `PairedRates`.
-
     **Raises:** `ValueError` for counts below zero or above `pairs`, and unless `pairs >= 1` and
     `0 < confidence < 1`.
     """

@@ -18,7 +18,6 @@ def shortest(
     **Arguments:**
     - `matrix`: rows of length one, up to rounding, so that one tolerance fits them all.
     - `bound`: least value of each row.
-
     **Returns:** the vector; None if the inequalities contradict each other.
     """
     if np.all(bound <= 0):
@@ -49,7 +48,6 @@ def shortest_in_box(
     **Arguments:**
     - `rows`, `maximum`: linear inequalities; rows of zeros are left out.
     - `low`, `high`: the box.
-
     **Returns:** the vector, or None.
     """
     sizes = np.linalg.norm(rows, axis=1)
@@ -83,7 +81,6 @@ def smallest_change(
     - `target`: robustness to reach in every environment.
     - `free`: coordinates that may move.
     - `bounded`: whether they stay in the unit cube.
-
     **Returns:** the step; None if the linear model has no such point.
     """
     indices = np.flatnonzero(free)

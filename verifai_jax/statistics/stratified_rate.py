@@ -100,9 +100,7 @@ def stratified_rate(
     - `allocated`: whether somebody chose the number of trials of each stratum beforehand; without
       that they are samples of the whole.
     - `at_any_time`: whether verdicts decided which trials were made, or when to stop.
-
     **Returns:** the `StratifiedRate`.
-
     **Raises:** `ValueError` for counts below zero or failures above trials, no trial, and for a
     share or a confidence out of range.
     """

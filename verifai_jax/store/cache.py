@@ -42,7 +42,6 @@ class Cache:
     - `folder`: in which it is the file `sweep.cache` for a sweep; None keeps everything in this
       process only.
     - `kind`: of the work: `"sweep"` or `"augmentation"`.
-
     **Raises:** `CacheError` for a file that is not a cache, or damaged.
     """
 
@@ -75,10 +74,8 @@ class Cache:
         - `fingerprint`: nested dictionaries of plain data.
         - `sources`: what the work is made of; finished work of other files is refused too.
         - `even_if_changed`: whether work of other files will do; it is recorded then.
-
         **Returns:** what the work was made of when it began, and each time it went on with other
         files; nothing without `sources`.
-
         **Raises:** `CacheError` with the differences.
         """
         given = json.loads(json.dumps(fingerprint))

@@ -59,7 +59,6 @@ def replacing_all(folder: Path, names: Sequence[str]) -> Iterator[Path]:
     - `names`: the names of all files and folders that belong together, also those that may be
       missing. The last one is that without which the others are worth nothing: it goes first and
       comes last.
-
     **Raises:** `OSError` that names `folder`, for whatever the file system refuses.
     """
     *others, last = names

@@ -88,10 +88,8 @@ def sweep(
       `halving`, what goes on beyond a checkpoint is trained from its beginning, wherever it goes.
     - `even_if_changed`: whether to go on with finished work of a folder although files of the study
       are others than those that were recorded when it began; the record then says so.
-
     **Returns:** the policies with their returns and certificates. An interrupted sweep (Ctrl-C, out
     of time) returns its finished part; `record.complete` is False.
-
     **Raises:** before anything trains, `StudyError` and `UnknownNameError` as `Study.check`;
     `ValueError` for options out of range and for a search that needs gradients; `UnknownNameError`
     for an unknown search or option; `CacheError` for a folder that is damaged, foreign, of another

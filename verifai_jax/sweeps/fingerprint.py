@@ -23,7 +23,6 @@ def fingerprint(study: Study, options: Mapping[str, Any]) -> dict[str, Any]:
 
     **Arguments:**
     - `options`: options of the sweep, as plain data.
-
     **Returns:** nested dictionaries of plain data.
     """
     problem = study.untrained_problem()

@@ -183,7 +183,6 @@ def train_once(
     - `call`: the hyper-parameters `values`, the `steps` in all, the `folder` to resume from, and
       `starts` if it gets them.
     - `seed`: training seed.
-
     **Returns:** the arrays, which the pool hands on as they are.
     """
     random.seed(seed)

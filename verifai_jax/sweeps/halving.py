@@ -26,7 +26,6 @@ class Halving:
     - `by`: the criterion. `"return"` is the nominal return at the checkpoint; `"safety"` is the
       failure rate of the closed loop in a few simulations, then the worst robustness, then the
       return.
-
     **Raises:** `ValueError` for a reduction of 1 or less; `UnknownNameError` for another criterion.
     """
 
@@ -49,7 +48,6 @@ class Halving:
         **Arguments:**
         - `objective`: the objective of each configuration, by its number; the least is best, and
           NaN is worst.
-
         **Returns:** numbers of the configurations, in ascending order; of equal ones the first
         continue.
         """

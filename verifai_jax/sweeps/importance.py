@@ -100,9 +100,7 @@ class HyperparameterImportance(InNotebook):
 
         **Arguments:**
         - `path`: file that the picture is written to, if given.
-
         **Returns:** the Matplotlib figure.
-
         **Raises:** `ValueError` with too few configurations.
         """
         if not self.scores:

@@ -42,7 +42,6 @@ class OptunaSampler:
     **Arguments:**
     - `name`: `tpe`, `random`, `cmaes`, `gp`, `nsgaii` or `qmc`.
     - `options`: keyword arguments of the sampler's class; the seed is the sweep's.
-
     **Raises:** `UnknownNameError` for another name; `ValueError` for a seed among the options.
     """
 
@@ -62,7 +61,6 @@ class OptunaSampler:
         - `space`: the space of the hyper-parameters.
         - `seed`: the seed of the sampler.
         - `batch`: configurations in a round.
-
         **Raises:** `MissingExtra` without Optuna or a package that the sampler needs; `TypeError`
         for options that the sampler does not have.
         """

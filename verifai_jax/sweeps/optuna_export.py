@@ -58,7 +58,6 @@ def export_to_optuna(
     - `space`: the space of the hyper-parameters, where it is known.
     - `used`: names of the hyper-parameters of each algorithm; empty if all have all.
     - `storage`: the storage of the study; in memory when left out.
-
     **Raises:** `MissingExtra` without Optuna.
     """
     optuna = require("optuna", "optuna")

@@ -63,7 +63,6 @@ def make_proposer(
     - `search`: a name, `"optuna:NAME"`, a `Search`, or an `OptunaSampler`.
     - `configurations`: number of proposals in all.
     - `batch`: configurations in a round.
-
     **Raises:** `UnknownNameError` for another name; `ValueError` for a search that needs gradients
     or does not fit this space; `TypeError` for something that is not a search; `MissingExtra`
     without Optuna.
@@ -138,7 +137,6 @@ def objective(
     - `worst_robustness`: the least robustness of all simulations.
     - `nominal_return`: mean return on the nominal task.
     - `return_range`: least and greatest nominal return of the first round.
-
     **Returns:** the objective; None if the failure rate is not known.
     """
     if not math.isfinite(failure_rate):

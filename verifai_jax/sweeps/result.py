@@ -250,9 +250,7 @@ class Sweep(Drawn):
         - `i`: number of the row; the best when left out.
         - `simulations`: budget of a search for more than those of the sweep; needs the study.
         - `search`, `seed`: of these simulations.
-
         **Returns:** columns of the problem's features, and `rho`, the robustness.
-
         **Raises:** as `problem` and `best`; `ValueError` where more are looked for and the model
         has changed since the sweep.
         """
@@ -357,7 +355,6 @@ class Sweep(Drawn):
         - `path`: the path of the HTML file.
         - `options`: the options of `reports.write_report`: `units` and `reasons` of
           hyper-parameters.
-
         **Returns:** the path.
         """
         return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
@@ -390,7 +387,6 @@ class Sweep(Drawn):
         - `storage`: place where Optuna stores it, such as `"sqlite:///sweep.db"`; memory when left
           out.
         - `name`: the name of the study there; the sweep's own when left out.
-
         **Raises:** `MissingExtra` without the package.
         """
         return export_to_optuna(
@@ -412,7 +408,6 @@ def load_sweep(folder: str | Path, study: Study | str | None = None) -> Sweep:
     - `folder`: the folder.
     - `study`: the study or its name, such as `"specs/cartpole.py:safe_training"`; needed for
       `.problem(i)` and further counterexamples. The files never name code to run.
-
     **Raises:** `FileNotFoundError` for a folder without a sweep; `SweepFileError` for a damaged
     one, one of another format, or a study of another name or with other hyper-parameters.
     """

@@ -70,7 +70,6 @@ def write_sweep(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> Pat
     **Arguments:**
     - `table`: its table, the columns of the record.
     - `folder`: the folder; it is created.
-
     **Raises:** `FolderInUse` where another process writes it; `OSError` for what the file system
     refuses, which leaves what was there.
     """
@@ -163,7 +162,6 @@ def read_sweep(description: Mapping[str, Any], folder: Path) -> StoredSweep:
 
     **Arguments:**
     - `description`: the description of the folder, as `read_description` returns it.
-
     **Raises:** `SweepFileError` where a file is missing or damaged.
     """
     import pandas as pd

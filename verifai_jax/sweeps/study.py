@@ -169,7 +169,6 @@ class Study(InNotebook):
         **Arguments:**
         - `names`: hyper-parameters to vary.
         - `nominal`: values of the others.
-
         **Raises:** `UnknownNameError` for another name; `ValueError` for a missing value.
         """
         return replace(self, space=self.space.only(*names, nominal=nominal))

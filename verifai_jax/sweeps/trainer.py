@@ -71,7 +71,6 @@ class Trainer:
     - `observation`: for a function, an example of an observation where its policies do not say what
       they observe, as functions and modules of flax.
     - `workers`: for a function, processes at a time; as many as there are cores when left out.
-
     **Raises:** `StudyError` without an algorithm, for something that is not an algorithm or
     task, a number of steps that is not positive, or a nominal task with other actions or
     observations.
@@ -151,7 +150,6 @@ class Trainer:
         **Arguments:**
         - `values`: plain Python values; the fields of algorithm and task decide the others.
         - `seed`: training seed.
-
         **Raises:** `ValueError` for a value that the algorithm or the task refuses.
         """
         algorithm = self.by_name[self.algorithm_name(values)]

@@ -147,7 +147,6 @@ class TrainingRuns:
         - `numbers`: the runs.
         - `rung`: number of the checkpoint, from 0 on.
         - `further`: keep their states, because some will continue from there.
-
         **Raises:** `OutOfTime` where the seconds of the stage are over.
         """
         self._assign_batches()
@@ -308,7 +307,6 @@ def train_block(
     **Arguments:**
     - `shipment`: with the study.
     - `work`: of each run its hyper-parameters, its seed, and the steps of its checkpoints.
-
     **Returns:** of each run the arrays of its checkpoints, or the error that ended it in one line.
     """
     trainer = shipment.thing.trainer

@@ -90,9 +90,7 @@ def repair(
     - `max_seconds`: wall-clock seconds; a fifth is reserved for the check.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
     - all other arguments: as in `falsify`.
-
     **Returns:** a `Repair`; after Ctrl-C what is finished, without the check.
-
     **Raises:** `ValueError` before anything compiles for unknown features, parameters without a
     nominal value, no environment, options out of range, or arrays of a system without gradients.
     """

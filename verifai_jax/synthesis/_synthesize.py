@@ -100,9 +100,7 @@ def synthesize(
     - `max_seconds`: wall-clock seconds; a fifth is reserved for the check.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
     - all other arguments: as in `falsify`.
-
     **Returns:** a `Synthesis`; after Ctrl-C what is finished, without the check.
-
     **Raises:** `ValueError` before anything compiles for unknown features and options out of range.
     """
     started = time.perf_counter()

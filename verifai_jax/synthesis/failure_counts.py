@@ -41,7 +41,6 @@ class FailureCounts:
     - `seed`: alone decides samples and candidates.
     - `start` `[p]`: nominal parameters, which are candidates; of others that fail as seldom the
       nearest to these is best. None without any.
-
     **Raises:** `ValueError` where nothing varies but the parameters.
     """
 

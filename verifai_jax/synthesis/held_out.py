@@ -89,7 +89,6 @@ def held_out(
     - `margin`: robustness that is wanted.
     - `seed`: alone decides the environments.
     - `limits`: time at which to stop early.
-
     **Returns:** a `HeldOut`.
     """
     points = draw(loop, theta, count, seed)

@@ -69,7 +69,6 @@ class FeatureParameters:
     - `names`: the names of the features that are parameters; all that vary when left out.
     - `batch`: simulations at once.
     - `gradient`: whether gradients may be asked for.
-
     **Raises:** `ValueError` for unknown features, none, or one that does not vary.
     """
 
@@ -195,7 +194,6 @@ class ArrayParameters:
     - `parameters`: a pytree of arrays of real numbers.
     - `system_of(parameters) -> system`: pure, and traced by JAX.
     - `batch`: simulations at once.
-
     **Raises:** `TypeError` for leaves that are no real numbers; `ValueError` for a system that JAX
     cannot trace in the parameters.
     """

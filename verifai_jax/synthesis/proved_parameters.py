@@ -70,7 +70,6 @@ def prove_around(
     - `low`, `high`: corners of the part of the cube in which the other features lie.
     - `seconds`: how long, about.
     - `precision`, `seed`: as of `verify`.
-
     **Raises:** `MissingRule` for an operation of the system that sets cannot go through.
     """
     started, end = time.perf_counter(), time.perf_counter() + seconds

@@ -276,7 +276,6 @@ class Repair(Drawn, InNotebook):
         **Arguments:**
         - `method`, `options`: of `vj.estimate`.
         - `budget`: simulations at most for each of the two.
-
         **Raises:** as `vj.estimate`.
         """
         estimate = lazy_import("verifai_jax.estimation", "estimate")

@@ -114,7 +114,6 @@ class System(ForUsers):
 
         **Arguments:**
         - `features`: `jax.ShapeDtypeStruct`s.
-
         **Raises:** `ValueError` that says what does not fit.
         """
 
@@ -168,7 +167,6 @@ class System(ForUsers):
 
         **Arguments:**
         - `factor`: the step is divided by it; a traced integer where `traced_factor` allows it.
-
         **Raises:** `ValueError` for a factor that is not a positive integer.
         """
         raise NotImplementedError(f"{self!r} has no refined(factor)")
@@ -212,7 +210,6 @@ class System(ForUsers):
 
         **Arguments:**
         - `features`: `jax.ShapeDtypeStruct`s.
-
         **Raises:** `ValueError` for a system that has no policy or controller that is known here.
         """
         raise ValueError(
@@ -246,7 +243,6 @@ class System(ForUsers):
 
         **Arguments:**
         - `features`: each leaf with a leading axis `[n]`.
-
         **Returns:** a trace, each leaf with a leading axis `[n]`.
         """
         raise NotImplementedError(f"{self!r} has no simulate_batch(features, keys)")

@@ -190,7 +190,6 @@ class Passing(NamedTuple):
 
         **Arguments:**
         - `channel`: `"observation"`, `"action"`, a name, or either with an index: `"action[0]"`.
-
         **Raises:** `UnknownNameError` with the nearest channel; `ValueError` for an index that does
         not exist, and a channel without numbers.
         """

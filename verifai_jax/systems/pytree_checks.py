@@ -74,7 +74,6 @@ def check_like(
     **Arguments:**
     - `same_precision`: whether real numbers must have the same number of bits; where not, whoever
       asks converts them (`as_precise_as`).
-
     **Raises:** `ValueError`: `origin` must return `role`, and the first difference.
     """
     must = f"{origin} must return {role}"

@@ -19,7 +19,6 @@ def check_domain(domain: Domain, *, samples: int = 64, seed: int = 0) -> None:
     - `domain`: to check.
     - `samples`: number of random points.
     - `seed`: the seed of the points.
-
     **Raises:** `AssertionError` naming the broken law.
     """
     size, levels = domain.size, np.array(domain.levels, int)

@@ -27,7 +27,6 @@ def check_search(
     - `batch`: points in a round.
     - `rounds`: number of rounds.
     - `seed`: the seed of its random key.
-
     **Raises:** `AssertionError` naming the broken law.
     """
     search.check(cube)
@@ -104,7 +103,6 @@ def check_batch_independence(search: Search, cube: Cube, *, points: int = 48) ->
     - `search`: to check.
     - `cube`: that it searches.
     - `points`: number of points to compare.
-
     **Raises:** `AssertionError` if it does not.
     """
     sequences = []

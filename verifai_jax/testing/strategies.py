@@ -27,9 +27,7 @@ def strategy(space: FeatureSpace, nominal: Mapping[str, Any] | None = None) -> A
     - `space`: a feature space.
     - `nominal`: ordinary features, towards which examples shrink; the middles of the domains, and
       the least lengths, when left out.
-
     **Returns:** a `hypothesis.strategies.SearchStrategy` of dictionaries of features.
-
     **Raises:** `ImportError` without Hypothesis; `ValueError` for nominal features outside the
     space.
     """

@@ -25,7 +25,6 @@ def check_system(
     - `seed`: the seed of features and keys.
     - `tolerance`: difference of signals between the ways to simulate, relative to their largest
       value.
-
     **Raises:** `AssertionError` naming the broken law.
     """
     points = jax.random.uniform(jax.random.key(seed), (samples, space.dim), jnp.float32)

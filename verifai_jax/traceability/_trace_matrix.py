@@ -54,9 +54,7 @@ def trace_matrix(
     - `runs`: folders of runs, and folders of such folders.
     - `reports`: files and folders of reports; those in the folders of the runs are always found.
       What is None is not asked for, and not missing.
-
     **Returns:** the matrix.
-
     **Raises:** `TargetError` for a file that cannot be run; `ValueError` for a damaged record,
     claims of another form, and two problems of one name.
     """

@@ -68,9 +68,7 @@ def real_trials(
     - `at_any_time`: verdicts decided which trials were made, or when to stop.
     - `time`, `dt`: of recordings, as `mtl.read` takes them.
     - `precision`, `executor`, `progress`: as in `falsify`.
-
     **Returns:** the result, with the table of trials and predictions.
-
     **Raises:** `FileNotFoundError`; `ValueError` for tables without a verdict or a feature,
     features outside their domains, and options out of range; what `falsify` raises.
     """

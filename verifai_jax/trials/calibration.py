@@ -85,9 +85,7 @@ def calibrate(
     - `features`: names of the features that the trials had in common and nobody measured.
     - `simulations`: all of them; each draw of values takes as many as there are trials.
     - `seed`: the seed of the draws.
-
     **Returns:** the posterior, and the problem with it.
-
     **Raises:** `ValueError` for no or an unknown feature, one that is no single number, a table
     without a verdict, and fewer simulations than 20 draws take; what `simulate` raises.
     """

@@ -95,7 +95,6 @@ def compare_trials(
       trials name a policy by its code.
     - `margin`: difference of failure rates that does not matter, from 0 on.
     - `confidence`: probability with which the verdict holds, whenever one stops.
-
     **Raises:** `FileNotFoundError`; `ValueError` for missing columns, an unknown policy, a pair
     that has a policy twice, no complete pair, and numbers out of range.
     """

@@ -56,9 +56,7 @@ def trial_protocol(
     - `policies`: names of two policies to compare.
     - `trials`: features of the trials instead, such as those of `next_trials`.
     - `seed`: the seed of the features, the order and the codes.
-
     **Returns:** the table.
-
     **Raises:** `ValueError` for a number of policies other than none or two; `OSError` where a file
     cannot be written.
     """

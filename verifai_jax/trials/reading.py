@@ -34,10 +34,8 @@ def read_trials(
     - `problem`: its features are columns of the table; its formulas judge recordings.
     - `trials`: a file or a data frame.
     - `time`, `dt`: of recordings, as `mtl.read` takes them.
-
     **Returns:** the features with a column `failed` of True, False or None (undecided), and why
     recordings have no verdict, with how many.
-
     **Raises:** `FileNotFoundError`; `ValueError` for no trial, a table without a verdict or without
     a feature, and for a verdict that is none.
     """

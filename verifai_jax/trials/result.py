@@ -76,7 +76,6 @@ class RealTrials(InNotebook):
 
         **Arguments:**
         - `options`: the options of `analysis.rules`.
-
         **Raises:** `ValueError` where all predictions are right, or all wrong.
         """
         columns = list(self.problem.space.columns)
@@ -95,7 +94,6 @@ class RealTrials(InNotebook):
         **Arguments:**
         - `count`: number of trials.
         - `seed`: the seed of the draw.
-
         **Returns:** the features, `predicted` and the simulated `robustness` of each.
         """
         check_count("count", count)

@@ -60,9 +60,7 @@ def verify(
       next. Nothing is sampled; searches and estimates simulate steps, and do not take the result.
     - `resume`: an earlier result of the same problem, or its file, to go on with.
     - `progress`: as in `falsify`.
-
     **Returns:** the result: the three volumes, the three probabilities, the boxes.
-
     **Raises:** `ProblemError` for a black box, for a system that draws random numbers, and for what
     `continuous` cannot be about;
     `MissingRule` for an operation that sets cannot go through, with its name and line; `ValueError`

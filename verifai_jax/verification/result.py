@@ -239,7 +239,6 @@ class Verification(Drawn, InNotebook):
         **Arguments:**
         - `problem`: that of `rest`.
         - `budget`: simulations of the search, of which these take an eighth at most.
-
         **Returns:** the rows; None if nothing is left.
         """
         boxes = self.boxes[~np.isin(self.boxes.state, (PROVED, OUTSIDE))]
@@ -258,7 +257,6 @@ class Verification(Drawn, InNotebook):
         **Arguments:**
         - `problem`: the problem that was verified.
         - `precision`: the precision of the simulations of the rest, in which it was verified.
-
         **Raises:** `ValueError` for another problem or precision, and where nothing is left.
         """
         self.check_same(problem, precision)
@@ -273,7 +271,6 @@ class Verification(Drawn, InNotebook):
         **Arguments:**
         - `path`: the path of the HTML file.
         - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`.
-
         **Returns:** the path.
         """
         return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
@@ -283,9 +280,7 @@ class Verification(Drawn, InNotebook):
 
         **Arguments:**
         - `path`: the path of the file, whose folder is made.
-
         **Returns:** the path.
-
         **Raises:** `OSError` that names the file, for whatever the file system refuses.
         """
         plain = {name: value for name, value in vars(self).items()

@@ -190,9 +190,7 @@ def clusters(
     - `seed`: an integer, a NumPy generator or a `jax.random` key.
     - `scale`: as in `Samples.scaling`.
     - `max_clusters`: clusters at most, where `count` is left out.
-
     **Returns:** `Clusters`; the same seed gives the same ones.
-
     **Raises:** `ValueError` for an unknown method; a method
     without a column that it can use; a `count` above the number of different rows, or for DBSCAN; a
     radius that is not positive, or for another method.

@@ -79,7 +79,6 @@ class Samples:
         - `columns`: what to analyse; by default all features. `"rho"` and `"rho.NAME"`, the
           robustness, are columns too, but only if named here.
         - `space`: says which columns are ordered and what their ranges are; a run knows its own.
-
         **Raises:** `TypeError` for another source; `ValueError` for another `which`, rows of a run
         that have changed since they were written, no rows,
         row numbers that are not unique integers, unknown columns (with the nearest names), or

@@ -94,9 +94,7 @@ def brax_task(
     - `backend`: the physics pipeline, as for `brax`.
     - `time_limit`: in steps, after which an episode is cut off; Brax trains on 1000.
     - `options`: keyword arguments of an environment by name, numbers or text.
-
     **Returns:** a task with actions from -1 to 1 for each actuator.
-
     **Raises:** `MissingExtra` without brax; `UnknownNameError` for an unknown environment or
     backend; `ValueError` for an environment in a wrapper that resets, ends or batches episodes, for
     observations that are no array, and for a `time_limit` that is not a positive integer.
@@ -119,9 +117,7 @@ def playground_task(
     - `env`: the name of an environment, or an `MjxEnv` of your own.
     - `time_limit`: in steps, after which an episode is cut off.
     - `options`: overrides of the configuration of an environment by name.
-
     **Returns:** a task with actions from -1 to 1 for each actuator.
-
     **Raises:** `MissingExtra` without Playground; `UnknownNameError` for an unknown environment;
     `ValueError` for observations that are no array, and for one whose assets are not installed.
     """

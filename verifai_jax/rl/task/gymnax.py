@@ -98,10 +98,8 @@ def gymnax_task(
     - `env`: the id of a registered environment, or an `Environment` of your own.
     - `params`: the environment's parameters; its default ones when left out.
     - `time_limit`: in steps; the environment's `max_steps_in_episode` when left out.
-
     **Returns:** a task with the environment's actions: a choice, or a box. A box whose entries have
     different bounds takes actions from -1 to 1 for each. Observations are one vector of float32.
-
     **Raises:** `MissingExtra` without gymnax, or with one that is too old; `UnknownNameError` for
     an unknown environment; `ValueError` for an environment in a wrapper, a missing time limit, and
     actions or observations of another kind.

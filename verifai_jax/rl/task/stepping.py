@@ -99,7 +99,6 @@ def match_types(state: PyTree, following: PyTree, name: str) -> PyTree:
     **Arguments:**
     - `following`: the state after a step, or its shapes and dtypes.
     - `name`: the environment's, for the error message.
-
     **Raises:** `ValueError` for a step that leads to a state of another structure.
     """
     if jax.tree.structure(state) != jax.tree.structure(following):

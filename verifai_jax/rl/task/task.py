@@ -88,7 +88,6 @@ class Task(Protocol):
 
         **Arguments:**
         - `key`: a random key, of this episode's start alone.
-
         **Returns:** a state with the structure, shapes and dtypes that `step` returns.
         """
         ...
@@ -103,7 +102,6 @@ class Task(Protocol):
         - `state`: as `reset` or `step` returned it.
         - `action`: an int32 scalar of a `Discrete` task, a float32 vector `[size]` of a
           `Continuous` one.
-
         **Returns:** the next state; the reward; whether the episode is over for good.
         """
         ...

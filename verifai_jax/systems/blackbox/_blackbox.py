@@ -295,10 +295,8 @@ def blackbox(
       is `[n]`, and so is every array of the trace; see `stack_traces`.
     - `signals`, `dt`, `length`: the form of every trace; see `TraceForm`. One that differs is a
       row with status `error`.
-
     **Returns:** a `VectorisedBlackBox` with `vectorised`, a `PooledBlackBox` with `workers`, else a
     `BlackBox`.
-
     **Raises:** `ValueError` for a function that cannot be called, or that workers cannot import,
     and for options that do not go together.
     """
@@ -335,9 +333,7 @@ def stack_traces(
 
     **Arguments:** those of `Trace`, each array with a leading axis: `signals` are `[n, time]` or
     `[n, time, k]`, `times` `[n, time]`, `valid` and `status` `[n]`.
-
     **Returns:** a `Trace` whose leaves have a leading axis `[n]`.
-
     **Raises:** as `Trace` does for the first of them.
     """
     signals = {name: with_gaps(name, signal) for name, signal in signals.items()}

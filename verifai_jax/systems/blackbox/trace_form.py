@@ -22,7 +22,6 @@ class TraceForm:
     - `signals`: names of scalars, or names with their number of components (1 for a scalar).
     - `dt`: sampling period in seconds.
     - `length`: number of samples.
-
     **Raises:** `ValueError` for a declaration that no trace can meet.
     """
 

@@ -63,7 +63,6 @@ class Pool:
     - `function`: the user's part of it, which errors speak of.
     - `workers`, `timeout` (s), `retries`: see `blackbox`.
     - `fresh`: each simulation gets a process of its own.
-
     **Raises:** `ValueError` for numbers out of range, and for a function that a new process cannot
     import.
     """

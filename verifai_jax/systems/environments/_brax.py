@@ -190,7 +190,6 @@ def brax(
     A `Signal` feature reaches `sys` and functions as its value at the beginning of the step.
 
     **Returns:** a `Brax` system; one episode is one simulation.
-
     **Raises:** `MissingExtra` without brax, or with one that is too old; `UnknownNameError` for an
     unknown environment, backend or part; `ValueError` for a part that the backend does not read,
     and numbers that do not fit; once the system is traced, for a policy, a state or signals that

@@ -399,10 +399,8 @@ def gymnasium(
       reaches the environment, as libraries do in training; False passes it on. Either way the run
       counts it and says so among its notes. Whatever else is no action of the action space is an
       error of its row.
-
     **Returns:** a black box, with `workers` one in processes of its own; one episode is one
     simulation.
-
     **Raises:** `MissingExtra` without Gymnasium; `ValueError` for options that do not fit; when the
     problem is checked, `UnknownNameError` for an attribute that the environment lacks.
     """

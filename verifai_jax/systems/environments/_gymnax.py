@@ -152,7 +152,6 @@ def gymnax(
     Environments that support gradients are asked for them; differentiating any other raises.
 
     **Returns:** a `Gymnax` system; one episode is one simulation.
-
     **Raises:** `MissingExtra` without gymnax, or with one that is too old; `UnknownNameError` for
     an unknown environment or parameter; `ValueError` for numbers that do not fit, and, once the
     system is traced, for a policy, a state or signals that do not.

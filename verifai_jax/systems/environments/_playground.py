@@ -136,9 +136,7 @@ def playground(
       left out.
     - `observation_delay`, `action_delay`: steps after which the policy sees an observation, and
       after which its action takes effect: a number, or `{feature: greatest number}`.
-
     **Returns:** a `Playground` system; one episode is one simulation.
-
     **Raises:** `MissingExtra` without Playground; `UnknownNameError` for an unknown environment or
     path; `ValueError` for an environment whose assets are not installed, for forces and controls
     in `bind`, and for numbers that do not fit.

@@ -205,7 +205,6 @@ def policy_function(policy: object, memory: PyTree = None) -> Decide:
       arguments have no default, and the features of the instant if one is called `features`.
     - `memory`: the memory of a policy with memory at first. It is then called with `(observation,
       memory)` or `(observation, memory, key)` and returns `(action, memory)`.
-
     **Raises:** `ValueError` for something that cannot be called so.
     """
     act = getattr(policy, "act", None)

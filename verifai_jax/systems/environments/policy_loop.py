@@ -191,7 +191,6 @@ def loop_options(
     **Arguments:**
     - `delays`: the delays of observations and of actions.
     - `configured`, `started`: what `configure`, and a function `initial`, is called with first.
-
     **Raises:** `ValueError` for an option that cannot be used.
     """
     seconds = sampling_period(dt)

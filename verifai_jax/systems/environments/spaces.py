@@ -106,7 +106,6 @@ def fit(space: Space, action: object, clip: bool = True) -> Fitted:
     **Arguments:**
     - `clip`: whether what lies outside the bounds of a Box is set to the nearest bound, as training
       libraries do, or passed on. Either way `outside` says so.
-
     **Raises:** `Misfit` for a value that is not an action of the space.
     """
     kind = kind_of(space)

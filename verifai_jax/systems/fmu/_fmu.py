@@ -206,9 +206,7 @@ def fmu(
       FMU cannot save its state; False for an FMU whose reset forgets something.
     - `exchange`: whether its equations are integrated here, by model exchange; when left out only
       those of an FMU without a solver of its own.
-
     **Returns:** the system.
-
     **Raises:** `FileNotFoundError`; `ValueError` for a file that is no such FMU, without a binary
     for this machine, for variables that do not exist, and times out of range.
     """
@@ -265,9 +263,7 @@ def fmu_ranges(
     - `file`: the FMU.
     - `names`: parameters, start values or inputs.
     - `around`: share of the start value to both sides, for variables without a range, such as 0.2.
-
     **Returns:** the low and the high end for each name.
-
     **Raises:** `ValueError` for a variable without a range, if `around` is left out or it has no
     start value; as `fmu`.
     """

@@ -64,7 +64,6 @@ class Instance:
     **Arguments:**
     - `description`: the description of the FMU.
     - `folder`: where the FMU is unpacked.
-
     **Raises:** `FMUError` where the binary cannot be loaded or does not make an instance.
     """
 

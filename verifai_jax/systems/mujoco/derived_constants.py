@@ -55,7 +55,6 @@ def bodies_of_geoms(
     - `model`: with the spec that it came from.
     - `changed`: numbers of geoms of another size or in another location.
     - `massive`: numbers of geoms with another mass, and the paths that say so.
-
     **Raises:** `ValueError` for a body whose inertia cannot be computed here (meshes, shells), and
     for the mass of a geom that its body's does not come from.
     """

@@ -66,7 +66,6 @@ def load(
       the model's own.
     - `keyframe`: name or number of the keyframe that simulations begin with.
     - `options`: fields of the model's options to set, where they are not None.
-
     **Raises:** `MissingExtra` without MuJoCo; `FileNotFoundError`; `ValueError` for text that is
     no model, for contacts of an `MjModel`, which takes no more sensors, and for a keyframe that
     the model lacks.

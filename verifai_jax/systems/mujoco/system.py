@@ -271,9 +271,7 @@ def mujoco(
     - `action_delay`: control periods after which a decision of the controller takes effect, or the
       feature that says so with the greatest that it may be, `{"latency": 5}`. Until the first one
       does, the control is the keyframe's, or zero.
-
     **Returns:** a `MuJoCo` system.
-
     **Raises:** `MissingExtra` without MuJoCo; `FileNotFoundError`; `ValueError` for a model that
     does not compile, times that do not fit, and paths that are not in the model.
     """

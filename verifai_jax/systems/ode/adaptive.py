@@ -31,7 +31,6 @@ def adaptive(
     - `rtol`, `atol`: relative and absolute tolerance of a step's error.
     - `max_steps`: the maximum number of steps of diffrax in one step of `ode`; what needs more
       becomes `NONFINITE`.
-
     **Raises:** `MissingExtra` without diffrax, `UnknownNameError` for an unknown solver, and
     `ValueError` for tolerances that are not positive.
     """

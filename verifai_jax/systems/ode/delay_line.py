@@ -67,7 +67,6 @@ def delay_line(value: Any, *, longest: float, period: float) -> DelayLine:
     - `longest`: seconds back at most; what is older has the value of that time.
     - `period`: seconds between two samples: `dt` for a line that `update` pushes, the control
       period for one in a controller's memory. A delay shorter than it reads the newest sample.
-
     **Raises:** `ValueError` for seconds that are not positive, and a value that is not a number.
     """
     for name, seconds in (("longest", longest), ("period", period)):

@@ -38,7 +38,6 @@ class LookupTable:
       these make a table of vectors.
     - `beyond`: `"clip"` has the value at the end of an axis beyond it, `"extrapolate"` goes on
       along the last line.
-
     **Raises:** `ValueError` for breakpoints that do not increase, values that are not finite or of
     another shape, and an unknown `beyond`.
     """

@@ -64,7 +64,6 @@ def hysteresis(on: Any, value: Any, low: Any, high: Any) -> Any:
     **Arguments:**
     - `on`: the mode now, 0 or 1, which stays between the two.
     - `low`, `high`: where the mode changes; numbers, or traced.
-
     **Raises:** `ValueError` for numbers with `low` above `high`.
     """
     if is_number(low) and is_number(high) and low > high:

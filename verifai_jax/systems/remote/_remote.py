@@ -174,9 +174,7 @@ def remote(
     - `max_bytes`: the maximum number of bytes of one message from a client.
     - `max_memory`: bytes of unfinished messages of all clients together, at least `max_bytes`;
       beyond it the client whose message began first is sent away, and may come back.
-
     **Returns:** a `Remote`, which listens once it is needed, or in a `with` statement.
-
     **Raises:** `ValueError` for options out of range, an address beyond this machine without a
     token, files that are no certificate; when it is first needed, `OSError` for a port that is
     taken.

@@ -320,7 +320,6 @@ def server_context(certificate: File, private_key: File | None) -> ssl.SSLContex
     **Arguments:**
     - `certificate`: a PEM file with the certificate, and those between it and its authority.
     - `private_key`: a PEM file with its key; the same file when None. The key is not encrypted.
-
     **Raises:** `ValueError` for files that are not there, or hold no such thing.
     """
     for name, file in (("certificate", certificate), ("private_key", private_key)):
