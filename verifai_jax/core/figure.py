@@ -37,6 +37,24 @@ class Drawn:
         return lazy_import(f"verifai_jax.plotting.{module}", function)(self, path)
 
 
+class Reported:
+    """A result on which an evidence report can be written."""
+
+    def report(self, path: str | Path, **options: Any) -> Path:
+        """Write the evidence report as one HTML file, and its claims as JSON next to it.
+
+        **Arguments:**
+        - `path`: the path of the HTML file.
+        - `options`: the options of `reports.write_report` for a result of this kind: of a run
+          `units` and `reasons` of features, `traces`, `studies`, `modes`, `odd`, `assessment`; of a
+          sweep `units` and `reasons` of hyper-parameters; of a transfer `units` and `reasons` of
+          features, and of any other result its `problem`, too; of an estimate and a comparison also
+          `errors`.
+        **Returns:** the path of the HTML file.
+        """
+        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
+
+
 def new_figure(**options: Any) -> Figure:
     """Return an empty figure: nothing pops up, and nothing has to be closed.
 

@@ -10,12 +10,10 @@ result.plot("estimate.png")
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from verifai_jax.core.checks import check_fraction
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.lazy import lazy_import
+from verifai_jax.core.figure import Drawn, Reported
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent, format_probability
 from verifai_jax.statistics.binomial import simulations_until
@@ -33,7 +31,7 @@ WEIGHTED = ("importance", "splitting", "surrogate")
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate(Drawn, InNotebook):
+class Estimate(Drawn, Reported, InNotebook):
     """A failure probability, as `estimate` returns it.
 
     - `name`: name of the problem.
@@ -191,13 +189,3 @@ class Estimate(Drawn, InNotebook):
         if self.probability is not None and self.high < p0:
             return f"shown, unless the method has missed a part of the failures; {prior}"
         return f"open; {prior}"
-
-    def report(self, path: str | Path, **options: Any) -> Path:
-        """Write the evidence report on the estimate as HTML, and its claims as JSON.
-
-        **Arguments:**
-        - `path`: the path of the HTML file.
-        - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`, `errors`.
-        **Returns:** the path.
-        """
-        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)

@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.lazy import lazy_import
+from verifai_jax.core.figure import Drawn, Reported
 from verifai_jax.core.sources import Change, list_changes
 from verifai_jax.core.targets import load_target
 from verifai_jax.core.trace import Trace
@@ -51,7 +50,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Sweep(Drawn):
+class Sweep(Drawn, Reported):
     """The policies of a sweep with their returns and certificates, as `sweep` returns them.
 
     **Fields:**
@@ -347,17 +346,6 @@ class Sweep(Drawn):
 
     def _repr_html_(self) -> str:
         return format_html(self.findings)
-
-    def report(self, path: str | Path, **options: Any) -> Path:
-        """Write the evidence report on the sweep: one HTML file, and its claims as JSON next to it.
-
-        **Arguments:**
-        - `path`: the path of the HTML file.
-        - `options`: the options of `reports.write_report`: `units` and `reasons` of
-          hyper-parameters.
-        **Returns:** the path.
-        """
-        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
 
     def save(self, folder: str | Path) -> Path:
         """Write the sweep to a folder: table, policies, curves, record.

@@ -15,8 +15,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.lazy import lazy_import
+from verifai_jax.core.figure import Drawn, Reported
 from verifai_jax.core.notebook import InNotebook, frame_html, picture_html
 from verifai_jax.core.text import counted, format_percent
 from verifai_jax.problem.model_digest import digest_of_model
@@ -47,7 +46,7 @@ class Part(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Verification(Drawn, InNotebook):
+class Verification(Drawn, Reported, InNotebook):
     """The result of `verify`.
 
     - `name`: the name of the problem; `columns`: its unit coordinates.
@@ -264,16 +263,6 @@ class Verification(Drawn, InNotebook):
         if not left.mass:
             raise ValueError(f"all of {problem.name!r} is proved: nothing is left to search")
         return replace(problem, space=RestSpace(problem.space, left))
-
-    def report(self, path: str | Path, **options: Any) -> Path:
-        """Write the evidence report on the verification as HTML, and its claims as JSON.
-
-        **Arguments:**
-        - `path`: the path of the HTML file.
-        - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`.
-        **Returns:** the path.
-        """
-        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
 
     def save(self, path: str | Path) -> Path:
         """Write the result as JSON; `load_verification` reads it.
