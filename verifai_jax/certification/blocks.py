@@ -239,7 +239,9 @@ class Blocks:
                     ]
                     found = self._simulate(owner, [blocks[j] for j in some], key)
                     ready.update(zip(some, found, strict=True))
-                return _to_memo(ready.pop(i))
+                verdicts = ready.pop(i)
+                lowest = np.where(verdicts.proper, verdicts.lowest, np.nan).astype(np.float32)
+                return {"rho": lowest, "failing": verdicts.violated, "proper": verdicts.proper}
 
             yield i, _from_memo(self._remember(block.name, compute), len(block.points))
 
@@ -337,11 +339,6 @@ class _Samples:
 
     def accepted(self, u: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
         return np.asarray(self._space.accepts_points(u))
-
-
-def _to_memo(verdicts: Verdicts) -> dict[str, np.ndarray]:
-    lowest = np.where(verdicts.proper, verdicts.lowest, np.nan).astype(np.float32)
-    return {"rho": lowest, "failing": verdicts.violated, "proper": verdicts.proper}
 
 
 def _from_memo(known: Arrays, count: int) -> Verdicts:

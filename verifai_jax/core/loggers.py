@@ -48,22 +48,19 @@ class CSVLogger:
         row = {STEP: step, **values}
         columns = [*self._columns, *(name for name in row if name not in self._columns)]
         if columns != self._columns:
-            self._widen(columns)
+            # Write the file anew with more columns.
+            rows: list[dict[str, str]] = []
+            if self._columns:
+                with self.path.open(newline="") as file:
+                    rows = list(csv.DictReader(file))
+            with replacing(self.path) as partial, partial.open("w", newline="") as file:
+                writer = csv.DictWriter(file, columns)
+                writer.writeheader()
+                writer.writerows(rows)
+            self._columns = columns
         line = io.StringIO()
         csv.DictWriter(line, self._columns).writerow(row)
         append(self.path, line.getvalue().encode())
-
-    def _widen(self, columns: list[str]) -> None:
-        """Write the file anew with more columns."""
-        rows: list[dict[str, str]] = []
-        if self._columns:
-            with self.path.open(newline="") as file:
-                rows = list(csv.DictReader(file))
-        with replacing(self.path) as partial, partial.open("w", newline="") as file:
-            writer = csv.DictWriter(file, columns)
-            writer.writeheader()
-            writer.writerows(rows)
-        self._columns = columns
 
 
 class TensorBoardLogger:
