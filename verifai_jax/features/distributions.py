@@ -18,7 +18,6 @@ from jaxtyping import Array, Float
 from verifai_jax.features import continuous
 from verifai_jax.features.domain import MIN_REAL, Tuning, short
 from verifai_jax.features.ends import replace_where
-from verifai_jax.features.english import number
 
 CENTRAL = 4.0
 """Standard deviations from the mean within which float32 coordinates are closely spaced."""
@@ -44,6 +43,7 @@ class Normal(continuous.Continuous):
     """
 
     arguments = ("mean", "std")
+    _english = "normal with mean {mean} and standard deviation {std}"
     mean: float
     std: float
 
@@ -73,12 +73,9 @@ class Normal(continuous.Continuous):
             -np.abs((np.asarray(value, np.float64) - self.mean) / self.std)
         )
 
-    def words(self) -> str:
-        return f"normal with mean {number(self.mean)} and standard deviation {number(self.std)}"
-
 
 @dataclass(frozen=True, repr=False)
-class TruncatedNormal(continuous.Continuous):
+class TruncatedNormal(continuous.Bounded):
     """A normal distribution given that the value lies in `[low, high]`.
 
     **Arguments:**
@@ -94,6 +91,7 @@ class TruncatedNormal(continuous.Continuous):
     """
 
     arguments = ("mean", "std", "low", "high")
+    _english = "normal with mean {mean} and standard deviation {std}, cut off at {low} and {high}"
     mean: float
     std: float
     low: float
@@ -114,10 +112,6 @@ class TruncatedNormal(continuous.Continuous):
                 f"only {self._inside:z.1g} of the normal distribution lies between low and high, "
                 f"which float32 cannot resolve (at least {DEEPEST:zg} is needed); got {self!r}"
             )
-
-    @property
-    def support(self) -> tuple[float, float]:
-        return (self.low, self.high)
 
     @property
     def _mirrored(self) -> bool:
@@ -172,19 +166,13 @@ class TruncatedNormal(continuous.Continuous):
         whole = Normal(self.mean, self.std).log_density(value) - math.log(self._inside)
         return np.where(self.contains(value), whole, -np.inf)
 
-    def words(self) -> str:
-        return (
-            f"normal with mean {number(self.mean)} and standard deviation {number(self.std)}, cut "
-            f"off at {number(self.low)} and {number(self.high)}"
-        )
-
     @property
     def tuning(self) -> Tuning:
         return Tuning("other", self.low, self.high)
 
 
 @dataclass(frozen=True, repr=False)
-class LogUniform(continuous.Continuous):
+class LogUniform(continuous.Bounded):
     """Positive numbers whose logarithm is uniform: learning rates, masses, stiffnesses.
 
     **Arguments:**
@@ -193,6 +181,7 @@ class LogUniform(continuous.Continuous):
     """
 
     arguments = ("low", "high")
+    _english = "log-uniform between {low} and {high}"
     low: float
     high: float
 
@@ -203,10 +192,6 @@ class LogUniform(continuous.Continuous):
         if self.low < MIN_REAL:
             raise ValueError(f"low of a LogUniform must be at least {MIN_REAL:zg}; got {self!r}")
         continuous.check_ends(self, self.low, self.high)
-
-    @property
-    def support(self) -> tuple[float, float]:
-        return (self.low, self.high)
 
     @property
     def _width(self) -> float:
@@ -233,9 +218,6 @@ class LogUniform(continuous.Continuous):
         inside = self.contains(value)
         density = -np.log(np.where(inside, value, 1.0)) - math.log(self._width)
         return np.where(inside, density, -np.inf)
-
-    def words(self) -> str:
-        return f"log-uniform between {number(self.low)} and {number(self.high)}"
 
     @property
     def tailed(self) -> tuple[bool, ...]:

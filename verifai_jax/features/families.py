@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from verifai_jax.features.continuous import (
     OUTERMOST,
     REACH,
+    Bounded,
     Continuous,
     check_ends,
     check_logs,
@@ -117,6 +118,7 @@ class Weibull(Positive):
     """
 
     arguments = ("shape", "scale")
+    _english = "Weibull with shape {shape} and scale {scale}"
     shape: float
     scale: float
 
@@ -139,9 +141,6 @@ class Weibull(Positive):
             density = math.log(self.shape) - math.log(self.scale) + (self.shape - 1) * log
             return _at_positive(value, density - np.exp(self.shape * log))
 
-    def words(self) -> str:
-        return f"Weibull with shape {number(self.shape)} and scale {number(self.scale)}"
-
 
 @dataclass(frozen=True, repr=False)
 class Exponential(Positive):
@@ -154,6 +153,7 @@ class Exponential(Positive):
     """
 
     arguments = ("mean",)
+    _english = "exponential with mean {mean}"
     mean: float
 
     def __post_init__(self) -> None:
@@ -171,12 +171,9 @@ class Exponential(Positive):
         value, x = _positive(value)
         return _at_positive(value, -x / self.mean - math.log(self.mean))
 
-    def words(self) -> str:
-        return f"exponential with mean {number(self.mean)}"
-
 
 @dataclass(frozen=True, repr=False)
-class Triangular(Continuous):
+class Triangular(Bounded):
     """Numbers between two ends with one most likely value: `Triangular(low, mode, high)`.
 
     The coordinates 0 and 1 stand for a probability of 2^-26, since the density is zero at the ends,
@@ -188,6 +185,7 @@ class Triangular(Continuous):
     """
 
     arguments = ("low", "mode", "high")
+    _english = "triangular between {low} and {high}, most likely {mode}"
     low: float
     mode: float
     high: float
@@ -197,10 +195,6 @@ class Triangular(Continuous):
         check_ends(self, self.low, self.high)
         if not self.low <= self.mode <= self.high:
             raise ValueError(f"the mode must lie between low and high; got {self!r}")
-
-    @property
-    def support(self) -> tuple[float, float]:
-        return (self.low, self.high)
 
     @property
     def _rising(self) -> float:
@@ -232,9 +226,3 @@ class Triangular(Continuous):
         height = np.where(value < self.mode, up, down) * 2 / (self.high - self.low)
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self.contains(value), np.log(height), -np.inf)
-
-    def words(self) -> str:
-        return (
-            f"triangular between {number(self.low)} and {number(self.high)}, most likely "
-            f"{number(self.mode)}"
-        )

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 
 from verifai_jax.features.continuous import (
     REACH,
+    Bounded,
     Continuous,
     check_ends,
     check_logs,
@@ -98,6 +99,7 @@ class Gamma(Positive):
     """
 
     arguments = ("shape", "scale")
+    _english = "gamma with shape {shape} and scale {scale}"
     shape: float
     scale: float
 
@@ -152,12 +154,9 @@ class Gamma(Positive):
         sides = scipy_special().gammainc(self.shape, x), scipy_special().gammaincc(self.shape, x)
         return 2 * np.minimum(*sides)
 
-    def words(self) -> str:
-        return f"gamma with shape {number(self.shape)} and scale {number(self.scale)}"
-
 
 @dataclass(frozen=True, repr=False)
-class Beta(Continuous):
+class Beta(Bounded):
     """Shares, or numbers between two ends: `Beta(a, b)`, `Beta(a, b, low, high)`.
 
     **Arguments:**
@@ -168,6 +167,7 @@ class Beta(Continuous):
     """
 
     arguments = ("a", "b", "low", "high")
+    _english = "beta with a = {a} and b = {b} between {low} and {high}"
     a: float
     b: float
     low: float = 0.0
@@ -179,10 +179,6 @@ class Beta(Continuous):
             if getattr(self, name) < 0.05:
                 raise ValueError(f"{name} of a Beta must be at least 0.05; got {self!r}")
         check_ends(self, self.low, self.high)
-
-    @property
-    def support(self) -> tuple[float, float]:
-        return (self.low, self.high)
 
     @property
     def closed(self) -> str:
@@ -243,12 +239,6 @@ class Beta(Continuous):
         x = np.clip(x, 0.0, 1.0)
         return 2 * np.minimum(
             scipy_special().betainc(self.a, self.b, x), scipy_special().betaincc(self.a, self.b, x)
-        )
-
-    def words(self) -> str:
-        return (
-            f"beta with a = {number(self.a)} and b = {number(self.b)} between "
-            f"{number(self.low)} and {number(self.high)}"
         )
 
     def __repr__(self) -> str:
