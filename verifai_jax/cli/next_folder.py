@@ -35,8 +35,8 @@ def next_folder(parent: str, name: str) -> Iterator[Path]:
 
     A command that ends without a file in it removes it.
     """
+    from verifai_jax.core.store.locks import writing
     from verifai_jax.core.text import folder_name
-    from verifai_jax.store.locks import writing
 
     name, number, first = folder_name(name), 1, not Path(parent).exists()
     while True:

@@ -40,11 +40,11 @@ def shrink(
     **options: Any,
 ) -> None:
     """Make a ROW (by default the worst) of the run in RUN small: few features, near nominal."""
-    from verifai_jax import counterexamples
+    import verifai_jax as vj
 
     run = arguments.load_judged_run(folder, target)
     with kept_until_done() as kept:
-        small = counterexamples.shrink(run, row, **options)
+        small = vj.shrink(run, row, **options)
         give_result(robustness=small.rho)
         show_result(
             small, (into or folder) / f"shrunk-{small.row}.png" if pictures else None, "row",

@@ -68,10 +68,10 @@ def sweep(
 ) -> None:
     """Train configurations of the study TARGET (specs/FILE.py:NAME), certify their policies."""
     from verifai_jax import Study
+    from verifai_jax.core.store.cache import cache_file
     from verifai_jax.core.targets import load_target, target_of_project
     from verifai_jax.core.text import printable
-    from verifai_jax.store.cache import cache_file
-    from verifai_jax.sweeps._sweep import sweep as run_sweep
+    from verifai_jax.training.sweeps._sweep import sweep as run_sweep
 
     if resume is not None:
         arguments.refuse_others(_RESUMES, "is fixed in the sweep that --resume goes on with")
@@ -184,7 +184,7 @@ def _keywords(given: Mapping[str, Any], options: tuple[str, ...]) -> dict[str, A
 
 def _read_command(folder: Path) -> dict[str, Any]:
     """Read the command of an interrupted sweep from its cache."""
-    from verifai_jax.store.cache import Cache, CacheError, cache_file
+    from verifai_jax.core.store.cache import Cache, CacheError, cache_file
 
     if not cache_file(folder).exists():
         raise FileNotFoundError(f"no sweep to resume in {folder}{_describe_folder(folder)}")
@@ -218,7 +218,7 @@ def _describe_folder(folder: Path) -> str:
 def _format_table(result: "Sweep") -> str:
     """Write the most preferable rows of the table."""
     from verifai_jax.core.text import printable
-    from verifai_jax.sweeps.ranking import preference_order
+    from verifai_jax.training.sweeps.ranking import preference_order
 
     table = result.table
     order = list(preference_order(table))

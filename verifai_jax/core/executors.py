@@ -75,7 +75,7 @@ def check_executor(executor: object) -> None:
     if not callable(getattr(executor, "submit", None)):
         raise TypeError(
             "executor must have concurrent.futures' submit, such as Dask's client.get_executor(), "
-            f"verifai_jax.clusters.RayExecutor() or a process pool; got {type(executor).__name__}"
+            f"vj.clusters.RayExecutor() or a process pool; got {type(executor).__name__}"
         )
     context = getattr(executor, "_mp_context", None)
     method = getattr(context, "get_start_method", lambda: "")()

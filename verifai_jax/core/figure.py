@@ -21,7 +21,7 @@ else:
 class Drawn:
     """A result that has a picture.
 
-    - `_picture`: a module of `verifai_jax.plotting`, and its function that draws the result.
+    - `_picture`: a module of `verifai_jax.reports.plotting`, and its function that draws it.
     """
 
     _picture: ClassVar[tuple[str, str]]
@@ -34,7 +34,7 @@ class Drawn:
         **Returns:** the Matplotlib figure.
         """
         module, function = self._picture
-        return lazy_import(f"verifai_jax.plotting.{module}", function)(self, path)
+        return lazy_import(f"verifai_jax.reports.plotting.{module}", function)(self, path)
 
 
 class Reported:

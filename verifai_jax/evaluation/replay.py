@@ -120,7 +120,9 @@ class Replay(InNotebook):
         - `signals`: the signals, and features that are Signals, to draw; chosen when left out.
         **Raises:** `UnknownNameError` for a signal that does not exist.
         """
-        return lazy_import("verifai_jax.plotting.replay", "plot_replay")(self, path, signals)
+        return lazy_import("verifai_jax.reports.plotting.replay", "plot_replay")(
+            self, path, signals
+        )
 
     def animate(
         self,
@@ -141,7 +143,7 @@ class Replay(InNotebook):
         **Raises:** `ValueError` for a problem without `draw` that has no MuJoCo model and is no
         environment of Gymnasium; `UnknownNameError` for a camera that the model lacks.
         """
-        draw = lazy_import("verifai_jax.plotting.animation", "animate")
+        draw = lazy_import("verifai_jax.reports.plotting.animation", "animate")
         return draw(self, path, camera=camera, size=size, fps=fps)
 
 

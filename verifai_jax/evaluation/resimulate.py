@@ -40,8 +40,11 @@ ONE_BY_ONE = 16
 SEEDS = 32
 """Seeds of a host system's rows that are made in one call, so that one program makes all."""
 LANES = (64, 256)
-"""Rows that a device replays together if there are more: the second number once two calls of the
-first would not do, since a call costs something whatever its size."""
+"""Rows that a device replays together if there are more: the second number for more rows than
+`CALLS` calls of the first would take, since a call costs something whatever its size."""
+CALLS = 6
+"""Calls of the smaller program up to which the larger one is not compiled: half a millisecond each
+for a quadrotor of four states, whose larger program compiles for a third of a second."""
 
 
 class Refiner:
@@ -150,7 +153,7 @@ class Replays:
         if count <= ONE_BY_ONE:
             return 1
         some, many = (lanes * len(jax.local_devices()) for lanes in LANES)
-        return many if count * times > 2 * some else some
+        return many if count * times > CALLS * some else some
 
     def _keys(self, numbers: Int[np.ndarray, " n"], together: int) -> Key[Array, " together"]:
         if not self.draws:

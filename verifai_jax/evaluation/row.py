@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from verifai_jax.core.clauses import CLAUSES
+from verifai_jax.core.clauses import ABSENT, CLAUSES
 from verifai_jax.core.lifting import lifting
 from verifai_jax.core.trace import Trace
 from verifai_jax.evaluation.differentiation import Derivative
@@ -33,7 +33,7 @@ from verifai_jax.evaluation.verdicts import (
     with_status,
 )
 from verifai_jax.mtl import hard, online, robustness, smooth
-from verifai_jax.mtl.clauses import ABSENT, Goals
+from verifai_jax.mtl.clauses import Goals
 from verifai_jax.problem.problem import Problem
 
 

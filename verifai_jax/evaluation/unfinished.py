@@ -23,12 +23,12 @@ from jaxtyping import Float, Int
 
 from verifai_jax.core.progress import write_line
 from verifai_jax.core.sources import Sources, list_changes
+from verifai_jax.core.store.cache import Cache, CacheError, locked_cache
+from verifai_jax.core.store.log import Arrays
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.kept_work import PRESENT
 from verifai_jax.evaluation.verdicts import RowVerdict, Verdicts
 from verifai_jax.problem.problem import Problem
-from verifai_jax.store.cache import Cache, CacheError, locked_cache
-from verifai_jax.store.log import Arrays
 
 Form: TypeAlias = jax.tree_util.PyTreeDef  # pyright: ignore[reportInvalidTypeForm]
 KIND = "unfinished"

@@ -96,7 +96,7 @@ def distinguish(
     """
     one, other = as_formula(one), as_formula(other)
     if isinstance(signals, Simulated):
-        return lazy_import("verifai_jax.requirements", "distinguish_by_search")(
+        return lazy_import("verifai_jax.analysis.requirements", "distinguish_by_search")(
             one, other, signals, budget, seed
         )
     if signals is None:

@@ -138,7 +138,7 @@ def mine(
         )
     check_fraction("share", share, one=True)
     if isinstance(recordings, Simulated):
-        return lazy_import("verifai_jax.requirements", "mine_by_search")(
+        return lazy_import("verifai_jax.analysis.requirements", "mine_by_search")(
             template, recordings, budget, seed, confidence, progress
         )
     return mine_template(template, tuple(named_traces(recordings).values()), share, end, confidence)

@@ -6,8 +6,8 @@ from typing import Any
 
 from verifai_jax.analysis import OddCoverage
 from verifai_jax.core.text import format_percent
-from verifai_jax.error_budgets.result import ErrorBudget
-from verifai_jax.failure_modes import Mode, Modes
+from verifai_jax.estimation.error_budgets.result import ErrorBudget
+from verifai_jax.estimation.failure_modes import Mode, Modes
 from verifai_jax.features.english import number
 from verifai_jax.reports.claims import Claim
 from verifai_jax.reports.markup import Child, Markup, bullets, element, paragraph, picture, table

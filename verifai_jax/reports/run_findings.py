@@ -11,7 +11,6 @@ from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.summary import first_message
 from verifai_jax.features.density import tails
 from verifai_jax.features.english import number
-from verifai_jax.plotting.scatter import plot_features
 from verifai_jax.reports.commands import replay_command
 from verifai_jax.reports.markup import (
     Child,
@@ -25,6 +24,7 @@ from verifai_jax.reports.markup import (
     table,
 )
 from verifai_jax.reports.page import Section
+from verifai_jax.reports.plotting.scatter import plot_features
 from verifai_jax.reports.run_question import About
 from verifai_jax.reports.studies import Failure, Studies, png
 

@@ -10,9 +10,9 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
-from verifai_jax.comparison.result import Compared, Comparison
 from verifai_jax.core.sources import Sources
 from verifai_jax.core.text import one_line
+from verifai_jax.estimation.comparison.result import Compared, Comparison
 from verifai_jax.estimation.result import METHODS, Estimate
 from verifai_jax.features import FeatureSpace
 from verifai_jax.statistics.paired_rates import PairedRates

@@ -13,15 +13,15 @@ from typing import Any, TypeVar
 import numpy as np
 
 from verifai_jax.analysis import Analysis, analyze
+from verifai_jax.analysis.counterexamples import Explained, Shrunk, explain, shrink
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.text import format_error, one_line
-from verifai_jax.counterexamples import Explained, Shrunk, explain, shrink
+from verifai_jax.estimation.failure_modes import Modes
+from verifai_jax.estimation.failure_modes import modes as find_modes
 from verifai_jax.evaluation.replay import Replay
-from verifai_jax.failure_modes import Modes
-from verifai_jax.failure_modes import modes as find_modes
 from verifai_jax.falsification.run import Run
-from verifai_jax.plotting.animation import animate
-from verifai_jax.plotting.mujoco_motion import can_draw
+from verifai_jax.reports.plotting.animation import animate
+from verifai_jax.reports.plotting.mujoco_motion import can_draw
 from verifai_jax.reports.view import rows_to_trace, trace_data
 
 Result = TypeVar("Result")

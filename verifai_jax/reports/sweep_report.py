@@ -12,7 +12,7 @@ from verifai_jax.reports.provenance import Model, folder_inputs
 from verifai_jax.reports.run_question import About, space_table
 from verifai_jax.reports.sections import MODEL, result_page
 from verifai_jax.reports.studies import png
-from verifai_jax.sweeps.result import Sweep
+from verifai_jax.training.sweeps.result import Sweep
 
 FILES = (
     ("sweep.json", "the record of the sweep"),

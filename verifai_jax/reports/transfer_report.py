@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from verifai_jax.comparison.result import Transfer
 from verifai_jax.core.text import format_percent
+from verifai_jax.estimation.comparison.result import Transfer
 from verifai_jax.features.english import number
 from verifai_jax.reports.claims import Claim
 from verifai_jax.reports.markup import paragraph, picture, preformatted, table

@@ -18,9 +18,9 @@ from verifai_jax.falsification.counts import claimed_rows, violating_rows
 from verifai_jax.falsification.run import Run
 from verifai_jax.mtl.bounds import signal_bounds
 from verifai_jax.mtl.expression import constant_value
-from verifai_jax.plotting.replay import decisive_instant
-from verifai_jax.plotting.scatter import distinguishing_features
-from verifai_jax.plotting.style import FAILING, NOT_CLAIMED, SAFE, WITHOUT_VERDICT
+from verifai_jax.reports.plotting.replay import decisive_instant
+from verifai_jax.reports.plotting.scatter import distinguishing_features
+from verifai_jax.reports.plotting.style import FAILING, NOT_CLAIMED, SAFE, WITHOUT_VERDICT
 
 GROUPS = (
     ("safe", SAFE, 4000),

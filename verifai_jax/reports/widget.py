@@ -9,8 +9,8 @@ from typing import Any
 
 from verifai_jax.core.text import format_error, one_line
 from verifai_jax.falsification.run import Run
-from verifai_jax.plotting.scatter import plot_features
 from verifai_jax.reports.page import asset
+from verifai_jax.reports.plotting.scatter import plot_features
 from verifai_jax.reports.studies import png
 from verifai_jax.reports.view import trace_data, view_data
 

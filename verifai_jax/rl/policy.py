@@ -108,11 +108,13 @@ class Policy:
             save_policy(self, path)
             return Path(path)
         graph, arrays, start = self.as_graph()
-        return lazy_import("verifai_jax.policies.base", "write")(graph, arrays, start, Path(path))
+        return lazy_import("verifai_jax.rl.policies.base", "write")(
+            graph, arrays, start, Path(path)
+        )
 
     def as_graph(self, observation: object = None) -> tuple[Any, Any, Any]:
         """Return the policy as a graph of ONNX operators, as policies of other frameworks do."""
-        as_any = lazy_import("verifai_jax.policies.base", "Policy")(self, _act)
+        as_any = lazy_import("verifai_jax.rl.policies.base", "Policy")(self, _act)
         return as_any.as_graph(np.zeros(self.layers[0][0].shape[0]))
 
 
