@@ -6,7 +6,7 @@ Each number is fixed, or a domain, which makes it a feature of the problem.
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from typing import Any, ClassVar, NamedTuple, TypeAlias, dataclass_transform
 
 import jax.numpy as jnp
@@ -20,9 +20,9 @@ Number: TypeAlias = float | Domain
 Vector: TypeAlias = Float[Array | np.ndarray, " n"]
 
 
-def number(low: float = -math.inf, high: float = math.inf, **default: float) -> Any:
+def number(low: float = -math.inf, high: float = math.inf, default: Any = MISSING) -> Any:
     """Return the field of a number of a fault, which has to lie between two ends."""
-    return field(metadata={"ends": (low, high)}, **default)
+    return field(metadata={"ends": (low, high)}, default=default)
 
 
 class Moment(NamedTuple):

@@ -114,8 +114,8 @@ def fmea(
             again = confirm(run, max_rows=len(run.table), progress=False)
             verdicts = dict(zip(again.numbers.tolist(), again.verdict.tolist(), strict=True))
         for each in found:
-            happens = [] if rates is None else [rates[name] * mission_time for name in each.faults]
-            chance = math.prod(-math.expm1(-number) for number in happens)
+            known_rates = [] if rates is None else [rates[name] for name in each.faults]
+            chance = math.prod(-math.expm1(-one * (mission_time or 0.0)) for one in known_rates)
             numbers = (chance * rows.probability(each, confidence, budget)).tolist()
             within = dict(zip(("low", "high", "probability"), numbers, strict=True))
             effect = effect_of(run, each, known, verdicts)

@@ -286,7 +286,8 @@ class Work:
             )  # fmt: skip
             return {name: np.asarray(value) for name, value in found._asdict().items()}
 
-        found = Collected(**self.cache.remember(f"collected/{stage}", compute))
+        known: dict[str, Any] = self.cache.remember(f"collected/{stage}", compute)
+        found = Collected(**known)
         self.points, self.radii = (
             np.concatenate([one[found.kept], new])[-CAPACITY:]
             for one, new in ((self.points, found.points), (self.radii, found.radii))

@@ -85,7 +85,7 @@ class Mixture:
             shares = (shares[0], shares[1] + shares[2], 0.0)
         ends = np.zeros((2, CAPACITY, space.dim), np.float32)
         ends[:, :count] = neighbourhoods(space, centres, radii)
-        return cls(space, np.asarray(shares, np.float32), *ends, count)
+        return cls(space, np.asarray(shares, np.float32), ends[0], ends[1], count)
 
     def draw(self, key: Key[Array, ""]) -> Float[Array, " d"]:
         """Draw a point of the unit cube, from the prior or from a neighbourhood."""
