@@ -65,8 +65,8 @@ def fmea(
       then happens with probability `1 - exp(-rate * mission_time)`, one independent of the other.
       Without them probabilities are those given that it happens.
     - `samples`: of each fault, and of each pair, from the prior of its numbers.
-    - `budget`: the budget of the search for a failure where no sample fails, and half of that of
-      the estimate where few do; 0 for neither.
+    - `budget`: the budget of the search for failures where no or few samples fail, and half of that
+      of the estimate where few do; 0 for neither.
     - `pairs`: whether pairs are tried of those faults that never fail alone.
     - `confidence`: the confidence of each interval.
     - `seed`: the seed of everything that is drawn at random.

@@ -26,7 +26,8 @@ LEVELS = 33
 FOLLOWED = 6
 """Failing samples of a fault whose severity is lowered."""
 FEW = 10
-"""Failing samples below which importance sampling or splitting estimates the probability."""
+"""Failing samples below which a search looks for others, and importance sampling or splitting
+estimates the probability."""
 TRIED = 32
 """Failing samples that are simulated again beside the lowered ones: at the edge of failure another
 step, or another random key, may decide otherwise."""
@@ -69,14 +70,15 @@ class Rows:
         return known["violated"], known["proper"]
 
     def try_out(self, names: tuple[str, ...], samples: int, budget: int) -> Found:
-        """Sample a fault or a pair, search where nothing fails, and lower what fails."""
+        """Sample a fault or a pair, search where few samples fail, and lower what fails."""
         points = np.repeat(self.nominal.u[None], samples, axis=0)
         for name in names:
             points[:, self.groups[name]] = self.rng.random((samples, len(self.groups[name])))
         violated, proper = self(f"samples/{'+'.join(names)}", points)
         failing = points[violated]
-        if not len(failing) and budget:
-            failing = self._searched(names, budget)
+        if len(failing) < FEW and budget:
+            # A few failures by chance may all be refuted: the worst of a search are less so.
+            failing = np.concatenate([failing, self._searched(names, budget)])
         if len(failing):
             failing = self._lowered(names, failing)
         return Found(names, failing, int(violated.sum()), int((~proper).sum()), samples)
@@ -100,7 +102,7 @@ class Rows:
         return self.cache.remember(name, estimated)["interval"]
 
     def _searched(self, names: Sequence[str], budget: int) -> Points:
-        """Return failing points that a search finds where no sample fails."""
+        """Return the worst failing points that a search finds."""
 
         def searched() -> dict[str, np.ndarray]:
             run = falsify(
