@@ -1,7 +1,6 @@
 """The failure table against closed forms: redundant sensors, a voter, a single channel."""
 
 import json
-import math
 
 import jax.numpy as jnp
 import numpy as np
@@ -172,10 +171,7 @@ def test_the_report_names_each_row_with_its_command(table, tmp_path):
 
 @pytest.mark.thorough
 def test_the_report_on_a_table_without_a_failure(tmp_path):
-    effect = Effect(
-        ("gyro_dropout",), False, {}, None, "", "", math.nan, "", math.nan, 1.0, 0.0, 0.0, 0.006,
-        0, 512, "",
-    )  # fmt: skip
+    effect = Effect(("gyro_dropout",), False, 0, 512, probability=0.0, high=0.006)
     empty = FailureTable("balance", (effect,), None, None, None, 0.95, True, 1.0)
     page = empty.report(tmp_path / "empty.html").read_text()
     assert "No failure by gyro_dropout was found" in page

@@ -227,7 +227,7 @@ template <class T> INLINE T exponential1(T x) {
   return choose(truth(absolute(x) < 0.35f), p, choose(truth(x > 88.f) , exponential(x),
     e * e - 1.f)); }
 template <class T> INLINE T hyperbolic(T x) {
-  T end = filled(x, 7.90531110763549805f), c = greater(-end, lesser(end, x));
+  T end = filled(x, 7.90531110763549805f), c = greater_than_bound(-end, lesser_than_bound(end, x));
   T s = c * c, p = filled(x, -2.76076847742355e-16f), q = filled(x, 1.19825839466702e-06f);
   p = p * s + 2.00018790482477e-13f; p = p * s - 8.60467152213735e-11f;
   p = p * s + 5.12229709037114e-08f; p = p * s + 1.48572235717979e-05f;

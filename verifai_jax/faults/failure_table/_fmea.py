@@ -7,6 +7,7 @@ faults of a row are off.
 """
 
 import itertools
+import math
 import shutil
 import time
 from collections.abc import Mapping, Sequence
@@ -90,11 +91,14 @@ def fmea(
         check_count(name, count, 0)
     faulty = resolved(faulty, batch=samples, budget=samples * len(known)).problem
     faulty.check()
-    options = {"samples": samples, "budget": budget, "seed": seed}
-    features = {name: repr(domain) for name, domain in faulty.space.domains.items()}
-    formulas = {name: str(formula) for name, formula in faulty.formulas.items()}
+    work = {
+        "problem": faulty.name,
+        "features": {name: repr(domain) for name, domain in faulty.space.domains.items()},
+        "formulas": {name: str(formula) for name, formula in faulty.formulas.items()},
+        "samples": samples, "budget": budget, "seed": seed,
+    }  # fmt: skip
+    effects = []
     with locked_cache(folder, "fmea") as cache:
-        work = {"problem": faulty.name, "features": features, "formulas": formulas, **options}
         cache.claim(work, faulty.sources())
         rows = Rows(faulty, known, cache, seed, executor)
         healthy = not rows("healthy", rows.nominal.u[None])[0][0]
@@ -103,38 +107,30 @@ def fmea(
             safe = [each.faults[0] for each in found if not len(each.candidates)]
             both = [rows.try_out(pair, samples, 0) for pair in itertools.combinations(safe, 2)]
             found += [each for each in both if len(each.candidates)]
-        run = _run_of(rows, found, folder, target)
-        verdicts: dict[int, str] = {}
+        starts = itertools.accumulate((len(each.candidates) for each in found), initial=0)
+        found = [each._replace(first=first) for each, first in zip(found, starts, strict=False)]
+        run, verdicts = _run_of(rows, found, folder, target), {}
         if run is not None:
             again = confirm(run, max_rows=len(run.table), progress=False)
             verdicts = dict(zip(again.numbers.tolist(), again.verdict.tolist(), strict=True))
-        effects = []
         for each in found:
-            interval = rows.probability(each, confidence, budget)
-            chance = 1.0
-            for name in each.faults:
-                chance *= 1.0 if rates is None else float(-np.expm1(-rates[name] * mission_time))
-            low, high, probability = (chance * end for end in interval)
-            effect = replace(
-                effect_of(run, each, known, verdicts),
-                occurrence=chance, probability=probability, low=low, high=high,
-            )  # fmt: skip
-            effects.append(effect)
+            happens = [] if rates is None else [rates[name] * mission_time for name in each.faults]
+            chance = math.prod(-math.expm1(-number) for number in happens)
+            numbers = (chance * rows.probability(each, confidence, budget)).tolist()
+            within = dict(zip(("low", "high", "probability"), numbers, strict=True))
+            effect = effect_of(run, each, known, verdicts)
+            effects.append(replace(effect, occurrence=chance, **within))
     effects.sort(key=lambda effect: (-effect.fails, -effect.probability, effect.faults))
-    seconds = time.perf_counter() - started
     return FailureTable(
-        faulty.name, tuple(effects), run, rates, mission_time, confidence, bool(healthy), seconds
-    )
+        faulty.name, tuple(effects), run, rates, mission_time, confidence, bool(healthy),
+        time.perf_counter() - started,
+    )  # fmt: skip
 
 
 def _run_of(
     rows: Rows, found: list[Found], folder: str | Path | None, target: str | None
 ) -> Run | None:
-    """Simulate the candidates of all faults as one run, and number them in `found`."""
-    first = 0
-    for i, each in enumerate(found):
-        found[i] = each._replace(first=first)
-        first += len(each.candidates)
+    """Simulate the candidates of all faults as one run; None without any."""
     points = [each.candidates for each in found if len(each.candidates)]
     if not points:
         return None
@@ -165,12 +161,11 @@ def _faults_of(problem: Problem) -> dict[str, Fault]:
             raise ValueError(f"fmea takes faults one by one; {name!r} is {AtMost.__name__}")
         fault = domain.fault
         weakest = {number: fault.weakest(number) for number in fault.domains}
-        off = weakest.get("duration") == 0 or weakest.get(fault.severity) == fault.off
-        if not off:
+        if weakest.get("duration") != 0 and weakest.get(fault.severity) != fault.off:
+            at = ", ".join(f"{number} {value:zg}" for number, value in weakest.items())
             raise ValueError(
-                f"fault {name!r} cannot be off, at its weakest "
-                f"({', '.join(f'{n} {v:zg}' for n, v in weakest.items())}) neither: let it be "
-                "short, with duration=vj.Box(0, ...)"
+                f"fault {name!r} cannot be off, at its weakest ({at}) neither: let it be short, "
+                "with duration=vj.Box(0, ...)"
             )
         known[name] = fault
     if not known:
@@ -185,10 +180,8 @@ def _rates(
     rate: float | Mapping[str, float] | None, mission_time: float | None, known: Mapping[str, Fault]
 ) -> Mapping[str, float] | None:
     if (rate is None) != (mission_time is None):
-        raise ValueError(
-            f"rate (in an hour) and mission_time (in hours) go together; got ({rate=}, "
-            f"{mission_time=})"
-        )
+        got = f"({rate=}, {mission_time=})"
+        raise ValueError(f"rate (in an hour) and mission_time (in hours) go together; got {got}")
     if rate is None:
         return None
     rates = dict(rate) if isinstance(rate, Mapping) else dict.fromkeys(known, rate)

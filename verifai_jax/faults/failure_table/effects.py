@@ -54,41 +54,36 @@ def effect_of(
     - `faults`: all of them by name.
     - `verdicts`: the verdicts of the confirmation, by row.
     """
+    effect = Effect(found.faults, len(found.candidates) > 0, found.failures, found.simulations)
     rows = range(found.first, found.first + len(found.candidates))
-    row = next((row for row in rows if verdicts.get(row) == "confirmed"), None)
-    row = next((row for row in rows if row in verdicts), None) if row is None else row
-    effect = Effect(
-        faults=found.faults, fails=len(found.candidates) > 0, severity={}, row=row, verdict="",
-        broken="", delay=math.nan, shown_by="", shown_after=math.nan, occurrence=1.0,
-        probability=math.nan, low=0.0, high=1.0, failures=found.failures,
-        simulations=found.simulations, command="",
-    )  # fmt: skip
-    if run is None or row is None or run.problem is None:
+    # The first that is confirmed; without one, the first that fails at all.
+    tried = sorted(
+        (row for row in rows if row in verdicts), key=lambda r: verdicts[r] != "confirmed"
+    )
+    if run is None or run.problem is None or not tried:
         return effect
-    again = run.replay(row)
+    again, space = run.replay(tried[0]), run.problem.space
     columns = again.columns()
-    numbers = [f"{name}.{faults[name].grade}" for name in found.faults]
-    severity = {number: float(columns[number]) for number in numbers}
     onset = min(
         float(columns.get(f"{name}.onset", faults[name].numbers["onset"]))  # pyright: ignore[reportArgumentType]
         for name in found.faults
     )
-    domains = run.problem.space.domains
-    healthy = {**again.features, **{name: domains[name].nominal for name in found.faults}}
-    space = run.problem.space
+    healthy = {**again.features, **{name: space.domains[name].nominal for name in found.faults}}
     batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], space.coerce(healthy))
     one = {name: np.asarray(column)[0] for name, column in space.rows(batch).items()}
-    without = simulate_again(run.problem, one, run_keys(run.seed)[1], row, run.precision)
+    without = simulate_again(run.problem, one, run_keys(run.seed)[1], tried[0], run.precision)
     shown_by, shown = _first_difference(again.trace, without.trace)
+    numbers = [f"{name}.{faults[name].grade}" for name in found.faults]
     return replace(
         effect,
-        severity=severity,
-        verdict=verdicts.get(row, ""),
+        row=tried[0],
+        severity={number: float(columns[number]) for number in numbers},
+        verdict=verdicts[tried[0]],
         broken=again.worst,
         delay=_violation(again, onset) - max(onset, 0.0),
         shown_by=shown_by,
         shown_after=shown - max(onset, 0.0),
-        command=_command(run, row),
+        command=_command(run, tried[0]),
     )
 
 

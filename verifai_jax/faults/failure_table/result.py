@@ -1,12 +1,13 @@
 """The result of `fmea`: a row for each fault, and for each pair that fails where neither does."""
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.errors import check_names
 from verifai_jax.core.figure import Drawn
 from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook, frame_html
@@ -23,6 +24,7 @@ class Effect:
 
     - `faults`: their names.
     - `fails`: whether any simulation with it, and without another fault, breaks the property.
+    - `failures`, `simulations`: the samples of the fault's prior that `probability` rests on.
     - `severity`: the least at which one does, by the name of the number; empty if none does.
     - `row`: the row of the counterexample in the run of the table; None if there is none.
     - `verdict`: the verdict of the confirmation of that counterexample, see `vj.confirm`.
@@ -32,26 +34,25 @@ class Effect:
       `shown_after` seconds from the onset.
     - `occurrence`: probability that it happens in a mission.
     - `probability`, `low`, `high`: of a mission that fails by it, with the interval.
-    - `failures`, `simulations`: the samples of the fault's prior that this rests on.
     - `command`: what simulates the counterexample again.
     """
 
     faults: tuple[str, ...]
     fails: bool
-    severity: Mapping[str, float]
-    row: int | None
-    verdict: str
-    broken: str
-    delay: float
-    shown_by: str
-    shown_after: float
-    occurrence: float
-    probability: float
-    low: float
-    high: float
     failures: int
     simulations: int
-    command: str
+    severity: Mapping[str, float] = field(default_factory=dict)
+    row: int | None = None
+    verdict: str = ""
+    broken: str = ""
+    delay: float = math.nan
+    shown_by: str = ""
+    shown_after: float = math.nan
+    occurrence: float = 1.0
+    probability: float = math.nan
+    low: float = 0.0
+    high: float = 1.0
+    command: str = ""
 
     @property
     def name(self) -> str:
@@ -67,6 +68,19 @@ class Effect:
     def confirmed(self) -> bool:
         """True if the counterexample failed in every closer replay."""
         return self.verdict == "confirmed"
+
+    def __str__(self) -> str:
+        chance = f"{self.probability:z.2g} ({self.low:z.2g} to {self.high:z.2g})"
+        if not self.fails:
+            return f"{chance}, no failure in {self.simulations:,} samples"
+        if self.row is None:
+            return f"{chance}, fails under few random keys"
+        after, shown = (format_seconds(each, 3) for each in (self.delay, self.shown_after))
+        shows = f";\n    {self.shown_by} shows it after {shown}" if self.shown_by else ""
+        return (
+            f"{chance}, {self.verdict}\n    from {self.severity_text}; breaks {self.broken} "
+            f"{after} after the onset{shows}"
+        )
 
 
 COLUMNS = {
@@ -116,10 +130,8 @@ class FailureTable(Drawn, InNotebook):
 
         **Raises:** `UnknownNameError` for a fault that has none.
         """
-        for effect in self.effects:
-            if effect.name == name:
-                return effect
-        raise unknown_name("row of the failure table", name, [each.name for each in self.effects])
+        check_names("row of the failure table", [name], [each.name for each in self.effects])
+        return next(each for each in self.effects if each.name == name)
 
     @property
     def table(self) -> "pd.DataFrame":
@@ -132,10 +144,6 @@ class FailureTable(Drawn, InNotebook):
 
     def to_csv(self, path: str | Path) -> None:
         """Write the table to a file.
-
-        **Arguments:**
-
-        - `path`: the path of the file.
 
         **Raises:** `OSError` that names the file, for whatever the file system refuses.
         """
@@ -157,10 +165,8 @@ class FailureTable(Drawn, InNotebook):
 
         **Arguments:**
 
-        - `path`: the path of the HTML file.
+        - `path`: the path of the HTML file, which is returned.
         - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`.
-
-        **Returns:** the path.
         """
         return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
 
@@ -173,20 +179,7 @@ class FailureTable(Drawn, InNotebook):
             f"{self.seconds:z.0f} s"
         ]
         width = max((len(each.name) for each in self.effects), default=0)
-        for each in self.effects:
-            line = f"  {each.name:<{width}}  {each.probability:z.2g} "
-            line += f"({each.low:z.2g} to {each.high:z.2g})"
-            if not each.fails:
-                line += f", no failure in {each.simulations:,} samples"
-            elif each.row is None:
-                line += ", fails under few random keys"
-            else:
-                line += f", {each.verdict}\n    from {each.severity_text}; breaks {each.broken} "
-                line += f"{format_seconds(each.delay, 3)} after the onset"
-                if each.shown_by:
-                    shown = format_seconds(each.shown_after, 3)
-                    line += f";\n    {each.shown_by} shows it after {shown}"
-            lines.append(line)
+        lines += [f"  {each.name:<{width}}  {each}" for each in self.effects]
         if not self.healthy:
             lines.append("  note: the nominal features break the property without any fault")
         return "\n".join(lines)

@@ -81,14 +81,12 @@ class Rows:
             failing = self._lowered(names, failing)
         return Found(names, failing, int(violated.sum()), int((~proper).sum()), samples)
 
-    def probability(
-        self, found: Found, confidence: float, budget: int
-    ) -> tuple[float, float, float]:
+    def probability(self, found: Found, confidence: float, budget: int) -> Float[np.ndarray, "3"]:
         """Return the interval and the probability of a failure, given that the faults happen."""
         rate = clopper_pearson(found.failures, found.simulations, confidence, found.without)
         enough = not len(found.candidates) or found.failures >= FEW
         if enough or not budget or len(found.faults) > 1:
-            return rate.low, rate.high, rate.estimate
+            return np.array([rate.low, rate.high, rate.estimate])
 
         def estimated() -> dict[str, np.ndarray]:
             seen = estimate(
@@ -98,9 +96,8 @@ class Rows:
             chance = rate.estimate if seen.probability is None else seen.probability
             return {"interval": np.array([seen.low, seen.high, chance])}
 
-        known = self.cache.remember(f"estimate/{'+'.join(found.faults)}/{confidence}", estimated)
-        low, high, chance = known["interval"].tolist()
-        return low, high, chance
+        name = f"estimate/{'+'.join(found.faults)}/{confidence}"
+        return self.cache.remember(name, estimated)["interval"]
 
     def _searched(self, names: Sequence[str], budget: int) -> Points:
         """Return failing points that a search finds where no sample fails."""
@@ -111,12 +108,10 @@ class Rows:
                 progress=False, executor=self.executor,
             )  # fmt: skip
             worst = run.table.counterexamples.sort_values("rho").head(FOLLOWED)
-            space = self.problem.space
-            return {"points": space.points(worst) if len(worst) else np.zeros((0, space.dim))}
+            points = self.problem.space.points(worst) if len(worst) else self.nominal.u[None][:0]
+            return {"points": np.asarray(points, np.float32)}
 
-        return self.cache.remember(f"search/{'+'.join(names)}", searched)["points"].astype(
-            np.float32
-        )
+        return self.cache.remember(f"search/{'+'.join(names)}", searched)["points"]
 
     def _lowered(self, names: Sequence[str], failing: Points) -> Points:
         """Return failing points, first those with a severity as low as they still fail at."""

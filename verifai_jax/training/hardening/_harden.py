@@ -32,7 +32,7 @@ from verifai_jax.estimation.certification import Certificates, certify
 from verifai_jax.estimation.comparison import Comparison, compare
 from verifai_jax.features import Categorical
 from verifai_jax.problem.problem import Problem
-from verifai_jax.rl import Algorithm, evaluate
+from verifai_jax.rl import PPO, Algorithm, evaluate
 from verifai_jax.search import Search
 from verifai_jax.statistics.confidence_sequences import safe_at
 from verifai_jax.training.hardening.arms import FunctionArms, TaskArms
@@ -45,14 +45,18 @@ from verifai_jax.training.hardening.mixture import (
     mixture_of,
 )
 from verifai_jax.training.hardening.result import BASELINE, HARDENED, Hardening
-from verifai_jax.training.sweeps.fingerprint import describe
+from verifai_jax.training.sweeps.fingerprint import fingerprint
 from verifai_jax.training.sweeps.study import Study
 from verifai_jax.training.sweeps.trainer import FunctionTrainer, Trainer
 
-KIND = "hardening"
-"""Kind of the cache."""
 ROUND, FINAL, COMPARED, ATTACK, RETURNS = range(5)
 """Purposes of random numbers."""
+CERTIFIED = ("failures", "simulations", "failure_rate", "failure_low", "failure_high", "verdict",
+             "attack_failures", "cost")  # fmt: skip
+"""Columns of a certificate that the table has."""
+OWN_STEP, MOST_OWN = 0.25, 0.75
+"""Share of episodes that become the task's own in a round after which an arm does not keep the
+return, and that cease to be after one that does; and how many are its own at most."""
 TABLE, SHRUNK = 512, 4
 """Uniform samples beside the counterexamples of a round, and counterexamples that are shrunk."""
 
@@ -78,9 +82,8 @@ class Plan:
     seed: int
 
     def __post_init__(self) -> None:
-        for name in ("rounds", "further_steps", "added", "episodes"):
-            check_count(name, getattr(self, name))
-        check_count("seed", self.seed, 0)
+        for name in ("rounds", "further_steps", "added", "episodes", "seed"):
+            check_count(name, getattr(self, name), 0 if name == "seed" else 1)
         for name in ("p", "confidence"):
             check_fraction(name, getattr(self, name))
         for name in ("own", "failing", "tolerance"):
@@ -158,7 +161,8 @@ def harden(
     - `samples`, `attack`, `attack_simulations`: of each certificate, as in `certify`.
     - `added`: points to train around that a round adds at most.
     - `own`, `failing`: shares of episodes that are the task's own, and that begin near failures,
-      those of the prior included that fail anyway; the others are of the prior.
+      those of the prior included that fail anyway; the others are of the prior. As long as return
+      is lost, more are the task's own.
     - `tolerance`: share of the first policy's return that may be lost.
     - `episodes`: the number of episodes of the task itself, the same for all policies, that measure
       returns.
@@ -184,46 +188,48 @@ def harden(
         rounds, first_steps, further, made.p if p is None else p, confidence, samples, attack,
         attack_simulations, added, own, failing, tolerance, episodes, baseline, seed,
     )  # fmt: skip
-    untrained = made.problem(trainer.untrained_policy(trainer.algorithm_name(values)))
+    untrained = made.untrained_problem()
     untrained.check()
-    with locked_cache(folder, KIND) as cache:
-        cache.claim(
-            _fingerprint(made, plan, values, untrained), untrained.sources(), even_if_changed
-        )
-        work = Work(made, plan, values, untrained, start, cache)
-        result = work.run(max_seconds)
+    with locked_cache(folder, "hardening") as cache:
+        options = {name: stable_text(each) for name, each in vars(plan).items()}
+        options["hyperparameters"] = stable_text(sorted(values.items()))
+        cache.claim(fingerprint(made, options), untrained.sources(), even_if_changed)
+        result = Work(made, plan, values, untrained, start, cache).run(max_seconds)
     if folder is not None:
         with cache.writing(folder):
             result.save(folder)
     return result
 
 
+@dataclass(eq=False)
 class Work:
     """The rounds of a hardening, of which finished parts are in the cache."""
 
-    def __init__(
-        self,
-        study: Study,
-        plan: Plan,
-        values: Mapping[str, object],
-        untrained: Problem,
-        start: Start | None,
-        cache: Cache,
-    ) -> None:
-        self.study, self.plan, self.cache, self.untrained = study, plan, cache, untrained
+    study: Study
+    plan: Plan
+    values: Mapping[str, object]
+    untrained: Problem
+    start: Start | None
+    cache: Cache
+
+    def __post_init__(self) -> None:
+        study, plan, untrained = self.study, self.plan, self.untrained
         self.arms_named = (HARDENED, BASELINE) if plan.baseline else (HARDENED,)
         stages = [plan.steps + stage * plan.further_steps for stage in range(plan.rounds + 1)]
-        trainer, space, named = study.trainer, untrained.space, self.arms_named
+        trainer, space = study.trainer, untrained.space
         self.task, self.stages = trainer.nominal, stages
+        known = study, self.values, stages, plan.seed, self.cache, self.arms_named
         self.arms: TaskArms | FunctionArms
         if isinstance(trainer, FunctionTrainer):
-            self.arms = FunctionArms(study, values, stages, plan.seed, cache, named)
+            self.arms = FunctionArms(*known)
         else:
-            configured = trainer.configuration(values, plan.seed).task
-            self.task = configured if trainer.nominal is None else trainer.nominal
-            mixture = mixture_of(configured, untrained, start)
-            self.arms = TaskArms(trainer, values, stages, plan.seed, cache, mixture, named)
-        self.points = np.zeros((0, space.dim), np.float32)
+            configured = trainer.configuration(self.values, plan.seed)
+            self.task = configured.task if trainer.nominal is None else trainer.nominal
+            self.arms = TaskArms(
+                *known, configured, mixture_of(configured.task, untrained, self.start)
+            )
+        self.points, self.radii = np.zeros((0, space.dim), np.float32), np.zeros(0)
+        self.own = dict.fromkeys(self.arms_named, plan.own)
         self.rows: list[dict[str, Any]] = []
         self.added: list[pd.DataFrame] = []
         self.policies: dict[tuple[str, int], Any] = {}
@@ -236,13 +242,12 @@ class Work:
             # The verbs of a round count their simulations in the same line.
             say_done(0, figures=f"round {stage} of {plan.rounds}")
             certificates = self._stage(stage)
+            late = max_seconds is not None and time.perf_counter() - began > max_seconds
             if certificates[0].verdict == safe_at(plan.p) and self._keeps_return(HARDENED, stage):
                 stopped = "certified"
-                break
-            if stage == plan.rounds:
-                break
-            if max_seconds is not None and time.perf_counter() - began > max_seconds:
+            elif late and stage < plan.rounds:
                 stopped = "max_seconds"
+            if stopped != "budget" or stage == plan.rounds:
                 break
             self._collect(stage, certificates)
         return self._result(stopped, began)
@@ -258,22 +263,15 @@ class Work:
             remember=self.cache.remember,
         )  # fmt: skip
         end_if_interrupted(certificates.stopped)
+        records = certificates.table.to_dict("records")
         for number, (arm, policy) in enumerate(zip(self.arms_named, policies, strict=True)):
             self.policies[arm, stage] = policy
             self.returns[arm, stage] = self._returns(number, stage, policy)
-            one = certificates[number]
-            self.rows.append(
-                {
-                    "round": stage, "arm": arm, "steps": self.stages[stage],
-                    "failures": one.failures + one.not_finite, "simulations": one.simulations,
-                    "failure_rate": one.rate.estimate if one.rate else np.nan,
-                    "failure_low": one.rate.low if one.rate else np.nan,
-                    "failure_high": one.rate.high if one.rate else np.nan,
-                    "verdict": one.verdict, "attack_failures": one.attack_failures,
-                    "return": float(self.returns[arm, stage].mean()),
-                    "added": 0, "cost": one.cost, "seconds": time.perf_counter() - began,
-                }
-            )  # fmt: skip
+            one = {name: records[number][name] for name in CERTIFIED}
+            one["failures"] += records[number]["not_finite"]
+            mean = float(self.returns[arm, stage].mean())
+            row = {"round": stage, "arm": arm, "steps": self.stages[stage], **one, "return": mean}
+            self.rows.append({**row, "added": 0, "seconds": time.perf_counter() - began})
         return certificates
 
     def _collect(self, stage: int, certificates: Certificates) -> None:
@@ -288,21 +286,26 @@ class Work:
             )  # fmt: skip
             return {name: np.asarray(value) for name, value in found._asdict().items()}
 
-        known = self.cache.remember(f"collected/{stage}", compute)
-        found = Collected(**{**known, "simulations": int(known["simulations"])})
-        self.points = np.concatenate([self.points[found.kept], found.points])[-CAPACITY:]
+        found = Collected(**self.cache.remember(f"collected/{stage}", compute))
+        self.points, self.radii = (
+            np.concatenate([one[found.kept], new])[-CAPACITY:]
+            for one, new in ((self.points, found.points), (self.radii, found.radii))
+        )
         row = self.rows[-len(self.arms_named)]
-        row["added"], row["cost"] = len(found.points), row["cost"] + found.simulations
+        row["added"], row["cost"] = len(found.points), row["cost"] + int(found.simulations)
         if len(found.points):
             columns = space.rows(space.features_at(found.points))
             self.added.append(pd.DataFrame(columns).assign(round=stage, source=found.sources))
-        # The more of the prior fails, the more of its episodes begin at failures anyway.
-        rate = certificates[0].rate.estimate if certificates[0].rate else 0.0
-        failing = (plan.failing - (1 - plan.own) * rate) / max(1 - rate, 1e-9)
-        failing = min(max(failing, 0.0), plan.failing)
-        shares = (plan.own, 1 - plan.own - failing, failing)
-        mixtures = [Mixture.of(space, shares, p) for p in (self.points, self.points[:0])]
-        self.arms.mix(stage + 1, mixtures[: len(self.arms_named)])
+        rate, mixtures = certificates[0].rate.estimate if certificates[0].rate else 0.0, []
+        for arm, count in zip(self.arms_named, (len(self.points), 0), strict=False):
+            change = -OWN_STEP if self._keeps_return(arm, stage) else OWN_STEP
+            own = self.own[arm] = max(plan.own, min(self.own[arm] + change, MOST_OWN))
+            # The more of the prior fails, the more of its episodes begin at failures anyway.
+            wanted = plan.failing * (1 - own) / max(1 - plan.own, 1e-9)
+            failing = min(max((wanted - (1 - own) * rate) / max(1 - rate, 1e-9), 0.0), wanted)
+            shares = (own, 1 - own - failing, failing)
+            mixtures.append(Mixture.of(space, shares, self.points[:count], self.radii[:count]))
+        self.arms.mix(stage + 1, mixtures)
 
     def _returns(self, number: int, stage: int, policy: Any) -> np.ndarray:
         if self.task is None:
@@ -326,22 +329,21 @@ class Work:
         """Choose, certify before and after from fresh samples, and compare them in pairs."""
         plan, notes = self.plan, []
         chosen = {arm: self._choice(arm) for arm in self.arms_named}
-        start = self.policies[HARDENED, 0]
         comparison: Comparison | None = None
-        if chosen[HARDENED]:
+        if at := chosen[HARDENED]:
             comparison = compare(
-                self.study.problem(start),
-                self.study.problem(self.policies[HARDENED, chosen[HARDENED]]),
+                *(self.study.problem(self.policies[HARDENED, stage]) for stage in (0, at)),
                 confidence=plan.confidence, budget=16 * plan.samples,
                 seed=plan.seed_for(COMPARED), progress=False,
             )  # fmt: skip
             end_if_interrupted(comparison.stopped)
             if comparison.regression:
                 notes.append(
-                    "the paired comparison shows that the policy of round "
-                    f"{chosen[HARDENED]} fails more often, so that the first one is returned"
+                    f"the paired comparison shows that the policy of round {at} fails more often, "
+                    "so that the first one is returned"
                 )
                 chosen[HARDENED] = 0
+        start = self.policies[HARDENED, 0]
         finalists = [start, *(self.policies[arm, at] for arm, at in chosen.items())]
         final = certify(
             self.study.problem, finalists, p=plan.p, confidence=plan.confidence,
@@ -363,8 +365,7 @@ class Work:
             | {arm: self.returns[arm, at] for arm, at in chosen.items()},
             stopped=stopped,
             seconds=time.perf_counter() - began,
-            options={name: getattr(plan, name) for name in Plan.__dataclass_fields__}
-            | {"attack": stable_text(plan.attack)},
+            options={**vars(plan), "attack": stable_text(plan.attack)},
             notes=tuple(notes),
             version=__version__,
         )
@@ -376,21 +377,18 @@ def _as_study(
     algorithm: Algorithm | None,
     p: float | None,
 ) -> Study:
+    if isinstance(given, Study | Trainer) and algorithm is not None:
+        raise ValueError(f"a {type(given).__name__} has algorithms; give no other")
     if isinstance(given, Study):
-        if problem is not None or algorithm is not None:
-            raise ValueError("a Study has a problem and algorithms; give no others")
+        if problem is not None:
+            raise ValueError("a Study has a problem; give no other")
         study = given
     elif problem is None:
         raise HardeningError(
             "harden needs problem=, a function from a policy to the Problem of its closed loop"
         )
     else:
-        if not isinstance(given, Trainer):
-            trainer = Trainer(given) if algorithm is None else Trainer(given, algorithm)
-        elif algorithm is None:
-            trainer = given
-        else:
-            raise ValueError("a Trainer has algorithms; give no other")
+        trainer = given if isinstance(given, Trainer) else Trainer(given, algorithm or PPO())
         space = {"steps": Categorical(trainer.steps)}
         study = Study(trainer.name, space, trainer, problem, p=0.01 if p is None else p)
     trainer = study.trainer
@@ -402,19 +400,3 @@ def _as_study(
             )
         trainer.check(study.space)
     return study
-
-
-def _fingerprint(
-    study: Study, plan: Plan, values: Mapping[str, object], problem: Problem
-) -> dict[str, Any]:
-    """Describe what decides the numbers of every round; code by its name only."""
-    return {
-        "study": study.name,
-        "task": describe(study.trainer.task),
-        "algorithms": {name: describe(each) for name, each in study.trainer.by_name.items()},
-        "hyperparameters": {name: stable_text(value) for name, value in values.items()},
-        "space": {name: stable_text(domain) for name, domain in problem.space.domains.items()},
-        "formulas": {name: str(formula) for name, formula in problem.formulas.items()},
-        "options": {name: stable_text(getattr(plan, name)) for name in Plan.__dataclass_fields__},
-        "version": __version__,
-    }

@@ -20,11 +20,15 @@ from jaxtyping import Bool, Float
 from verifai_jax.analysis import rules
 from verifai_jax.analysis.counterexamples import shrink
 from verifai_jax.falsification import falsify
+from verifai_jax.hardening.mixture import NARROW, RADIUS, neighbourhoods
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import PointList
 
 SHRINKING = 300
 """Simulations to shrink a counterexample: a near failure is wanted, not the nearest."""
+AROUND, THIN = 8, 0.25
+"""Samples around each point, and the share of failing ones below which its neighbourhood is narrow:
+few episodes of a wide one would show what fails."""
 PRIOR = 4096
 """Samples of the prior of which those within the rules are kept."""
 
@@ -33,12 +37,14 @@ class Collected(NamedTuple):
     """Points of the unit cube to train around.
 
     - `points`: `[n, d]`, new ones.
+    - `radii`: `[n]`, of their neighbourhoods.
     - `sources`: the origin of each: `"sample"`, `"counterexample"`, `"shrunk"` or `"rule"`.
     - `kept`: which earlier points stay: those that still fail, and as many others as points fail.
     - `simulations`: spent to confirm and shrink.
     """
 
     points: Float[np.ndarray, "n d"]
+    radii: Float[np.ndarray, " n"]
     sources: np.ndarray
     kept: Bool[np.ndarray, " m"]
     simulations: int
@@ -59,16 +65,15 @@ def collect(
     **Arguments:**
 
     - `problem`: the problem of the policy.
-    - `failing`: rows that fail, the worst first.
-    - `earlier`: points of the rounds before.
-    - `seed`: the seed of the samples of the prior.
+    - `failing`: rows that fail, the worst first; `earlier`: points of the rounds before.
+    - `seed`, `table`: the seed and the number of samples of the prior.
     - `added`: the maximum number of points.
-    - `table`: the number of samples of the prior.
     - `shrunk`: counterexamples that are shrunk, where the problem says what is nominal.
     """
     space, points, sources = problem.space, [np.zeros((0, problem.space.dim), np.float32)], []
     if not len(failing):
-        return Collected(points[0], np.zeros(0, np.str_), np.ones(len(earlier), bool), 0)
+        kept = np.ones(len(earlier), bool)
+        return Collected(points[0], np.zeros(0), np.zeros(0, np.str_), kept, 0)
 
     def add(found: Float[np.ndarray, "n d"], source: str) -> None:
         points.append(np.asarray(found, np.float32))
@@ -108,7 +113,28 @@ def collect(
     kept = fails[:first]
     passing = np.flatnonzero(~kept)
     kept[passing[max(len(passing) - int(kept.sum()) - len(sources), 0) :]] = True
-    return Collected(np.concatenate(points), np.array(sources, np.str_), kept, simulations)
+    centres = np.concatenate(points)
+    radii, spent = _radii(problem, centres, seed)
+    return Collected(centres, radii, np.array(sources, np.str_), kept, simulations + spent)
+
+
+def _radii(
+    problem: Problem, centres: Float[np.ndarray, "n d"], seed: int
+) -> tuple[Float[np.ndarray, " n"], int]:
+    """Return how far failures reach around points, and the simulations that it took to see it."""
+    space, count = problem.space, len(centres)
+    low, high = (np.repeat(ends, AROUND, 0) for ends in neighbourhoods(space, centres, RADIUS))
+    points = low + np.random.default_rng(seed).random(low.shape) * (high - low)
+    possible = np.asarray(jax.vmap(space.accepts)(space.features_at(points)))
+    run = falsify(
+        problem, PointList(points[possible]), int(possible.sum()), seed=seed, confirm=False,
+        progress=False,
+    )  # fmt: skip
+    end_if_interrupted(run.stopped)
+    fails = np.zeros(len(points), bool)
+    fails[np.flatnonzero(possible)[np.asarray(run.table.violating.index, int)]] = True
+    thin = fails.reshape(count, AROUND).mean(axis=1) < THIN
+    return np.where(thin, NARROW, RADIUS), run.simulations
 
 
 def end_if_interrupted(stopped: str | None) -> None:

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree, Shaped
 
 from verifai_jax.analysis.counterexamples.nominal import Nominal
+from verifai_jax.core.text import format_error
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 from verifai_jax.rl.batched_training import StaticTask, numbers_of
@@ -25,9 +26,10 @@ from verifai_jax.rl.task.task import Action, State, Task
 
 CAPACITY = 256
 """Neighbourhoods that a mixture holds at most; the newest stay."""
-RADIUS = 0.1
-"""Half the side of a neighbourhood, a share of each coordinate's range. At 0.03 what was learnt
-did not reach beyond the counterexamples, at 0.3 it was domain randomisation."""
+RADIUS, NARROW = 0.1, 0.03
+"""Half the side of a neighbourhood, a share of each coordinate's range; the second where little of
+the first fails. At 0.03 what was learnt of wide failures did not reach beyond the counterexamples,
+at 0.3 it was domain randomisation."""
 TRIES = 8
 """Draws of which the first that the constraint accepts is taken."""
 
@@ -39,6 +41,16 @@ Shares = tuple[float, float, float]
 
 class HardeningError(ValueError):
     """An error for a task and a problem that cannot be hardened together."""
+
+
+def neighbourhoods(
+    space: FeatureSpace, centres: Float[np.ndarray, "n d"], radii: Float[np.ndarray, " n"] | float
+) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
+    """Return the ends of boxes around points of the unit cube."""
+    # The neighbourhood of a choice or an integer is its cell.
+    wide = np.array(space.levels) <= 0
+    around = np.asarray(radii, np.float32)[..., None] * wide
+    return np.clip(centres - around, 0.0, 1.0), np.clip(centres + around, 0.0, 1.0)
 
 
 @jax.tree_util.register_dataclass
@@ -62,18 +74,19 @@ class Mixture:
 
     @classmethod
     def of(
-        cls, space: FeatureSpace, shares: Shares, centres: Float[np.ndarray, "n d"]
+        cls,
+        space: FeatureSpace,
+        shares: Shares,
+        centres: Float[np.ndarray, "n d"],
+        radii: Float[np.ndarray, " n"] | float = RADIUS,
     ) -> "Mixture":
         """Return a mixture with the neighbourhoods of these points; without them of the rest."""
-        centres = np.asarray(centres, np.float32)[-CAPACITY:]
-        if not len(centres):
+        count = len(centres)
+        if not count:
             shares = (shares[0], shares[1] + shares[2], 0.0)
-        # The neighbourhood of a choice or an integer is its cell.
-        radius = np.where(np.array(space.levels) > 0, 0.0, RADIUS).astype(np.float32)
-        low, high = np.zeros((2, CAPACITY, space.dim), np.float32)
-        low[: len(centres)] = np.clip(centres - radius, 0.0, 1.0)
-        high[: len(centres)] = np.clip(centres + radius, 0.0, 1.0)
-        return cls(space, np.asarray(shares, np.float32), low, high, len(centres))
+        ends = np.zeros((2, CAPACITY, space.dim), np.float32)
+        ends[:, :count] = neighbourhoods(space, centres, radii)
+        return cls(space, np.asarray(shares, np.float32), *ends, count)
 
     def draw(self, key: Key[Array, ""]) -> Float[Array, " d"]:
         """Draw a point of the unit cube, from the prior or from a neighbourhood."""
@@ -135,8 +148,12 @@ class MixtureTask:
         is_own, u = self.mixture.episode(kind_key, draw_key)
         if self.own is not None:
             return self.started(start_key, jnp.where(is_own, jnp.asarray(self.own, u.dtype), u))
-        own, started = self.task.reset(own_key), self.started(start_key, u)
-        return jax.tree.map(lambda one, two: _select(is_own, one, two), own, started)
+
+        def either(own: Array, started: Array) -> Array:
+            own = jnp.asarray(own)
+            return jnp.where(is_own, own, jnp.asarray(started, own.dtype))
+
+        return jax.tree.map(either, self.task.reset(own_key), self.started(start_key, u))
 
     def started(self, key: Key[Array, ""], u: Float[Array, " d"]) -> State:
         """Start an episode with the features at a point of the unit cube."""
@@ -174,8 +191,7 @@ def mixture_of(task: Task, problem: Problem, start: Start | None) -> MixtureTask
     except Exception as error:
         raise HardeningError(
             f"an episode of {type(task).__name__} does not start with the features of "
-            f"{problem.name!r} ({', '.join(problem.space.domains)}): {type(error).__name__}: "
-            f"{error}"
+            f"{problem.name!r} ({', '.join(problem.space.domains)}): {format_error(error)}"
         ) from error
     if _form(started) != _form(jax.eval_shape(task.reset, key)):
         # Its own episodes lack something that differs from one episode of the problem to the next.
@@ -193,8 +209,3 @@ def mixture_of(task: Task, problem: Problem, start: Start | None) -> MixtureTask
 def _form(state: PyTree) -> tuple[Any, list[tuple[int, ...]]]:
     leaves, structure = jax.tree.flatten(state)
     return structure, [leaf.shape for leaf in leaves]
-
-
-def _select(condition: Bool[Array, ""], one: PyTree, two: PyTree) -> PyTree:
-    one = jnp.asarray(one)
-    return jnp.where(condition, one, jnp.asarray(two).astype(one.dtype))

@@ -102,23 +102,21 @@ class Hardening(Drawn, InNotebook):
 
     def lost(self, arm: str = HARDENED) -> PairedDifference:
         """Compare the returns before and after on the same episodes: before minus after."""
-        return paired_difference(
-            self.returns["start"], self.returns[arm], self.options["confidence"]
-        )
+        before, after = self.returns["start"], self.returns[arm]
+        return paired_difference(before, after, self.options["confidence"])
 
     def summary(self) -> str:
         """Write what was gained, what was lost and what it cost."""
-        rounds = len(self.table["round"].unique()) - 1
-        sure = f"{100 * self.options['confidence']:zg} %"
+        rounds, sure = max(self.table["round"]), format_percent(self.options["confidence"])
         lines = [
             f"{self.problem}: hardened in {rounds} round{'s' * (rounds != 1)} "
             f"({self.stopped}); the policy of round {self.chosen[HARDENED]} is returned"
         ]
-        named = [("before", self.before, "start"), ("after", self.after, HARDENED)]
-        if self.baseline is not None:
-            named.append((f"randomised (round {self.chosen[BASELINE]})", self.baseline, BASELINE))
-        for name, one, arm in named:
-            lines.append(f"  {name + ':':<9} {_chance(one)}; {self._return(arm)}")
+        named = ("before", "after", f"randomised (round {self.chosen.get(BASELINE)})")
+        arms = zip(named, self.certificates.rows, self.returns.values(), strict=False)
+        for name, one, returns in arms:
+            known = f"{returns.mean():z.4g}" if np.isfinite(returns).all() else "unknown"
+            lines.append(f"  {name + ':':<9} {_chance(one)}; return {known}")
         lines.append(
             f"  the intervals hold together with {sure}, on samples that nothing was trained on"
         )
@@ -143,15 +141,10 @@ class Hardening(Drawn, InNotebook):
         )
         return "\n".join([*lines, *(f"  note: {note}" for note in self.notes)])
 
-    def _return(self, arm: str) -> str:
-        returns = self.returns[arm]
-        return f"return {returns.mean():z.4g}" if np.isfinite(returns).all() else "return unknown"
-
     def save(self, folder: str | Path) -> Path:
-        """Write table, added features, summary and policies to a folder.
+        """Write table, added features, summary and policies to a folder, which is returned.
 
-        **Raises:** `FolderInUse` where another process writes it; `OSError` for what the file
-        system refuses, which leaves what was there.
+        **Raises:** `FolderInUse`; `OSError` for what the file system refuses: what was there stays.
         """
         path = Path(folder)
         with write_lock(path), replacing_all(path, FILES) as made:
@@ -177,9 +170,6 @@ class Hardening(Drawn, InNotebook):
 def _chance(one: Certificate) -> str:
     if one.rate is None:
         return "not simulated"
-    low, high = format_percent(one.rate.low), format_percent(one.rate.high)
-    failing = one.failures + one.not_finite
-    return (
-        f"fails with {format_percent(one.rate.estimate)} ({low} to {high}; {failing:,} of "
-        f"{one.simulations:,}), {one.verdict}"
-    )
+    chance, low, high = map(format_percent, (one.rate.estimate, one.rate.low, one.rate.high))
+    counted = f"{one.failures + one.not_finite:,} of {one.simulations:,}"
+    return f"fails with {chance} ({low} to {high}; {counted}), {one.verdict}"
