@@ -20,9 +20,9 @@ from jaxtyping import Bool, Float
 from verifai_jax.analysis import rules
 from verifai_jax.analysis.counterexamples import shrink
 from verifai_jax.falsification import falsify
-from verifai_jax.hardening.mixture import NARROW, RADIUS, neighbourhoods
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import PointList
+from verifai_jax.training.hardening.mixture import NARROW, RADIUS, neighbourhoods
 
 SHRINKING = 300
 """Simulations to shrink a counterexample: a near failure is wanted, not the nearest."""
