@@ -12,6 +12,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+from markdown import Extension, Markdown
+from markdown.preprocessors import Preprocessor
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -27,6 +29,8 @@ LINK = re.compile(r"(!?)\[([^\]\n]*(?:\n[^\]\n]*)?)\]\(([\w./-]+)(#[\w-]+)?\)")
 IMAGE = re.compile(r'(<img src=")([\w./-]+)(")')
 BLOCK = re.compile(r"(^```.*?^```)", re.DOTALL | re.MULTILINE)
 ANSI = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
+SECTIONS = ("**Returns:**", "**Raises:**", "**Yields:**")
+"""Beginnings of paragraphs that follow arguments, or each other, in a docstring."""
 LONGEST_OUTPUT = 6000
 """Characters of an output of a notebook that are shown."""
 
@@ -46,7 +50,28 @@ def on_config(config: Any) -> Any:
         return lists.get(entry, entry)
 
     config["nav"] = filled(config["nav"])
+    config["markdown_extensions"].append(Sections())
     return config
+
+
+class Sections(Extension):
+    """Sections of docstrings, `**Arguments:**` and others, without empty lines between them."""
+
+    def extendMarkdown(self, md: Markdown) -> None:
+        """Add the empty lines that Markdown needs in front of a list and of a paragraph."""
+        md.preprocessors.register(_Spaced(md), "sections", priority=15)
+
+
+class _Spaced(Preprocessor):
+    def run(self, lines: list[str]) -> list[str]:
+        spaced: list[str] = []
+        for line in lines:
+            before = spaced[-1] if spaced else ""
+            begins = line.startswith("- ") and before.startswith("**")
+            if begins or (before and line.startswith(SECTIONS)):
+                spaced.append("")
+            spaced.append(line)
+        return spaced
 
 
 def on_files(files: Files, config: Any) -> Files:

@@ -30,7 +30,6 @@ def simulated(problem: Problem, count: int = SIMULATED, seed: int = 0) -> tuple[
     """Simulate a problem from its prior.
 
     **Returns:** the traces that have a verdict, `count` at most.
-
     **Raises:** as `falsify`; `ValueError` where no simulation has a verdict.
     """
     run = falsify(problem, "uniform", count, seed=seed, confirm=False, progress=False)
@@ -52,9 +51,7 @@ def mine_by_search(
     """Find the tightest parameters that no search breaks: each counterexample loosens them.
 
     **Arguments:**
-
     - `budget`: simulations in all. A search that finds nothing ends the work.
-
     **Raises:** as `mine` and `falsify`.
     """
     traces = list(simulated(problem, min(SIMULATED, budget), seed))

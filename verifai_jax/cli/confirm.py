@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import EVEN_IF_CHANGED, PROBLEM, ROW, RUN, load_judged_run
+from verifai_jax.cli.arguments import EVEN_IF_CHANGED, PROBLEM, ROW, RUN, load_judged_run, option
 from verifai_jax.cli.exit_codes import check_again
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import as_plain, command, give_result
@@ -14,7 +14,7 @@ from verifai_jax.cli.json_output import as_plain, command, give_result
 @RUN
 @ROW
 @PROBLEM
-@click.option(
+@option(
     "--engine",
     "engines",
     multiple=True,

@@ -16,7 +16,6 @@ def given_or_next(
     """Return the folder that was given, or else the next one, as `next_folder` makes it.
 
     **Arguments:**
-
     - `goes_on`: writes the command that goes on with the folder, which is said for those who kill
       this one.
     - `record`: file that the folder has from when on that is possible.

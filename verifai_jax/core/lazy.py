@@ -29,7 +29,6 @@ def attach(
     they are read from its source, so that each stands there once.
 
     **Arguments:**
-
     - `package`: the name of the package, which is being imported.
     - `others`: names that it has already.
     """

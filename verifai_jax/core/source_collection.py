@@ -71,7 +71,6 @@ def sources_of(*things: object, made: Sequence[Maker] = (), first: int = 0) -> S
     """Return what some objects are made of, as it is imported, and as data lie on the disk.
 
     **Arguments:**
-
     - `things`: such as a problem; their functions, classes and files count.
     - `made`: where they were made, as `made_here` returned it there.
     - `first`: the row of a table from which on that holds.

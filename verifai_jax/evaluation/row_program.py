@@ -39,7 +39,6 @@ class RowProgram:
     """The traced function of one row; see the module's docstring.
 
     **Arguments:**
-
     - `problem`: a checked `Problem`.
     - `inputs`: how rows become features and a system.
     - `precision`: `"float32"` or `"float64"`, of simulation, monitor and gradient.

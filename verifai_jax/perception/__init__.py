@@ -31,7 +31,6 @@ __all__ = [
     "load_detector", "losses_of", "mujoco_camera", "mujoco_scene", "save_detector", "score",
     "train_detector",
 ]  # fmt: skip
-
 # Given by `__getattr__`.
 Compositional: Any
 abstract: Any

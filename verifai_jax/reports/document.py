@@ -57,7 +57,6 @@ def write_report(
     """Write the evidence report on a result as one HTML file, and its claims as JSON next to it.
 
     **Arguments:**
-
     - `result`: a run, a sweep, an estimate, a verification, a comparison, a transfer, a failure
       table or a judgement. The failures of a run that has its problem are simulated again.
     - `path`: the path of the HTML file; the claims go to the same name with the ending
@@ -78,9 +77,6 @@ def write_report(
     - `assessment`: whether sections for an assessor follow: the claims as a tree, the nine steps of
       credibility with boxes to be filled in, and a page to be signed.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
-    **Returns:** the path of the HTML file.
-
     **Raises:** `UnknownNameError` for a unit or a reason of a feature that does not exist;
     `ValueError` for a number of simulations that is none, and for a run whose rows have changed
     since they were written;

@@ -87,13 +87,7 @@ MAX_MODES = 8
 
 
 def modes_section(found: Modes, about: About) -> Section:
-    """Write the ways of failing, the most probable first.
-
-    **Arguments:**
-
-    - `found`: the modes.
-    - `about`: units of the features.
-    """
+    """Write the ways of failing, the most probable first."""
     content: list[Markup] = [paragraph(_whole(found))]
     if found.modes:
         rows = [

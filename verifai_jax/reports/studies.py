@@ -25,7 +25,6 @@ from verifai_jax.reports.plotting.mujoco_motion import can_draw
 from verifai_jax.reports.view import rows_to_trace, trace_data
 
 Result = TypeVar("Result")
-
 MAX_FAILURES = 5
 """Failures that are shown one by one."""
 TRACES = 24
@@ -88,7 +87,6 @@ def study(
     """Study a run for its report: everything is decided by the run and its seed.
 
     **Arguments:**
-
     - `run`: the run.
     - `traces`: rows simulated beforehand at most; chosen when left out.
     - `studies`: whether the worst failure is explained and shrunk, which takes up to 2000

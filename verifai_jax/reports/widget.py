@@ -21,9 +21,7 @@ def explore(run: Run) -> Any:
     A row under the pointer shows its values. A clicked one is simulated again, and shows its trace.
 
     **Arguments:**
-
     - `run`: a run with a row at least.
-
     **Returns:** a widget of anywidget; without that package the figure of `run.plot()`.
     """
     try:

@@ -56,7 +56,6 @@ class Enclosure:
     """The program of one simulation of a problem, for sets of features.
 
     **Arguments:**
-
     - `problem`: a checked one.
     - `precision`: the precision of simulations, `"float32"` or `"float64"`.
     """

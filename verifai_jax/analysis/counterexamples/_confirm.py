@@ -58,7 +58,6 @@ def confirm(
     """Replay counterexamples more finely than they were found, and decide which are real.
 
     **Arguments:**
-
     - `run`: a run of a problem.
     - `row`: a row number, a row of the table, or a mapping with its feature columns; all
       counterexamples of the table when left out.
@@ -69,9 +68,7 @@ def confirm(
       few replays; of more, the worst and those nearest to zero, until the rest
       is far from it (see `evaluation.confirmer.Confirmer`).
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Returns:** a `Confirmation` for a row, `Confirmations` for all; after Ctrl-C what is finished.
-
     **Raises:** `ValueError` for a run without its problem, a row that is not a counterexample, an
     engine that does not fit; `IndexError` for a row that is not in the table.
     """

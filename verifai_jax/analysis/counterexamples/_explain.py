@@ -49,7 +49,6 @@ class Explained(Drawn, InNotebook):
 
     _picture = "counterexamples", "plot_explanation"
     """The deciding signal with its bound and instant, and the features."""
-
     row: int
     formula: str
     rho: float
@@ -95,7 +94,6 @@ def explain(
     """Explain a counterexample: the predicate that decides, when, and the features that matter.
 
     **Arguments:**
-
     - `run`: a run of a problem, with a counterexample.
     - `row`: the number of one, or a row of the table; the worst when left out.
     - `nominal`: features that are ordinary, where the problem does not say or others are meant.
@@ -105,7 +103,6 @@ def explain(
     nominal features only the gradient tells what matters.
 
     **Returns:** an `Explained`.
-
     **Raises:** `ValueError` for a run without its problem or without a counterexample, a row that
     is none, or has no verdict when simulated again.
     """
@@ -203,12 +200,9 @@ def slopes_of(
     distribution and little in its middle.
 
     **Arguments:**
-
-    - `space`: the space of the features.
     - `u`: the point at which the gradient was taken.
     - `gradient`: by the coordinates.
     - `precision`: in which it was taken.
-
     **Returns:** the derivative for each coordinate, in the unit of its number, NaN for choices,
     integers and lengths; and twice the width of the middle half, which is the whole of a Box.
     """

@@ -28,7 +28,6 @@ from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
-
 FAILING, FIXED, WITHOUT_VERDICT, INVALID, OTHER = (
     "failing",
     "fixed",
@@ -147,12 +146,10 @@ def replay_counterexamples(
     judged by those of today, and says so. Files of problems of other names are counted.
 
     **Arguments:**
-
     - `problem`: as it is now.
     - `folder`: that `run.save_counterexamples` wrote into, or one file of it.
     - `rename`: new names of features by their old ones.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Raises:** `FileNotFoundError` for a place that does not exist; `TypeError` for something that
     is no `Problem`.
     """
@@ -205,11 +202,7 @@ def _replay_each(
 
 
 def _replay_batch(
-    problem: Problem,
-    seed: int,
-    precision: str,
-    backend: str | None,
-    batch: _Batch,
+    problem: Problem, seed: int, precision: str, backend: str | None, batch: _Batch
 ) -> _Replayed:
     """Replay counterexamples of one seed, precision and backend."""
     problem = resolved(problem, wanted=backend).problem

@@ -73,7 +73,6 @@ def shrink(
     """Search the least departure from the nominal features that still fails.
 
     **Arguments:**
-
     - `run`: a run of a problem, with a counterexample.
     - `row`: the number of one, or a row of the table; the worst when left out, by likelihood the
       likeliest.
@@ -302,7 +301,6 @@ class _Search:
         """Return the least failures in different directions, after those of `first`.
 
         **Arguments:**
-
         - `first` `[m, d]`: points that are returned at any rate.
         - `alike`: whether only failures with as few departures as the least one count.
         - `cosine`: the cosine of the angle between directions, at most.

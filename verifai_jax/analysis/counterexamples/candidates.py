@@ -34,7 +34,6 @@ class Candidates:
     A gradient counts as one simulation.
 
     **Arguments:**
-
     - `problem`: whose system is simulated.
     - `nominal`: the point from which candidates depart.
     - `budget`: simulations at most.

@@ -182,16 +182,13 @@ def save_counterexamples(
     few of them stand for all.
 
     **Arguments:**
-
     - `run`: with its problem.
     - `folder`: made if missing; existing files stay.
     - `max_count`: counterexamples at most.
     - `shrink`: whether each is first shrunk towards the nominal features, where these are known.
     - `budget`: simulations to shrink one with, at most.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Returns:** the paths of the files, none twice.
-
     **Raises:** `ValueError` for a run without its problem or without a counterexample.
     """
     problem = problem_of(run)
@@ -272,7 +269,6 @@ def read_corpus(folder: str | Path) -> tuple[dict[Path, SavedCounterexample], di
     Every file whose name ends in `.json`, in whatever case, belongs to it; what is hidden does not.
 
     **Returns:** the counterexamples by path, and what is wrong with the other files.
-
     **Raises:** `FileNotFoundError` where there is no such place.
     """
     location = Path(folder)

@@ -48,7 +48,6 @@ def describe(
     """Write the whole explanation of a counterexample as a paragraph.
 
     **Arguments:**
-
     - `name`: the name of the problem.
     - `row`: its number in the table.
     - `why`: the predicate that decides, when, and through which sub-formulas.

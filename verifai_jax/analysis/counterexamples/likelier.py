@@ -17,7 +17,6 @@ from verifai_jax.analysis.counterexamples.candidates import Candidates
 
 Point = Float[np.ndarray, " d"]
 Points = Float[np.ndarray, "n d"]
-
 PARENTS = 6
 """Failures from which changes are tried, the likeliest ones."""
 TRIED = 256
@@ -40,9 +39,7 @@ def draw_around_elite(candidates: Candidates, rng: np.random.Generator) -> None:
     """Sample around the likeliest failures, fit to the likeliest of all, and so on.
 
     **Arguments:**
-
     - `candidates`: simulates, and remembers what failed, within its limit.
-    - `rng`: the rng of the samples.
     """
     nominal, fruitless = candidates.nominal, 0
     free = nominal.cube.continuous
@@ -99,7 +96,6 @@ def exchange_cells(candidates: Candidates, rng: np.random.Generator) -> None:
     """Change cells of the likeliest failures until no change of two makes any likelier.
 
     **Arguments:**
-
     - `candidates`: simulates, and remembers what failed, within its limit.
     - `rng`: the rng of the order of changes that are predicted alike.
     """

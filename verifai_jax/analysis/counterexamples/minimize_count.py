@@ -19,7 +19,6 @@ from verifai_jax.analysis.counterexamples.candidates import Candidates, Tangent
 Point = Float[np.ndarray, " d"]
 Points = Float[np.ndarray, "n d"]
 Results = Float[np.ndarray, "m d"]
-
 LEVELS = 5
 """Values of one feature alone that growth begins with."""
 BEAM = 6
@@ -230,11 +229,9 @@ def minimize_count(candidates: Candidates, starts: Points, rng: np.random.Genera
     """Minimise the number of coordinates that depart from nominal, among failing points.
 
     **Arguments:**
-
     - `candidates`: simulates, and remembers what failed.
     - `starts` `[m, d]`: failing points to begin with.
     - `rng`: for random candidates.
-
     **Returns:** failing points `[n, d]`, the fewest departures first, then the nearest.
     """
     nominal = candidates.nominal

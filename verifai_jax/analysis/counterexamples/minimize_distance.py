@@ -32,7 +32,6 @@ Point = Float[np.ndarray, " d"]
 Points = Float[np.ndarray, "n d"]
 Departure = Float[np.ndarray, " k"]
 Departures = Float[np.ndarray, "n k"]
-
 TURNS = (1.0, 0.75, 0.5, 0.3, 0.15, 0.05)
 """Shares of the way to the linearised boundary's nearest point,"""
 STRETCHES = (1.0, 1.003, 1.015, 1.06)
@@ -74,13 +73,11 @@ def minimize_distance(
     """Follow failing points along the boundary until none comes nearer to nominal.
 
     **Arguments:**
-
     - `candidates`: simulates, and remembers what failed.
     - `starts` `[n, d]`: failing points.
     - `rng`: for random candidates.
     - `keep_nominal`: whether coordinates that are nominal stay so.
     - `rounds`: batches at most.
-
     **Returns:** the points reached `[n, d]`, one for each start.
     """
     nominal = candidates.nominal

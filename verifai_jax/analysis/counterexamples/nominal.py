@@ -30,7 +30,6 @@ class Nominal:
     """The nominal features as a point of the unit cube.
 
     **Fields:**
-
     - `space`: the space of the features.
     - `u` `[d]`: the point.
     - `low` and `high` `[d]`: ends of the coordinates within which points may depart.
@@ -46,10 +45,8 @@ class Nominal:
         """Return the nominal point of a problem.
 
         **Arguments:**
-
         - `problem`: says what is nominal.
         - `nominal`: nominal values that override those of the problem.
-
         **Raises:** `ValueError` where neither names all features, or one is outside the space.
         """
         space = problem.space

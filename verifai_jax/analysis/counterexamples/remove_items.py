@@ -25,10 +25,7 @@ def remove_items(candidates: Candidates, u: Float[np.ndarray, " d"]) -> Float[np
     """Take items away from a failing point, or put nominal's back, as long as it fails.
 
     **Arguments:**
-
     - `candidates`: simulates, and remembers what failed.
-    - `u`: the failing point.
-
     **Returns:** the failing point with the least difference in items from nominal that was found.
     """
     nominal = candidates.nominal

@@ -35,12 +35,9 @@ def select_row(run: Run, row: Row) -> tuple[int, dict[str, Any]]:
     """Select a counterexample of a run.
 
     **Arguments:**
-
     - `run`: a run with a counterexample.
     - `row`: its number, or a row of the table; the worst where it is None.
-
     **Returns:** its number, and the entries of its row by column.
-
     **Raises:** `ValueError` for a run without a counterexample, or a row that is none; `TypeError`
     or `IndexError` for anything that is not a row of the table.
     """

@@ -54,7 +54,6 @@ class Shrunk(Drawn, InNotebook):
 
     _picture = "counterexamples", "plot_shrunk"
     """The coordinates that depart, and the signal that breaks the property."""
-
     problem: Problem
     row: int
     features: dict[str, Any]

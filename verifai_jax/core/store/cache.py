@@ -25,7 +25,6 @@ from verifai_jax.core.store.locks import write_lock
 from verifai_jax.core.store.log import Arrays, Log
 
 log = logging.getLogger("verifai_jax.cache")
-
 _NOTE = "note:"
 """What the names of notes begin with."""
 _ABOUT = "about"
@@ -40,11 +39,9 @@ class Cache:
     """Finished work on disk.
 
     **Arguments:**
-
     - `folder`: in which it is the file `sweep.cache` for a sweep; None keeps everything in this
       process only.
     - `kind`: of the work: `"sweep"` or `"augmentation"`.
-
     **Raises:** `CacheError` for a file that is not a cache, or damaged.
     """
 
@@ -74,14 +71,11 @@ class Cache:
         """Record the work that this cache belongs to, or refuse the cache of other work.
 
         **Arguments:**
-
         - `fingerprint`: nested dictionaries of plain data.
         - `sources`: what the work is made of; finished work of other files is refused too.
         - `even_if_changed`: whether work of other files will do; it is recorded then.
-
         **Returns:** what the work was made of when it began, and each time it went on with other
         files; nothing without `sources`.
-
         **Raises:** `CacheError` with the differences.
         """
         given = json.loads(json.dumps(fingerprint))

@@ -19,7 +19,6 @@ from verifai_jax.core.text import one_line
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
 _CHECKSUM = "checksum"
 """Entry of a record with the checksum of the others."""
 
@@ -56,12 +55,10 @@ def replacing_all(folder: Path, names: Sequence[str]) -> Iterator[Path]:
     So a full disk leaves what was there, and nothing of what was to come.
 
     **Arguments:**
-
     - `folder`: which is there, and has no other writer.
     - `names`: the names of all files and folders that belong together, also those that may be
       missing. The last one is that without which the others are worth nothing: it goes first and
       comes last.
-
     **Raises:** `OSError` that names `folder`, for whatever the file system refuses.
     """
     *others, last = names

@@ -23,7 +23,6 @@ try:
     import fcntl
 except ImportError:
     fcntl = None
-
 LOCK = "writer.lock"
 """Name of the file in a folder that is being written."""
 _NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}
@@ -64,7 +63,12 @@ def write_lock(folder: Path | None) -> Iterator[None]:
         yield
     finally:
         if file is not None and os.getpid() == owner:
-            _release(file, folder / LOCK)
+            path = folder / LOCK
+            _held.discard(file)
+            # While it is held: whoever opened the file before finds that it is another one's.
+            with contextlib.suppress(OSError):
+                path.unlink()
+            file.close()
 
 
 @contextlib.contextmanager
@@ -77,14 +81,6 @@ def writing(folder: Path | None) -> Iterator[None]:
             f"folder {str(folder)!r} cannot be written ({reason(error)}); give one that "
             "can be, or none to keep the results in memory"
         ) from error
-
-
-def _release(file: FileIO, path: Path) -> None:
-    _held.discard(file)
-    # While it is held: whoever opened the file before finds that it is another one's.
-    with contextlib.suppress(OSError):
-        path.unlink()
-    file.close()
 
 
 def _acquire(folder: Path) -> FileIO | None:

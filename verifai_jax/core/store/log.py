@@ -31,7 +31,6 @@ from verifai_jax.core.store.files import DamagedError, checksum, write_complete
 
 Arrays: TypeAlias = Mapping[str, np.ndarray]
 """An entry: arrays of numbers or texts, by name."""
-
 MARK = b"VJX1"
 """First bytes of each frame."""
 HEADER = struct.Struct("<4sIQI")
@@ -48,7 +47,6 @@ class Log:
     """The entries of a file; see the module's docstring.
 
     **Arguments:**
-
     - `path`: the file, which is made when the first entry is put; None keeps them in this process.
     """
 

@@ -45,7 +45,6 @@ MAX_KEPT = 1000
 """Counterexamples of a policy that are kept, the worst ones."""
 ROWS = 256
 """Rows whose features are computed at a time, so that one shape compiles."""
-
 ProgressReport = Callable[[int, int, str], None]
 
 
@@ -71,7 +70,6 @@ def certify(
     """Attack all policies, then bound the failure probability of each from fresh samples.
 
     **Arguments:**
-
     - `problem_of`: a policy's `Problem`. JAX traces it with the policy's numbers as arguments, so
       that policies of one structure share a program; where it cannot, each is compiled by itself.
     - `policies`: `rl.Policy` objects, or other pytrees of numbers.
@@ -336,11 +334,8 @@ def repeat_failures(
     One for 25 simulations or 32 of them, and up to 1024 where one has not come again.
 
     **Arguments:**
-
     - `blocks`: that simulate the policies.
-    - `policy`: its number.
     - `sampled`, `attacked`: its simulations, whose verdicts are replaced.
-
     **Returns:** the counts, which as text say what that means of the system.
     """
     rows = [

@@ -89,7 +89,6 @@ def attack_policies(
     """Attack every policy in rounds of one block each, and add the simulations to `records`.
 
     **Arguments:**
-
     - `blocks`: simulates the policies.
     - `records`: one of each policy.
     - `search`: the search of each policy.

@@ -37,7 +37,6 @@ from verifai_jax.search.uniform import uniform_points
 
 Arrays = Mapping[str, np.ndarray]
 Remember = Callable[[str, Callable[[], dict[str, np.ndarray]]], Arrays]
-
 STREAM = 0x5AFE
 """Sets the random numbers of a certificate apart from those of a training with the same seed."""
 DRAWN = 4096
@@ -69,14 +68,12 @@ class Blocks:
     `sources` is the record of the model that they are simulated with.
 
     **Arguments:**
-
     - `problem_of`: a policy's problem; JAX traces it where it can.
     - `policies`: any pytrees of numbers, or other objects, which are then simulated one by one.
     - `seed`: the seed of the samples and of the random keys of simulations.
     - `lanes`: samples in a block.
     - `devices`: JAX devices to use; all of this process when left out.
     - `executor`: whose workers simulate; this process when left out.
-
     **Raises:** `ProblemError` as `Problem.check` does, naming the policy, before anything compiles;
     `ValueError` for policies whose problems have other features than the first.
     """
@@ -196,13 +193,8 @@ class Blocks:
         """Simulate rows of a policy on the host once more.
 
         **Arguments:**
-
-        - `policy`: its number.
-        - `points`: the points of the rows.
         - `numbers`: the numbers of the simulations, which their random keys come from.
         - `of_attack`: whether they are simulations of the attack, or samples.
-        - `attempt`: number of the repetition.
-
         **Returns:** the least robustness of each, NaN without a verdict; and whether it fails.
         """
 
@@ -247,7 +239,9 @@ class Blocks:
                     ]
                     found = self._simulate(owner, [blocks[j] for j in some], key)
                     ready.update(zip(some, found, strict=True))
-                return _to_memo(ready.pop(i))
+                verdicts = ready.pop(i)
+                lowest = np.where(verdicts.proper, verdicts.lowest, np.nan).astype(np.float32)
+                return {"rho": lowest, "failing": verdicts.violated, "proper": verdicts.proper}
 
             yield i, _from_memo(self._remember(block.name, compute), len(block.points))
 
@@ -345,11 +339,6 @@ class _Samples:
 
     def accepted(self, u: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
         return np.asarray(self._space.accepts_points(u))
-
-
-def _to_memo(verdicts: Verdicts) -> dict[str, np.ndarray]:
-    lowest = np.where(verdicts.proper, verdicts.lowest, np.nan).astype(np.float32)
-    return {"rho": lowest, "failing": verdicts.violated, "proper": verdicts.proper}
 
 
 def _from_memo(known: Arrays, count: int) -> Verdicts:

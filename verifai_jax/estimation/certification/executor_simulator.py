@@ -16,15 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt32
 
-from verifai_jax.core.executors import (
-    SECONDS,
-    Executor,
-    Shipment,
-    check_executor,
-    count_workers,
-    gather,
-    seconds_per_block,
-)
+from verifai_jax.core import executors
 from verifai_jax.core.keys import as_key
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.estimation.certification.policy_groups import PolicyGroup
@@ -48,7 +40,6 @@ class ExecutorSimulator:
     """Policies of one structure, or each by itself, on workers; see the module's docstring.
 
     **Arguments:**
-
     - `shipment`: with `problem_of`.
     - `policies`: as a worker simulates them, those of one structure already padded.
     - `structure`: the structure of the policies that share a program; None for those simulated by
@@ -62,14 +53,14 @@ class ExecutorSimulator:
 
     def __init__(
         self,
-        shipment: Shipment[Callable[[Any], Problem]],
+        shipment: executors.Shipment[Callable[[Any], Problem]],
         policies: Sequence[Any],
         structure: str | None,
         lanes: int,
         dim: int,
-        executor: Executor,
+        executor: executors.Executor,
     ) -> None:
-        check_executor(executor)
+        executors.check_executor(executor)
         self.lanes, self.messages = lanes, dict[int, str]()
         self._shipment, self._policies, self._structure = shipment, policies, structure
         self._dim, self._executor = dim, executor
@@ -79,7 +70,7 @@ class ExecutorSimulator:
 
     def blocks_per_call(self) -> int:
         """Return the number of blocks that keep all workers busy for a while."""
-        return 3 * count_workers(self._executor) * self._each
+        return 3 * executors.count_workers(self._executor) * self._each
 
     def __call__(
         self,
@@ -90,7 +81,7 @@ class ExecutorSimulator:
     ) -> list[Verdicts]:
         """Return the verdicts of the blocks, in order; arguments as of `simulators.Simulator`."""
         words = np.asarray(jax.random.key_data(key))
-        share = -(-len(members) // count_workers(self._executor))
+        share = -(-len(members) // executors.count_workers(self._executor))
         step = max(1, min(self._each, share))
         parts, futures = [], []
         for start in range(0, len(members), step):
@@ -112,17 +103,17 @@ class ExecutorSimulator:
             for number, message in result["messages"].items():
                 self.messages.setdefault(number, message)
             each = result["seconds"] / max(len(found[index]), 1)
-            wanted = seconds_per_block(self._executor)
-            maximum = MAX_BLOCKS_PER_SECOND * max(1, int(wanted / SECONDS))
+            wanted = executors.seconds_per_block(self._executor)
+            maximum = MAX_BLOCKS_PER_SECOND * max(1, int(wanted / executors.SECONDS))
             self._each = max(1, min(maximum, int(wanted / max(each, 1e-9))))
 
-        gather(futures, ended)
+        executors.gather(futures, ended)
         return [verdicts for index in range(len(parts)) for verdicts in found[index]]
 
 
 @truncate_silently()
 def simulate_blocks(
-    shipment: Shipment[Callable[[Any], Problem]],
+    shipment: executors.Shipment[Callable[[Any], Problem]],
     structure: str | None,
     lanes: int,
     dim: int,
@@ -137,7 +128,6 @@ def simulate_blocks(
 
     **Arguments:** as of `ExecutorSimulator`, with the `policies` of these blocks by their numbers,
     and a `name` that sets policies by themselves apart from those of other simulators.
-
     **Returns:** `rho`, `status` and `violated` of each block; `messages` by policy; `seconds`.
     """
     indices = {number: index for index, (number, _) in enumerate(policies)}
@@ -160,7 +150,7 @@ def simulate_blocks(
 
 
 def _separate(
-    shipment: Shipment[Callable[[Any], Problem]],
+    shipment: executors.Shipment[Callable[[Any], Problem]],
     policies: Sequence[tuple[int, Any]],
     lanes: int,
     name: str,

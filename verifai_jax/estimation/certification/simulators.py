@@ -49,9 +49,7 @@ class Simulator(Protocol):
         """Return the verdicts of the blocks, in order.
 
         **Arguments:**
-
         - `members`: the index in the group of each block's policy.
-        - `points`: the samples of each block.
         - `first`: the number of the first sample of each block, from which its random keys are
           made.
         - `key`: the key of all simulations.

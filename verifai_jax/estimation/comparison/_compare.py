@@ -65,7 +65,6 @@ def compare(
     whenever sampling stops, and for several candidates together.
 
     **Arguments:**
-
     - `baseline`: the problem to compare with: itself, `FILE.py:NAME`, or `FILE.py:NAME@REVISION`
       for the problem as it was at a revision of git.
     - `candidates`: another one that varies the same features, or several by name. What is held,
@@ -78,9 +77,7 @@ def compare(
     - `precision`: as in `falsify`.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
     - `executor`: whose workers simulate, as in `falsify`; the comparison is the same.
-
     **Returns:** the comparison; after Ctrl-C that of the finished pairs.
-
     **Raises:** before anything is simulated, `TypeError` for anything but a `Problem`;
     `ProblemError` for other features that vary; `ValueError` for numbers out of range, and for
     targets that cannot be loaded.

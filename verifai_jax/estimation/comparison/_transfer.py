@@ -34,7 +34,6 @@ from verifai_jax.search.proposals import Proposals
 from verifai_jax.search.uniform import Uniform
 
 Made: TypeAlias = Problem | Callable[[Any], Problem]
-
 NUDGE = 2.0**-22
 """Part of the cube by which a sample is moved to see how rounding grows: the rounding of a feature
 in single precision. Simulations run in double precision, whose own rounding is far smaller."""
@@ -72,7 +71,6 @@ def transfer(
     a move of the features by one rounding of single precision makes in the same engine.
 
     **Arguments:**
-
     - `policy`: given to both problems; None if they have it already.
     - `problem_a`, `problem_b`: a function from the policy to a `Problem`, or a `Problem`. Features
       that both have, with the same domains, are varied; all others are held at their nominal
@@ -86,9 +84,7 @@ def transfer(
     - `batch`: pairs at once.
     - `precision`: the precision of the simulations.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Returns:** a `Transfer` with the table of all pairs.
-
     **Raises:** before anything is simulated, `ProblemError` for problems without a common feature
     or signal; `TypeError` for anything but a `Problem`; `ValueError` for numbers out of range
     and a search that needs gradients.

@@ -2,12 +2,12 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Array, Key
 
+from verifai_jax.core.figure import Drawn, Reported
 from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook, picture_html
@@ -18,7 +18,6 @@ from verifai_jax.statistics.paired_rates import PairedRates
 
 if TYPE_CHECKING:
     import pandas as pd
-
 WORSE, BETTER, SAME, UNDECIDED = "worse", "better", "the same", "undecided"
 """Verdicts on the second of two problems."""
 
@@ -79,7 +78,7 @@ class Compared:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison(InNotebook):
+class Comparison(Reported, InNotebook):
     """Candidates against a baseline on common samples, as `compare` returns them.
 
     - `baseline`: its name.
@@ -123,18 +122,6 @@ class Comparison(InNotebook):
         """True where a candidate is worse by more than the margin."""
         return any(candidate.verdict == WORSE for candidate in self.candidates)
 
-    def report(self, path: str | Path, **options: Any) -> Path:
-        """Write the evidence report on the comparison as HTML, and its claims as JSON.
-
-        **Arguments:**
-
-        - `path`: the path of the HTML file.
-        - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`, `errors`.
-
-        **Returns:** the path.
-        """
-        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
-
     def __str__(self) -> str:
         confidence = self.candidates[0].rates.confidence
         together = ""
@@ -171,7 +158,7 @@ def judge(rates: PairedRates, margin: float) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Transfer(InNotebook):
+class Transfer(Drawn, Reported, InNotebook):
     """The same policy in two engines, `a` and `b`, as `transfer` returns it.
 
     - `names`: the names of the two problems.
@@ -190,6 +177,8 @@ class Transfer(InNotebook):
     - `sources`: what each was made of, as a run records it.
     """
 
+    _picture = "transfer", "plot_transfer"
+    """The pair that parts most, and the gaps of all by the feature that matters most."""
     names: tuple[str, str]
     table: "pd.DataFrame" = field(repr=False)
     space: FeatureSpace = field(repr=False)
@@ -225,29 +214,6 @@ class Transfer(InNotebook):
         rows: Any = self.table[self.table["proper"]]
         rows = rows.assign(violated=rows.index.isin(self.flips.index), rho=-rows["gap"])
         return _rules(rows, self.space, options)
-
-    def report(self, path: str | Path, **options: Any) -> Path:
-        """Write the evidence report as HTML, and its claims as JSON.
-
-        **Arguments:**
-
-        - `path`: the path of the HTML file.
-        - `options`: the options of `reports.write_report`: `units`, `reasons`.
-
-        **Returns:** the path.
-        """
-        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
-
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Draw the pair that parts most, and the gaps of all by the feature that matters most.
-
-        **Arguments:**
-
-        - `path`: the picture that is written; none when left out.
-
-        **Returns:** the figure.
-        """
-        return lazy_import("verifai_jax.reports.plotting.transfer", "plot_transfer")(self, path)
 
     def _notebook_parts(self) -> Iterable[str]:
         yield picture_html(self.plot())

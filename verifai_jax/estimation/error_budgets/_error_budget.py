@@ -45,7 +45,6 @@ RADII = (0.01, 0.1, 1.0)
 """Divergences in nats for which the worst probability is shown."""
 FINEST = 4
 """The step is divided by that; an error of first order or better shrinks by as much at least."""
-
 Judged = tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]
 """Which samples fail, and which have a verdict."""
 Number = Estimate | Rate | Certificate | Compared
@@ -68,7 +67,6 @@ def error_budget(
     """Say how wrong a probability can be, part by part, and how far the prior may be wrong.
 
     **Arguments:**
-
     - `problem`: that was simulated; of a comparison the candidate, of a certificate the policy's.
     - `result`: an estimate, a rate (`run.failure_rate`), a certificate, or a candidate of a
       comparison, `comparison["NAME"]`.
@@ -82,9 +80,7 @@ def error_budget(
       the upper end (0 of a difference).
     - `seed`: the seed of the pairs: other samples than those of the result.
     - `confidence`: with which all intervals hold together.
-
     **Returns:** the `ErrorBudget`.
-
     **Raises:** `TypeError` for another result; `ValueError` for options out of range, a comparison
     without its baseline, and solvers with other features or formulas.
     """

@@ -83,7 +83,6 @@ def modes(
     """Find every mode of failure, with its probability under the prior of the features.
 
     **Arguments:**
-
     - `source`: a problem, or a run of one, whose failures are looked at too.
     - `budget`: simulations at most; one with its gradient counts 2.
     - `batch`: simulations at once.
@@ -93,11 +92,9 @@ def modes(
     - `precision`, `backend`: as in `falsify`.
     - `max_seconds`: wall-clock seconds after which what is finished is divided into modes.
     - `progress`: True draws a progress bar, False none; None draws one on a terminal.
-
     **Returns:** the modes, the most probable first; empty if no failure was found or failures
     could not be weighed, and a note says so. Where the system draws random numbers, probabilities
     are over these too, and each mode holds the random key under which its likeliest failure fails.
-
     **Raises:** `TypeError` for something that is not a problem or run; `ValueError` for options out
     of range, or a run that was loaded without its problem.
     """

@@ -35,7 +35,6 @@ TYPICAL = 0.5
 FOLLOWED = 300
 """Failures of which those that fail under a held key are followed to their regions, at most; they
 are simulated in a fourth of the budget."""
-
 Held = Callable[[int, int], LimitState]
 """From the number of a random key and a budget to the limit state under that key."""
 
@@ -91,13 +90,10 @@ def divide_under_keys(
     """Find the failing regions of a system that draws, within what is left of a budget.
 
     **Arguments:**
-
     - `held`: the limit state under a key.
     - `samples`: weighted samples, of which there are failures.
     - `starts`: further points to begin from.
-
     **Returns:** the regions, None without any.
-
     **Raises:** `Ended` where time is over.
     """
     x = samples.x[samples.failing]
@@ -158,10 +154,7 @@ def _likeliest_of(
 
 
 def _choose_keys(
-    limit_state: LimitState,
-    held: Held,
-    keys: Int[np.ndarray, " k"],
-    z: Float[np.ndarray, "n d"],
+    limit_state: LimitState, held: Held, keys: Int[np.ndarray, " k"], z: Float[np.ndarray, "n d"]
 ) -> list[int]:
     """Choose keys of failures so that nearly all of these fail under one; see the module."""
     fails: dict[int, Bool[np.ndarray, " n"]] = {}

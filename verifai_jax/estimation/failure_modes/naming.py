@@ -45,10 +45,8 @@ def name_mode(failures: pd.DataFrame, prior: pd.DataFrame) -> str:
     """Name a mode by conditions on the features that vary.
 
     **Arguments:**
-
     - `failures`: features of failures of the mode, one a row.
     - `prior`: features of samples of the prior.
-
     **Returns:** the conditions, the one that fewest samples of the prior fulfil first; `"anywhere"`
     without one that tells the failures apart.
     """
@@ -84,10 +82,7 @@ def _conditions(
     values = np.concatenate([own, others[np.isfinite(others)]])
     if np.all(values == np.round(values)):
         # The lower end is not included: it is the next smaller number.
-        return [
-            Between(name, above=low - 1, integer=True),
-            Between(name, upto=high, integer=True),
-        ]
+        return [Between(name, above=low - 1, integer=True), Between(name, upto=high, integer=True)]
     return [Between(name, above=_short(low, -1)), Between(name, upto=_short(high, 1))]
 
 

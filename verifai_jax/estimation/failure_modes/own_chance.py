@@ -46,7 +46,6 @@ def divide_by_chance(
     """Find the failing regions of a system with chance of its own, within what is left of a budget.
 
     **Arguments:**
-
     - `limit_state`: the limit state; a part of its budget is kept for the answer.
     - `samples`: weighted samples, of which there are failures.
     """

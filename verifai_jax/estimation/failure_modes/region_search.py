@@ -49,11 +49,9 @@ def find_regions(
     """Find the failing regions that weighted failures lie in.
 
     **Arguments:**
-
     - `z`: failures `[n, d]`.
     - `share`: the part `[n]` of the failure probability that each stands for, of sum one.
     - `nearest`: further failures `[m, d]`, such as those of searches.
-
     **Raises:** `Ended` where time is over, and where the budget is before a region was found.
     """
     regions = Regions(np.zeros((0, limit_state.dim)), np.zeros(0, int))

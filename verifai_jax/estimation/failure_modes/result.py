@@ -87,10 +87,8 @@ class Mode(InNotebook):
         """Draw the likeliest failure as an animated GIF.
 
         **Arguments:**
-
         - `path`: a file that is written too; none when left out.
         - `options`: `camera`, `size` and `fps`, as in `Replay.animate`.
-
         **Raises:** as `Replay.animate`.
         """
         return self.replay().animate(path, **options)
@@ -159,7 +157,6 @@ class Modes(Drawn, InNotebook):
 
     _picture = "modes", "plot_modes"
     """The probabilities with their intervals, and the failures of each mode."""
-
     name: str
     modes: tuple[Mode, ...]
     probability: float | None

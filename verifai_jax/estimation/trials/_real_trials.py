@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from verifai_jax.core.executors import Executor
-
 UNLIKELY = 1e-3
 """Probability below which trials are not taken for samples of the prior."""
 MIN_TRIALS = 10
@@ -57,7 +56,6 @@ def real_trials(
     many trials or fewer give an interval as short as that of Clopper and Pearson.
 
     **Arguments:**
-
     - `problem`: the simulation. The prior of its features is the distribution of the trials.
     - `trials`: the path of a CSV or Parquet file, or a data frame: a column for each feature as in
       the table of a run, and `failed` (yes or no; empty where a trial may have failed), or
@@ -70,9 +68,7 @@ def real_trials(
     - `at_any_time`: verdicts decided which trials were made, or when to stop.
     - `time`, `dt`: of recordings, as `mtl.read` takes them.
     - `precision`, `executor`, `progress`: as in `falsify`.
-
     **Returns:** the result, with the table of trials and predictions.
-
     **Raises:** `FileNotFoundError`; `ValueError` for tables without a verdict or a feature,
     features outside their domains, and options out of range; what `falsify` raises.
     """

@@ -27,7 +27,6 @@ from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
-
 POSTERIOR = 1000
 """Samples of the posterior that are returned."""
 TAIL = 1e-3
@@ -80,16 +79,13 @@ def calibrate(
     """Find values of features that make the simulation agree with trials.
 
     **Arguments:**
-
     - `problem`: the simulation.
     - `trials`: a table with the other features, and `failed` as in `real_trials`; a column
       `robustness` of measured values is used instead, where there is one.
     - `features`: names of the features that the trials had in common and nobody measured.
     - `simulations`: all of them; each draw of values takes as many as there are trials.
     - `seed`: the seed of the draws.
-
     **Returns:** the posterior, and the problem with it.
-
     **Raises:** `ValueError` for no or an unknown feature, one that is no single number, a table
     without a verdict, and fewer simulations than 20 draws take; what `simulate` raises.
     """

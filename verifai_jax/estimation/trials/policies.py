@@ -88,7 +88,6 @@ def compare_trials(
     """Compare two policies by pairs of real trials, after any pair.
 
     **Arguments:**
-
     - `trials`: a table with the columns `pair`, `policy` and `failed` (yes, no, or empty), such as
       the one that `trial_protocol` makes; pairs of which a trial is missing are left out.
     - `baseline`, `candidate`: the policies' names.
@@ -96,7 +95,6 @@ def compare_trials(
       trials name a policy by its code.
     - `margin`: difference of failure rates that does not matter, from 0 on.
     - `confidence`: probability with which the verdict holds, whenever one stops.
-
     **Raises:** `FileNotFoundError`; `ValueError` for missing columns, an unknown policy, a pair
     that has a policy twice, no complete pair, and numbers out of range.
     """

@@ -20,7 +20,6 @@ from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
-
 STYLE = """body{font:10pt sans-serif;margin:1.5cm}table{border-collapse:collapse;width:100%}
 td,th{border:1px solid #888;padding:4px 6px;text-align:left}thead{display:table-header-group}
 tr{page-break-inside:avoid}"""
@@ -51,16 +50,13 @@ def trial_protocol(
     in `_key.csv`.
 
     **Arguments:**
-
     - `problem`: its features are drawn from the prior; its formulas are the property.
     - `path`: the path of the HTML file.
     - `count`: number of trials, or of pairs.
     - `policies`: names of two policies to compare.
     - `trials`: features of the trials instead, such as those of `next_trials`.
     - `seed`: the seed of the features, the order and the codes.
-
     **Returns:** the table.
-
     **Raises:** `ValueError` for a number of policies other than none or two; `OSError` where a file
     cannot be written.
     """

@@ -13,10 +13,8 @@ from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
-
 TrialTable: TypeAlias = "str | Path | pd.DataFrame"
 """Trials: the path of a CSV or Parquet file, or a data frame, with a row for each."""
-
 FAILED, RECORDING = "failed", "recording"
 """Columns that say whether a trial failed, or which recording says so."""
 WORDS = {
@@ -33,14 +31,11 @@ def read_trials(
     """Read trials, and judge those that have a recording instead of a verdict.
 
     **Arguments:**
-
     - `problem`: its features are columns of the table; its formulas judge recordings.
     - `trials`: a file or a data frame.
     - `time`, `dt`: of recordings, as `mtl.read` takes them.
-
     **Returns:** the features with a column `failed` of True, False or None (undecided), and why
     recordings have no verdict, with how many.
-
     **Raises:** `FileNotFoundError`; `ValueError` for no trial, a table without a verdict or without
     a feature, and for a verdict that is none.
     """

@@ -75,9 +75,7 @@ class RealTrials(InNotebook):
         """Describe by a few boxes of the features where the simulation is wrong; see `vj.rules`.
 
         **Arguments:**
-
         - `options`: the options of `analysis.rules`.
-
         **Raises:** `ValueError` where all predictions are right, or all wrong.
         """
         columns = list(self.problem.space.columns)
@@ -94,10 +92,8 @@ class RealTrials(InNotebook):
         `at_any_time=True` if you stop in between.
 
         **Arguments:**
-
         - `count`: number of trials.
         - `seed`: the seed of the draw.
-
         **Returns:** the features, `predicted` and the simulated `robustness` of each.
         """
         check_count("count", count)

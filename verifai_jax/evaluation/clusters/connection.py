@@ -30,11 +30,9 @@ def connect(address: str) -> Iterator[Executor]:
     """Connect to a cluster for as long as the context lasts.
 
     **Arguments:**
-
     - `address`: `dask://HOST:PORT` of a scheduler; `ray://HOST:PORT` of a head node's client
       server, or `ray://auto` for the cluster that this machine is part of; `slurm`, with parameters
       of submitit where they are wanted: `slurm?slurm_partition=cpu&timeout_min=60&jobs=32`.
-
     **Raises:** `ValueError` for another address; `MissingExtra` where the package is not installed;
     `OSError` where there is no cluster.
     """
@@ -96,7 +94,6 @@ class _RayFuture(concurrent.futures.Future):
         reference.future().add_done_callback(self._finish)
 
     def cancel(self) -> bool:
-        """Take the task out of Ray's queue."""
         if self.done():
             return False
         self._ray.cancel(self._reference)
@@ -115,12 +112,10 @@ class RayExecutor:
     """`concurrent.futures`' `submit` on a cluster of Ray.
 
     **Arguments:**
-
     - `address`: the address of the cluster, as of `ray.init`; the one that Ray is connected to
       already, or else a new one on this machine, when left out.
     - `cpus`: cores that a block takes.
     - `gpus`: GPUs that a block takes.
-
     **Raises:** `MissingExtra` where Ray is not installed; what Ray raises where it cannot connect.
     """
 

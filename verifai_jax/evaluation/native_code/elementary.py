@@ -32,7 +32,6 @@ OPERATORS = {
     "exp2": "exponential({} * 0.693147180559945309f)",
 }
 """C operators, of vectors and single numbers."""
-
 FUNCTIONS = {
     "max": "greater({}, {})",
     "min": "lesser({}, {})",
@@ -72,9 +71,7 @@ FUNCTIONS = {
 }
 """Functions of the prelude, whose operands are all vectors or all single numbers. Bounds are
 constants: the first operand, or the first and the last."""
-
 COMPARISONS = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
-
 _FOLDED: dict[str, Callable[..., Any]] = {
     "add": np.add,
     "sub": np.subtract,
@@ -112,11 +109,9 @@ def expression(name: str, params: Params, kinds: list[str], out: str) -> tuple[s
     """Return the template of an operation, and whether its operands must be alike.
 
     **Arguments:**
-
     - `name`, `params`: of the primitive.
     - `kinds`: the kinds of its operands.
     - `out`: the kind of its result.
-
     **Raises:** `Untranslatable` for an unknown one.
     """
     if name in OPERATORS:

@@ -84,9 +84,7 @@ def library_name(fingerprint: str | None) -> str:
     """Return the name of the library of a program, by all that it depends on.
 
     **Arguments:**
-
     - `fingerprint`: the fingerprint of the program; None if it has none.
-
     **Raises:** `Unavailable` where there is no compiler, no cache folder, or no fingerprint.
     """
     tool = compiler()
@@ -102,12 +100,10 @@ def load(name: str, count: int, translate: Callable[[], str], quickly: bool = Fa
     """Return the library of this name, compiled where there is none.
 
     **Arguments:**
-
     - `name`: as `library_name` gives it.
     - `count`: numbers that a simulation returns.
     - `translate`: makes the source.
     - `quickly`: whether to compile in half the time, for reverse sweeps.
-
     **Raises:** `Unavailable` where it cannot be compiled, kept or loaded.
     """
 

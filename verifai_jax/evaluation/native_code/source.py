@@ -13,15 +13,8 @@ from verifai_jax.evaluation.native_code import control_flow as control_flow
 from verifai_jax.evaluation.native_code import indexing as indexing
 from verifai_jax.evaluation.native_code import randomness as randomness
 from verifai_jax.evaluation.native_code import sums as sums
+from verifai_jax.evaluation.native_code import values
 from verifai_jax.evaluation.native_code.translation import Translator
-from verifai_jax.evaluation.native_code.values import (
-    Element,
-    Memory,
-    Program,
-    Untranslatable,
-    elements,
-    kind_of,
-)
 
 PRELUDE = Path(__file__).with_name("prelude.hpp").read_text()
 """The beginning of every program."""
@@ -31,35 +24,31 @@ CACHE = 2**18
 """Bytes of a core's cache that the arrays of a block should fit into."""
 
 
-def translate(program: Program) -> str:
+def translate(program: values.Program) -> str:
     """Translate a program of one simulation.
 
     **Arguments:**
-
     - `program`: a closed `Jaxpr` of the row `[d]`, the words `[2]` of a random key, the number of
       the simulation, a temperature, and numbers `[n]` that all share; it returns a vector of bits.
-
-    **Returns:** the source.
-
     **Raises:** `Untranslatable` for a program with a part that is unknown.
     """
     used = without_unused(program.jaxpr, [True] * len(program.jaxpr.outvars))
     t = Translator()
     rows, _, _, _, numbers = used.invars
-    if [kind_of(each.aval.dtype) for each in used.invars] != ["f", "u", "i", "f", "f"]:
-        raise Untranslatable("a program of other inputs")
+    if [values.kind_of(each.aval.dtype) for each in used.invars] != ["f", "u", "i", "f", "f"]:
+        raise values.Untranslatable("a program of other inputs")
     d = rows.aval.shape[0]
     row = np.empty(d, object)
     for i in range(d):
         row[i] = t.code.define(f"column(rows + {i}, {d}, at + k * W, end)", "f", False)
     words = np.empty(2, object)
-    words[:] = [Element(f"key[{i}]", "u", True) for i in range(2)]
+    words[:] = [values.Element(f"key[{i}]", "u", True) for i in range(2)]
     number = t.code.define("first + (int)(at + k * W) + lanes()", "i", False)
     temperature = t.code.define("column(temperatures, 1, at + k * W, end)", "f", False)
-    shared = Memory("numbers", "f", True, numbers.aval.shape)
+    shared = values.Memory("numbers", "f", True, numbers.aval.shape)
     results = t.program(used, program.consts, [row, words, one(number), one(temperature), shared])
     (packed,) = results
-    for i, each in enumerate(elements(packed)):
+    for i, each in enumerate(values.elements(packed)):
         text = f"wide({each.text})" if each.uniform else each.text
         t.line(f"give({text}, out + {i} * total, at + k * W, end);")
     lines, arena = t.code.body()
@@ -71,7 +60,7 @@ def translate(program: Program) -> str:
     return "\n".join([head, PRELUDE, _HEAD, *t.code.globals, function])
 
 
-def one(element: Element) -> np.ndarray:
+def one(element: values.Element) -> np.ndarray:
     """Return an array of no axes."""
     out = np.empty((), object)
     out[()] = element
@@ -97,7 +86,6 @@ INLINE void give(U bits, unsigned *to, long at, long end) {
   else for (int l = 0; at + l < end; l++) to[at + l] = bits[l];
 }
 """
-
 _FUNCTION = r"""
 extern "C" int width() { return K * W; }
 /* Rows `begin` to `end` of a total; each result in a row of its own. 1: there is no memory. */

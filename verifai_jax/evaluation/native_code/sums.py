@@ -26,7 +26,6 @@ PRODUCTS = 512
 """Products up to which a matrix product is written out: more make a compiler slow."""
 SIDE = 8
 """Rows of a matrix that a loop multiplies at the same time."""
-
 _JOINED = {
     "reduce_sum": "add",
     "reduce_prod": "mul",

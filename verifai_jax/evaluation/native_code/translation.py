@@ -41,7 +41,6 @@ LONG = 300
 """Characters of an expression up to which it is computed where it is used."""
 SINGLE = 32
 """Elements of an array up to which each is a variable of its own."""
-
 Rule = Callable[["Translator", Equation, list[Value]], list[Value]]
 RULES: dict[str, Rule] = {}
 """How each primitive is translated that is not elementary."""

@@ -89,7 +89,6 @@ Number: TypeAlias = np.generic | float
 Elements: TypeAlias = Any
 """An object array of elements; those of random keys are pairs of elements."""
 Value: TypeAlias = Elements | Memory
-
 _NAME = re.compile(r"\b[a-z]+\d+\b")
 TYPES = {"f": ("F", "float"), "i": ("I", "int"), "u": ("U", "unsigned"), "b": ("I", "int")}
 """C types of each kind: of a vector, and of a single number."""
@@ -161,11 +160,6 @@ def same(value: Elements) -> Any:
     flat = value.ravel()
     first = flat[0] if flat.size else None
     return first if all(each is first for each in flat) else None
-
-
-def shape_of(value: Value) -> tuple[int, ...]:
-    """Return the shape of a value."""
-    return value.shape
 
 
 def names_in(value: Value) -> Iterator[str]:

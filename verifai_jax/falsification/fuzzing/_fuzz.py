@@ -50,7 +50,6 @@ def fuzz(
     """Look for failures by covering what can happen, with or without formulas.
 
     **Arguments:**
-
     - `problem`: a problem with formulas; or none, with `space` and `system` in its place.
     - `budget`: simulations at most.
     - `space`, `system`: what varies and what is simulated, where there is no formula. A simulation
@@ -68,7 +67,6 @@ def fuzz(
 
     **Returns:** the run: `run.coverage` says what was covered of how much, `run.corpus` has the
     rows that extended it, and `run.problem` the implicit properties.
-
     **Raises:** `ValueError` for ranges or cells that are none, both or neither of a problem and a
     space with a system; as `falsify`.
     """

@@ -28,22 +28,16 @@ FINITE = "finite"
 """The signal that is positive where all signals are finite, and its property."""
 COMPLETED = "completed"
 """The signal that is positive in a simulation that ended properly, and its property."""
-
 RANGE = "range_"
 """Beginning of the name of the property that a signal stays in its range."""
-
 HOLDS = 1e6
 """The value of these signals where all is well: more than any formula's robustness, which leads."""
-
 Ranges = Mapping[str, tuple[float, float]]
 """The range within which each signal must stay."""
-
 Cells = Mapping[str, tuple[float, float, int]]
 """For each signal the low and the high end of its cells, and their number."""
-
 CELLS_OF_A_RANGE = 4
 """Default number of cells of a signal with a range."""
-
 MAX_CUT = 4
 """Signals with ranges that are divided into cells by default, at most."""
 
@@ -52,7 +46,6 @@ class CheckedSystem(System):
     """A system whose traces say whether it ended properly, with finite signals.
 
     **Arguments:**
-
     - `system`: the system.
     - `ranges`: the ranges of signals; numbers that are not finite are replaced by the middle, as
       they are reported anyway.
@@ -79,7 +72,6 @@ class CheckedSystem(System):
         self.backends, self.backend, self.likely = system.backends, system.backend, system.likely
 
     def why_slow_to_compile(self, gradient: bool) -> str:
-        """Say what the system says."""
         return self.system.why_slow_to_compile(gradient)
 
     @property
@@ -256,11 +248,9 @@ def as_recorded(problem: Problem, derived: Mapping[str, Any]) -> Problem:
     """Return a problem with the implicit properties that a run of `fuzz` recorded.
 
     **Arguments:**
-
     - `problem`: with its own formulas alone; for a run without any its name, its space and its
       system count.
     - `derived`: `CheckedSystem.derived` of the run.
-
     **Raises:** `ValueError`, `TypeError`, `KeyError` for a record that describes no such problem.
     """
     ranges = {name: (low, high) for name, (low, high) in derived["ranges"].items()}

@@ -89,7 +89,6 @@ def abstract(
     looked for. Images that only fill up a compiled batch are not counted.
 
     **Arguments:**
-
     - `problem`: the loop with its network, one image at each sample of its traces.
     - `abstraction`: `severity -> system`, the same loop without images: its perception is the truth
       with an error of a severity from 0 (none) to 1 (the worst allowed); JAX traces it. Its
@@ -107,10 +106,8 @@ def abstract(
     - `seed`: the same seed gives the same result, bit for bit, on the same machine.
     - `images_per_simulation`: where it is not one at each sample of a trace.
     - `progress`: show a progress bar; by default on a terminal or in a notebook.
-
     **Returns:** the region, the images, the candidates and which of them fail in the loop, with the
     number of rendered images of each stage.
-
     **Raises:** before anything is rendered, `ProblemError` for parts that do not fit; `ValueError`
     for numbers out of range, or a search that cannot work on the space.
     """
@@ -310,7 +307,6 @@ class DecisiveImage(System):
     """The network's reading of the last image that the loop cannot do without.
 
     **Arguments:**
-
     - `loop`: the loop without images.
     - `frame`: renders one image, and returns the signals of the network's reading.
     - `lanes`: images that are worked on together.

@@ -27,12 +27,10 @@ from verifai_jax.systems.base import as_system
 Features = Any
 Abstraction = Callable[[Any], Any]
 """Severity -> system."""
-
 BISECTIONS = 10
 """Halvings of the severity, which is found to a thousandth."""
 AT_ONCE = 256
 """Abstract simulations that are worked on together."""
-
 UNCERTAIN, SAFE, FAILS_ANYWAY, NO_VERDICT = "uncertain", "safe", "fails anyway", "no verdict"
 """Kinds of samples: the loop fails with the worst perception only, with neither, with the best."""
 
@@ -69,7 +67,6 @@ class AbstractLoop:
     """A loop whose perception is the truth with an error of a given severity.
 
     **Arguments:**
-
     - `problem`: the loop with the network; its formulas decide.
     - `abstraction`: `severity -> system`, without images.
     - `error`: a condition on the signals of one instant: the perception errs.

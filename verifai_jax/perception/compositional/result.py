@@ -79,9 +79,7 @@ class Compositional(InNotebook):
         """Simulate a confirmed failure again, and keep its trace.
 
         **Arguments:**
-
         - `number`: 0 is the first that was found.
-
         **Raises:** `IndexError` where there are not as many.
         """
         failing = [run for run in self.simulations if len(run.table.counterexamples)]
@@ -97,7 +95,6 @@ class Compositional(InNotebook):
         Samples that fail anyway or have no verdict are left out.
 
         **Arguments:**
-
         - `options`: those of `vj.analysis.rules`.
         """
         known = self.region["kind"].isin([UNCERTAIN, SAFE])
@@ -111,12 +108,9 @@ class Compositional(InNotebook):
         """Draw the region of uncertainty over two features, by the least error that fails.
 
         **Arguments:**
-
         - `path`: file that the picture is written to, if given.
         - `features`: the columns; by default the two that the region depends on most.
-
         **Returns:** the figure.
-
         **Raises:** `UnknownNameError` for a column that the table has not.
         """
         draw = lazy_import("verifai_jax.reports.plotting.compositional", "plot_region")

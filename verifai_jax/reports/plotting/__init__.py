@@ -1,4 +1,8 @@
-"""Pictures of runs and of single simulations; matplotlib is imported when one is drawn."""
+"""Pictures of runs and of single simulations; matplotlib is imported when one is drawn.
+
+A function `plot_...` draws its first argument, writes the picture to `path`, if that is given, and
+returns the figure.
+"""
 
 from verifai_jax.reports.plotting.animation import animate as animate
 from verifai_jax.reports.plotting.replay import plot_replay as plot_replay

@@ -60,14 +60,12 @@ def animate(
     itself.
 
     **Arguments:**
-
     - `replay`: what `run.replay` returned.
     - `path`: a file that is written too; folders are made.
     - `camera`: the name of a camera of a MuJoCo model; the one that sees best what moves when left
       out.
     - `size`: width and height of a frame in pixels.
     - `fps`: frames a second; chosen when left out.
-
     **Raises:** `ValueError` for any other problem without `draw`, for a path that does not end in
     `.gif`, a camera without a MuJoCo model, and invalid sizes; `UnknownNameError` for
     a camera that the model lacks; `mujoco_scene.NoRenderer` where MuJoCo cannot draw.

@@ -22,13 +22,7 @@ def plot_arms(
     """Draw a metric of each arm and seed, and the paired difference of each arm to one of them.
 
     **Arguments:**
-
-    - `result`: the result.
-    - `path`: file that the picture is written to, if given.
     - `metric`, `reference`: as in `Augmentation.compare`.
-
-    **Returns:** the figure.
-
     **Raises:** as `Augmentation.compare`.
     """
     differences = result.compare(metric, reference)
@@ -74,14 +68,8 @@ def plot_montage(
     """Draw images that an arm added.
 
     **Arguments:**
-
-    - `result`: the result.
-    - `path`: file that the picture is written to, if given.
     - `arm`, `seed`: the arm, and the seed of its training.
     - `count`: images at most.
-
-    **Returns:** the figure.
-
     **Raises:** `ValueError` for inputs that are not images, or an arm that added nothing.
     """
     check_count("count", count)

@@ -31,15 +31,7 @@ DOTS = 4000
 
 
 def plot_clusters(clusters: Clusters, path: str | Path | None = None) -> Figure:
-    """Draw the clusters over the two columns that tell them apart best.
-
-    **Arguments:**
-
-    - `clusters`: what `analysis.clusters` returned.
-    - `path`: file that the picture is written to, if given.
-
-    **Returns:** the figure.
-    """
+    """Draw the clusters over the two columns that tell them apart best."""
     samples = clusters.samples
     across, up = distinguishing_columns(clusters)
     figure = new_figure(figsize=(6.2, 4.4))
@@ -113,15 +105,7 @@ def distinguishing_columns(clusters: Clusters) -> tuple[str, str]:
 
 
 def plot_diverse(diverse: Diverse, path: str | Path | None = None) -> Figure:
-    """Draw the rows among all, in their order, and the distance of each from those before.
-
-    **Arguments:**
-
-    - `diverse`: what `analysis.diverse` returned.
-    - `path`: file that the picture is written to, if given.
-
-    **Returns:** the figure.
-    """
+    """Draw the rows among all, in their order, and the distance of each from those before."""
     figure = new_figure(figsize=(8.6, 4.0))
     cloud, curve = figure.subplots(1, 2, width_ratios=(1.4, 1))
     across, up = two_columns(diverse.samples)
@@ -150,15 +134,7 @@ def plot_diverse(diverse: Diverse, path: str | Path | None = None) -> Figure:
 
 
 def plot_neighbours(neighbours: Neighbours, path: str | Path | None = None) -> Figure:
-    """Draw the rows among the others, over the two features that vary most.
-
-    **Arguments:**
-
-    - `neighbours`: what `analysis.k_closest`, `nearest` or `random_rows` returned.
-    - `path`: file that the picture is written to, if given.
-
-    **Returns:** the figure.
-    """
+    """Draw the rows among the others, over the two features that vary most."""
     figure = new_figure(figsize=(5.2, 4.2))
     axes = figure.subplots()
     draw_rows(

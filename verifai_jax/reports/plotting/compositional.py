@@ -12,20 +12,12 @@ from verifai_jax.reports.plotting import style
 
 
 def plot_region(
-    result: Compositional,
-    path: str | Path | None = None,
-    features: tuple[str, str] | None = None,
+    result: Compositional, path: str | Path | None = None, features: tuple[str, str] | None = None
 ) -> Figure:
     """Draw the samples of the region by the least error that fails, and the confirmed failures.
 
     **Arguments:**
-
-    - `result`: what `vj.perception.abstract` returned.
-    - `path`: file that the picture is written to, if given.
     - `features`: the columns across and up; by default the two that the region depends on most.
-
-    **Returns:** the figure.
-
     **Raises:** `UnknownNameError` for a column that the table has not.
     """
     region, columns = result.region, list(result.problem.space.columns)

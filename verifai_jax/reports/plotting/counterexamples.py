@@ -30,15 +30,7 @@ MAX_SIGNALS = 3
 
 
 def plot_explanation(explained: Explained, path: str | Path | None = None) -> Figure:
-    """Draw the deciding signal with its bound and instant, input signals, and the features.
-
-    **Arguments:**
-
-    - `explained`: what `explain` returned.
-    - `path`: file that the picture is written to, if given.
-
-    **Returns:** the figure.
-    """
+    """Draw the deciding signal with its bound and instant, input signals, and the features."""
     features = explained.replay.features
     inputs = [i for i in explained.influences if is_waveform(features.get(i.name))][:MAX_SIGNALS]
     figure = style.new_figure(figsize=(10.5, 3.4 + 1.3 * len(inputs)))
@@ -189,15 +181,7 @@ def _draw_bars(axes: Axes, explained: Explained) -> None:
 
 
 def plot_shrunk(shrunk: Shrunk, path: str | Path | None = None) -> Figure:
-    """Draw the coordinates that depart from nominal, next to the signal that breaks the property.
-
-    **Arguments:**
-
-    - `shrunk`: what `shrink` returned.
-    - `path`: file that the picture is written to, if given.
-
-    **Returns:** the figure.
-    """
+    """Draw the coordinates that depart from nominal, next to the signal that fails."""
     replay = shrunk.replay()
     names = list(shrunk.changed) or ["nothing departs"]
     shown = names[:24]

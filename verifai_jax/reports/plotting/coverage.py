@@ -14,15 +14,7 @@ MAX_SHOWN = 12
 
 
 def plot_coverage(coverage: Coverage, path: str | Path | None = None) -> Figure:
-    """Draw the share of cells occupied, and samples with the largest hole.
-
-    **Arguments:**
-
-    - `coverage`: what `analysis.coverage` returned.
-    - `path`: file that the picture is written to, if given.
-
-    **Returns:** the figure.
-    """
+    """Draw the share of cells occupied, and samples with the largest hole."""
     samples = coverage.samples
     worst = coverage.table.sort_values("occupied", kind="stable")
     figure = style.new_figure(figsize=(9.6, 4.2))

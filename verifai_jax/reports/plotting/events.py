@@ -13,12 +13,7 @@ def plot_pairs(coverage: FuzzCoverage, path: str | Path | None = None) -> Figure
     """Draw the pairs of transitions that can follow each other, by how often they did.
 
     **Arguments:**
-
     - `coverage`: the coverage of a run whose features have an automaton; the first one is drawn.
-    - `path`: file that the picture is written to, if given.
-
-    **Returns:** the figure.
-
     **Raises:** `ValueError` for a run without an automaton.
     """
     if not coverage.automata:

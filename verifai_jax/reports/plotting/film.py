@@ -12,7 +12,6 @@ from verifai_jax.evaluation.replay import Replay
 from verifai_jax.reports.plotting.replay import decisive_instant
 
 Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]
-
 MAX_FRAMES = 150
 """Frames of a film without a given frame rate; a longer film is played faster."""
 MAX_WANTED = 1000
@@ -47,10 +46,8 @@ def film_samples(
     """Return the samples that a film shows, in real time where they are not too many.
 
     **Arguments:**
-
     - `clock`: seconds of each sample.
     - `fps`: frames a second; None for `usual` many.
-
     **Returns:** the samples, and the milliseconds of each frame.
     """
     seconds = float(clock[-1] - clock[0])

@@ -8,15 +8,7 @@ from jaxtyping import UInt8
 
 from verifai_jax.core.atomic_files import replacing
 from verifai_jax.evaluation.replay import Replay
-from verifai_jax.reports.plotting.film import (
-    Frame,
-    caption_of,
-    check_film,
-    decided_at,
-    film_samples,
-    gif,
-    labelled,
-)
+from verifai_jax.reports.plotting import film
 from verifai_jax.systems.blackbox._blackbox import plain_leaves, seed_of
 from verifai_jax.systems.environments import EpisodeFunction
 
@@ -35,30 +27,30 @@ def film_episode(
     """Simulate an episode again, in this process, and return what the environment draws as a GIF.
 
     **Arguments:**
-
     - `replay`: the replay of a problem with an environment of Gymnasium.
     - `size`: width and height in pixels; those of the environment when left out.
     - `fps`: frames a second; `FRAMES_PER_SECOND` when left out.
-
     **Raises:** `ValueError` for an environment that draws no pictures.
     """
-    check_film(size, fps)
+    film.check_film(size, fps)
     episode = episode_of(replay.problem.system)
     assert episode is not None
     clock = np.asarray(replay.trace.clock(), np.float64)
-    samples, shown = film_samples(clock, fps, FRAMES_PER_SECOND)
+    samples, shown = film.film_samples(clock, fps, FRAMES_PER_SECOND)
     features, seed = plain_leaves(replay.features), seed_of(replay.key)
     drawn = episode.frames(features, seed, set(samples.tolist()))
-    decided = decided_at(replay)
+    decided = film.decided_at(replay)
     frames = []
     for sample in samples.tolist():
         # An episode that ends earlier than before stays where it ended.
         frame = drawn[min(sample, max(drawn))]
         failed = decided is not None and sample >= decided
         frames.append(
-            labelled(_resized(frame, size), caption_of(replay), float(clock[sample]), failed)
+            film.labelled(
+                _resized(frame, size), film.caption_of(replay), float(clock[sample]), failed
+            )
         )
-    return gif(frames, shown)
+    return film.gif(frames, shown)
 
 
 def write_episode(replay: Replay, path: Path) -> Path:
@@ -69,7 +61,7 @@ def write_episode(replay: Replay, path: Path) -> Path:
 
 
 def _resized(
-    frame: Frame, size: Sequence[int] | None
+    frame: film.Frame, size: Sequence[int] | None
 ) -> UInt8[np.ndarray, "wanted_height wanted_width 3"]:
     if size is None:
         return frame

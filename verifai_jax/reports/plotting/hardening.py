@@ -8,15 +8,7 @@ from verifai_jax.training.hardening.result import HARDENED, Hardening
 
 
 def plot_hardening(result: Hardening, path: str | Path | None = None) -> Figure:
-    """Draw the failure probability of each round with its interval, and the mean return.
-
-    **Arguments:**
-
-    - `result`: the result.
-    - `path`: file that the picture is written to, if given.
-
-    **Returns:** the figure.
-    """
+    """Draw the failure probability of each round with its interval, and the mean return."""
     figure = new_figure(figsize=(8.0, 3.2))
     left, right = figure.subplots(1, 2)
     for index, (arm, rows) in enumerate(result.table.groupby("arm", sort=False)):

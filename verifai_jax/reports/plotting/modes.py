@@ -29,11 +29,6 @@ WIDEST = 30
 def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
     """Draw the probability of each mode with its interval, and failures of each mode.
 
-    **Arguments:**
-
-    - `modes`: the modes.
-    - `path`: file that the picture is written to, if given.
-
     **Returns:** the figure. Failures are drawn over the two numerical features in which the modes
     differ most, next to their likeliest ones.
     """

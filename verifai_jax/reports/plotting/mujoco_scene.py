@@ -58,15 +58,9 @@ def film(
     """Write an animated GIF, in real time where its frames are not too many.
 
     **Arguments:**
-
-    - `motion`: what `record` returned.
-    - `path`: the path of the file; folders are made.
     - `size`: width and height in pixels; `SIZE` when left out.
     - `camera`: as for `frames`.
     - `fps`: frames a second; `FRAMES_PER_SECOND` when left out.
-
-    **Returns:** the path.
-
     **Raises:** `NoRenderer`; `UnknownNameError` for a camera that the model lacks.
     """
     check_film(size, fps)
@@ -94,15 +88,9 @@ def strip(
     Those of a failure close in on the sample that decided it.
 
     **Arguments:**
-
-    - `motion`: what `record` returned.
-    - `path`: the path of the file; folders are made.
     - `count`: instants.
     - `size`: width and height of each in pixels.
     - `camera`: as for `frames`.
-
-    **Returns:** the path.
-
     **Raises:** as `film`.
     """
     from PIL import Image
@@ -133,15 +121,11 @@ def frames(
     """Draw the motion at some samples.
 
     **Arguments:**
-
-    - `motion`: what `record` returned.
     - `samples`: their numbers.
     - `size`: width and height in pixels.
     - `camera`: the name of one of the model's; when left out, the one that sees best what moves
       (`mujoco_view.best_view`), of the model's or one that is made for it.
-
     **Returns:** a picture `[height, width, 3]` of each.
-
     **Raises:** `NoRenderer`; `UnknownNameError`.
     """
     mujoco = require("mujoco", extra="mujoco")
@@ -311,8 +295,6 @@ def best_view(motion: Motion, draw: Callable[..., Any], size: tuple[int, int]) -
     """Return the camera that sees best what moves.
 
     **Arguments:**
-
-    - `motion`: the motion of the model.
     - `draw`: what `mujoco_scene.canvas` gives, for pictures of this `size`.
     """
     mujoco = require("mujoco", extra="mujoco")

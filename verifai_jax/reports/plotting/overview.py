@@ -21,15 +21,7 @@ MAX_RULES = 2
 
 
 def plot_overview(analysis: Analysis, path: str | Path | None = None) -> Figure:
-    """Draw failures over the two most important features, and the importances as bars.
-
-    **Arguments:**
-
-    - `analysis`: what `analysis.analyze` returned.
-    - `path`: file that the picture is written to, if given.
-
-    **Returns:** the figure.
-    """
+    """Draw failures over the two most important features, and the importances as bars."""
     samples = analysis.samples
     title = analysis.parts[0].words.splitlines()[0]
     if samples is None:
@@ -91,15 +83,7 @@ MAX_SENSITIVITIES = 20
 
 
 def plot_importance(importance: Importance, path: str | Path | None = None) -> Figure:
-    """Draw the losses of the models' scores as bars.
-
-    **Arguments:**
-
-    - `importance`: what `analysis.importance` returned.
-    - `path`: file that the picture is written to, if given.
-
-    **Returns:** the figure.
-    """
+    """Draw the losses of the models' scores as bars."""
     columns = {
         target: f"{NAMES[target]} ({importance.score_words(target)})"
         for target in importance.scores
@@ -114,15 +98,7 @@ def plot_importance(importance: Importance, path: str | Path | None = None) -> F
 
 
 def plot_sensitivity(sensitivity: Sensitivity, path: str | Path | None = None) -> Figure:
-    """Draw sensitivity indices with their intervals.
-
-    **Arguments:**
-
-    - `sensitivity`: what `analysis.sobol_indices`, `morris` or `gradient_sensitivity` returned.
-    - `path`: file that the picture is written to, if given.
-
-    **Returns:** the figure.
-    """
+    """Draw sensitivity indices with their intervals."""
     shown = sensitivity.table.head(MAX_SENSITIVITIES)
     title = (
         f"{sensitivity.method} of {sensitivity.problem}, {sensitivity.simulations:,} simulations"
@@ -147,15 +123,9 @@ def plot_bars(
     """Draw one horizontal bar for each row and column of a table.
 
     **Arguments:**
-
     - `table`: a row for each feature; intervals are in the columns `NAME_low` and `NAME_high`, or
       in `low` and `high`.
     - `columns`: the name in the legend of each column to draw, empty for none.
-    - `title`: above the bars.
-    - `label`: the label of the horizontal axis.
-    - `path`: file that the picture is written to, if given.
-
-    **Returns:** the figure.
     """
     figure = style.new_figure(figsize=(6.4, 1.3 + 0.38 * len(table) + 0.2 * (len(columns) > 1)))
     axes = figure.subplots()
@@ -199,12 +169,7 @@ def plot_effects(table: pd.DataFrame, title: str, path: str | Path | None = None
     """Draw the mean size of elementary effects against their standard deviation.
 
     **Arguments:**
-
     - `table`: that of `analysis.morris`.
-    - `title`: above the picture.
-    - `path`: file that the picture is written to, if given.
-
-    **Returns:** the figure.
     """
     figure = style.new_figure(figsize=(5.6, 4.4))
     axes = figure.subplots()

@@ -20,15 +20,7 @@ MAX_LABELS = 12
 
 
 def plot_rules(rules: Rules, path: str | Path | None = None) -> Figure:
-    """Draw samples over the features that the rules use most, with the rules' boxes.
-
-    **Arguments:**
-
-    - `rules`: what `analysis.rules` returned.
-    - `path`: file that the picture is written to, if given.
-
-    **Returns:** the figure.
-    """
+    """Draw samples over the features that the rules use most, with the rules' boxes."""
     samples = rules.samples
     used = [c.feature for rule in rules.rules for c in rule.conditions]
     across, up = two_features(samples, used)

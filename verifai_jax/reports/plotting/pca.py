@@ -14,15 +14,7 @@ DOTS = 3000
 
 
 def plot_components(components: Components, path: str | Path | None = None) -> Figure:
-    """Draw the rows along the first two components, and the loadings of the first three.
-
-    **Arguments:**
-
-    - `components`: what `analysis.pca` returned.
-    - `path`: file that the picture is written to, if given.
-
-    **Returns:** the figure.
-    """
+    """Draw the rows along the first two components, and the loadings of the first three."""
     samples, names, directions = components.samples, components.names, components.directions
     shown = np.argsort(-np.abs(directions[:3]).max(axis=0, initial=0), kind="stable")[:12]
     figure = style.new_figure(figsize=(8.4, max(3.4, 1.2 + 0.27 * len(shown))))

@@ -9,15 +9,7 @@ from verifai_jax.synthesis.results import Repair
 
 
 def plot_repair(repair: Repair, path: str | Path | None = None) -> Figure:
-    """Draw the worst robustness that the attack of each round found.
-
-    **Arguments:**
-
-    - `repair`: what `repair` returned.
-    - `path`: file that the picture is written to, if given.
-
-    **Returns:** the figure.
-    """
+    """Draw the worst robustness that the attack of each round found."""
     figure = new_figure(figsize=(5.0, 3.0))
     axes = figure.subplots()
     worst = [turn.worst for turn in repair.rounds]

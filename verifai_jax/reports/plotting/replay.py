@@ -55,13 +55,7 @@ def plot_replay(
     (`vj.Signal`), then the others, as many as there is room for.
 
     **Arguments:**
-
-    - `replay`: what `run.replay` returned.
-    - `path`: file that the picture is written to, if given.
     - `signals`: the signals and Signal features to draw, in this order; chosen when left out.
-
-    **Returns:** the figure.
-
     **Raises:** `UnknownNameError` for a signal that does not exist; `ValueError` for none.
     """
     trace, formulas = replay.trace, replay.problem.formulas
@@ -86,7 +80,6 @@ def plot_replay(
     clock = np.asarray(trace.clock())
     decisive = decisive_instant(formulas[name], trace, replay.problem.end)
     to_blame = _predicates_to_blame(replay)
-
     figure = new_figure(figsize=(8, 1.2 + 1.45 * len(shown)))
     panels = figure.subplots(len(shown), 1, sharex=True, squeeze=False).ravel()
     for axes, signal in zip(panels, shown, strict=True):
@@ -123,8 +116,7 @@ def plot_replay(
     where = replay.describe_features()
     figure.suptitle(
         shorten(
-            f"{shorten(str(formulas[name]), LONGEST_FORMULA)}\n{verdict} at {where}",
-            LONGEST_TITLE,
+            f"{shorten(str(formulas[name]), LONGEST_FORMULA)}\n{verdict} at {where}", LONGEST_TITLE
         ),
         fontsize=9,
         color=FAILING if replay.violated else BOUND,

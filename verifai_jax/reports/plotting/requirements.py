@@ -13,16 +13,7 @@ from verifai_jax.mtl.exemplary import Examples
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.mtl.mining import Mined
-from verifai_jax.reports.plotting.style import (
-    BOUND,
-    FAILING,
-    INPUT,
-    SAFE,
-    new_figure,
-    show_or_save,
-    tidy,
-    wrap_name,
-)
+from verifai_jax.reports.plotting import style
 
 
 def plot_mined(mined: Mined, path: str | Path | None = None) -> Figure:
@@ -33,7 +24,7 @@ def plot_mined(mined: Mined, path: str | Path | None = None) -> Figure:
     if len(mined.tightest) < 2:
         raise ValueError("one parameter has a tightest value and no front to draw; see summary()")
     one, other = mined.tightest
-    figure = new_figure(figsize=(6.0, 4.5), facecolor="white")
+    figure = style.new_figure(figsize=(6.0, 4.5), facecolor="white")
     axis = figure.add_subplot()
     corners = sorted((corner[one], corner[other]) for corner in mined.front)
     axis.plot(*zip(*corners, strict=True), "o", color="#1b2a41", ms=4, label="corners of the front")
@@ -47,7 +38,7 @@ def plot_mined(mined: Mined, path: str | Path | None = None) -> Figure:
     axis.set_ylabel(f"{other} (tight: the {mined.tightest[other]})")
     axis.set_title(mined.text, fontsize=10)
     axis.legend()
-    return show_or_save(figure, path)
+    return style.show_or_save(figure, path)
 
 
 def plot_examples(examples: Examples, path: str | Path | None = None) -> Figure:
@@ -79,7 +70,9 @@ def _plot_traces(
         raise ValueError("no trace was found, so that there is nothing to draw")
     names = list(dict.fromkeys(name for formula in formulas for name in formula.signals()))
     rows, columns = len(names) + len(formulas), len(traces)
-    figure = new_figure(figsize=(3.2 * columns + 2.0, 1.4 * len(names) + 0.7 * len(formulas) + 1))
+    figure = style.new_figure(
+        figsize=(3.2 * columns + 2.0, 1.4 * len(names) + 0.7 * len(formulas) + 1)
+    )
     heights = [1.0] * len(names) + [0.35] * len(formulas)
     grid = figure.subplots(
         rows, columns, sharex="col", sharey="row", squeeze=False, height_ratios=heights
@@ -90,18 +83,20 @@ def _plot_traces(
         column[0].set_title(title, fontsize=10)
         column[-1].set_xlabel("time (s)")
         for axes, name in zip(column, names, strict=False):
-            axes.plot(clock, values.signals[name], color=INPUT, drawstyle="steps-post")
+            axes.plot(clock, values.signals[name], color=style.INPUT, drawstyle="steps-post")
             _draw_bounds(axes, formulas, name)
-            tidy(axes)
+            style.tidy(axes)
         for axes, formula in zip(column[len(names) :], formulas, strict=True):
             fails = np.broadcast_to(values.truth(formula) <= 0, len(clock))
-            axes.axvspan(clock[0], clock[-1], color=SAFE, lw=0)
-            axes.fill_between(clock, 0, fails, step="post", color=FAILING, lw=0)
+            axes.axvspan(clock[0], clock[-1], color=style.SAFE, lw=0)
+            axes.fill_between(clock, 0, fails, step="post", color=style.FAILING, lw=0)
             axes.set_yticks([])
             axes.set_ylim(0, 1)
     for axes, name in zip(grid[:, 0], [*names, *map(str, formulas)], strict=True):
-        axes.set_ylabel(wrap_name(name, 28, 4), rotation=0, ha="right", va="center", fontsize=9)
-    return show_or_save(figure, path)
+        axes.set_ylabel(
+            style.wrap_name(name, 28, 4), rotation=0, ha="right", va="center", fontsize=9
+        )
+    return style.show_or_save(figure, path)
 
 
 def _draw_bounds(axes: Axes, formulas: Sequence[Formula], name: str) -> None:
@@ -109,4 +104,4 @@ def _draw_bounds(axes: Axes, formulas: Sequence[Formula], name: str) -> None:
     solved = (limits for f in formulas for _, limits in signal_bounds(f, name))
     for number in {limit.number for limits in solved for limit in limits}:
         if number is not None:
-            axes.axhline(number, color=BOUND, lw=0.9, ls="--")
+            axes.axhline(number, color=style.BOUND, lw=0.9, ls="--")

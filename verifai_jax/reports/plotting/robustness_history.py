@@ -21,12 +21,8 @@ def plot_robustness_history(
     """Draw robustness over simulations with the running minimum; several runs share the axes.
 
     **Arguments:**
-
     - `run`: a run, or runs by the label that the legend gives them.
-    - `path`: file that the picture is written to, if given.
     - `axes`: to draw into; those of a new figure when left out.
-
-    **Returns:** the figure.
     """
     runs = {"": run} if isinstance(run, Run) else run
     given: Any = axes
@@ -65,20 +61,6 @@ def _one(axes: Axes, run: Run) -> None:
     axes.plot(
         number, np.fmin.accumulate(rho), color=style.BOUND, linewidth=1.6, label="best so far"
     )
-    _mark_first(axes, rho, failing)
-    doubtful = run.table.unconfirmed.index.to_numpy()
-    violating = len(run.table.violating)
-    title = f"{run.name}: {violating:,} of {len(rho):,} simulations violate the property"
-    if len(doubtful):
-        axes.scatter(
-            number[doubtful[:DOTS]], rho[doubtful[:DOTS]], c=style.NOT_CLAIMED, s=12, marker="^",
-            linewidths=0, label=f"{len(doubtful):,} not claimed",
-        )  # fmt: skip
-    axes.set_title(title)
-    axes.legend(frameon=False, loc="upper right")
-
-
-def _mark_first(axes: Axes, rho: Float[np.ndarray, " n"], failing: Int[np.ndarray, " k"]) -> None:
     if len(failing):
         first = failing[0]
         axes.annotate(
@@ -91,6 +73,16 @@ def _mark_first(axes: Axes, rho: Float[np.ndarray, " n"], failing: Int[np.ndarra
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5},
             arrowprops={"arrowstyle": "-", "color": style.FAILING, "linewidth": 0.8},
         )
+    doubtful = run.table.unconfirmed.index.to_numpy()
+    violating = len(run.table.violating)
+    title = f"{run.name}: {violating:,} of {len(rho):,} simulations violate the property"
+    if len(doubtful):
+        axes.scatter(
+            number[doubtful[:DOTS]], rho[doubtful[:DOTS]], c=style.NOT_CLAIMED, s=12, marker="^",
+            linewidths=0, label=f"{len(doubtful):,} not claimed",
+        )  # fmt: skip
+    axes.set_title(title)
+    axes.legend(frameon=False, loc="upper right")
 
 
 def _robustness(run: Run) -> Float[np.ndarray, " n"]:

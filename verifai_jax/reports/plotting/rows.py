@@ -13,16 +13,7 @@ from verifai_jax.core.figure import Axes
 DOTS = 3000
 """Rows drawn at most."""
 # Colour-blind readers can distinguish the first eight (Okabe and Ito, 2008).
-PALETTE = (
-    "#0072b2",
-    "#e69f00",
-    "#009e73",
-    "#d55e00",
-    "#cc79a7",
-    "#56b4e9",
-    "#8c6d31",
-    "#000000",
-)
+PALETTE = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#8c6d31", "#000000")
 _PRIMES = (2, 3, 5, 7, 11, 13, 17, 19)
 
 

@@ -21,11 +21,7 @@ def write_run_pictures(run: Run, folder: str | Path) -> list[Path]:
     The worst simulation is drawn when the run has its problem and a row with a verdict.
 
     **Arguments:**
-
-    - `run`: what `falsify` returned.
     - `folder`: to write into; made if missing.
-
-    **Returns:** the paths of the pictures.
     """
     folder = Path(folder)
     paths = [folder / "features.png", folder / "robustness.png"]
@@ -46,12 +42,8 @@ def write_replay_pictures(
     left out.
 
     **Arguments:**
-
-    - `replay`: what `run.replay` returned.
     - `folder`: to write into; made if missing.
     - `name`: the name of the files, without an ending; by default that of the row.
-
-    **Returns:** the paths of the pictures.
     """
     folder = Path(folder)
     name = name or ("replay" if replay.row is None else f"row-{replay.row}")

@@ -20,10 +20,7 @@ LARGE = 30
 
 
 def plot_features(
-    run: Run,
-    path: str | Path | None = None,
-    features: list[str] | None = None,
-    maximum: int = 4,
+    run: Run, path: str | Path | None = None, features: list[str] | None = None, maximum: int = 4
 ) -> Figure:
     """Draw safe (green) and failing (red) samples over pairs of features.
 
@@ -31,14 +28,8 @@ def plot_features(
     those without a verdict are grey crosses.
 
     **Arguments:**
-
-    - `run`: what `falsify` returned.
-    - `path`: file that the picture is written to, if given.
     - `features`: names; by default the `maximum` that distinguish failing from safe samples best.
     - `maximum`: features at most, where they are not named.
-
-    **Returns:** the figure.
-
     **Raises:** `UnknownNameError` for a feature that is not in the table.
     """
     table = run.table.all

@@ -10,7 +10,6 @@ from verifai_jax.core.figure import Axes, Figure
 from verifai_jax.reports.plotting.style import new_figure, show_or_save
 
 EGO, OTHERS, GROUND = "#d1495b", "#3a6ea5", "#b8b8b8"
-
 MARGIN = 4.0
 """Metres around the objects."""
 
@@ -19,7 +18,6 @@ def draw_scene(program: Any, scene: Any, path: str | Path | None = None) -> Figu
     """Draw the objects of a scene, each with its name and where it heads; returns the figure.
 
     **Arguments:**
-
     - `program`: a `ScenicProgram`.
     - `scene`: one of its scenes, of Scenic.
     - `path`: file to write the picture to.

@@ -17,9 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
 else:
     Axis = object
-
 Positions = Float[np.ndarray, " n"]
-
 SAFE = "#3a9e7d"
 FAILING = "#d1495b"
 WITHOUT_VERDICT = "#7f7f7f"
@@ -82,8 +80,6 @@ def name_points(
     A name that has no room at its point is moved up or down, and a line joins the two.
 
     **Arguments:**
-
-    - `axes`: with the points.
     - `names`: the names of the points at `x` and `y`, in the units of the data.
     - `low`, `high`: ends of a horizontal bar at each point, on which no name lies.
     """

@@ -24,7 +24,6 @@ from verifai_jax.training.sweeps.summary import format_failures
 
 if TYPE_CHECKING:
     import pandas as pd
-
 LOOKS = {
     "safe": (style.SAFE, "o"),
     "undecided": (style.WITHOUT_VERDICT, "D"),
@@ -40,15 +39,7 @@ MAX_BARS = 8
 
 
 def plot_sweep(sweep: Sweep, path: str | Path | None = None) -> Figure:
-    """Draw safety, learning curves and importance; the last two where there is any to show.
-
-    **Arguments:**
-
-    - `sweep`: the result of a sweep.
-    - `path`: file that the picture is written to, if given.
-
-    **Returns:** the figure.
-    """
+    """Draw safety, learning curves and importance; the last two where there is any to show."""
     curves = _curve_rows(sweep)
     importance = sweep.importance()
     bars = bool(importance.scores)
@@ -68,15 +59,7 @@ def plot_sweep(sweep: Sweep, path: str | Path | None = None) -> Figure:
 
 
 def plot_importance(importance: HyperparameterImportance, path: str | Path | None = None) -> Figure:
-    """Draw the shares of the variance, or the trends where no model is reliable.
-
-    **Arguments:**
-
-    - `importance`: the importance of hyper-parameters.
-    - `path`: file that the picture is written to, if given.
-
-    **Returns:** the figure.
-    """
+    """Draw the shares of the variance, or the trends where no model is reliable."""
     figure = style.new_figure(figsize=(6.4, 1.6 + 0.42 * len(importance.table)))
     _draw_importance(figure.subplots(), importance)
     return style.show_or_save(figure, path)

@@ -21,11 +21,7 @@ def plot_transfer(result: Transfer, path: str | Path | None = None) -> Figure:
     """Draw the signal that parts most in both engines, and the gaps by a feature.
 
     **Arguments:**
-
-    - `result`: what `vj.transfer` returned.
     - `path`: the picture that is written; none when left out.
-
-    **Returns:** the figure.
     """
     figure = new_figure(figsize=(8.4, 3.4))
     left, right = figure.subplots(1, 2)

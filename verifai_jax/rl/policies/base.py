@@ -27,7 +27,6 @@ from verifai_jax.rl.policies.tracing import number_type, traced
 
 Compute = Callable[[PyTree, PyTree, PyTree], tuple[Any, PyTree]]
 """A pure function `(weights, observation, memory) -> (outputs, memory)`."""
-
 ACTIONS = {
     "outputs": "the outputs themselves",
     "argmax": "the index of the greatest output",
@@ -104,7 +103,6 @@ class Normaliser:
 
     # JAX rebuilds the class with placeholders.
     __no_type_check__ = True
-
     mean: Float[Array | np.ndarray, "*k"]
     scale: Float[Array | np.ndarray, "*k"]
     clip: float | None = dataclasses.field(default=None, metadata={"static": True})
@@ -133,7 +131,6 @@ class Policy:
     """
 
     __no_type_check__ = True
-
     weights: PyTree
     compute: Compute = dataclasses.field(metadata={"static": True})
     initial_memory: PyTree = None
@@ -160,11 +157,9 @@ class Policy:
         """Return the action; for a policy that remembers, `(action, memory)`.
 
         **Arguments:**
-
         - `observation`: one observation, or a batch for a network of vectors.
         - `memory`: the memory of a policy that remembers; `initial_memory` at the start of an
           episode.
-
         **Raises:** `TypeError` for a memory that is missing, or that it does not have.
         """
         if self.initial_memory is None:
@@ -179,12 +174,9 @@ class Policy:
         policy that remembers becomes inputs and outputs `memory.0`, `memory.0.next` and so on.
 
         **Arguments:**
-
         - `path`: ends in `.onnx`, in `.safetensors`, or in `.npz`, which needs no other package.
         - `observation`: an example of an observation, where the network does not say its size.
-
         **Returns:** the path.
-
         **Raises:** `PolicyError` for another ending, and for a policy that ONNX cannot express:
         one that draws random numbers, or that runs in Python.
         """

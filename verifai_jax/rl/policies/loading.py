@@ -31,7 +31,6 @@ from verifai_jax.rl.policy import Policy as OwnPolicy
 from verifai_jax.rl.policy import load_policy
 
 Network = Callable[[dict[str, Array], PyTree], PyTree]
-
 FORMATS = (".zip", ".onnx", ".safetensors", ".pt", ".pth", ".npz")
 
 
@@ -55,7 +54,6 @@ def policy(
     """Load a policy that was trained anywhere, as a pure function of JAX with its weights.
 
     **Arguments:**
-
     - `source`: a file or a model:
       - `.zip`: a model of Stable-Baselines3 (PPO, A2C, SAC, TD3, DDPG, DQN), with its spaces, its
         squashing and its bounds;
@@ -83,10 +81,8 @@ def policy(
       found by their shapes.
     - `stack`: observations that the policy sees at once, the newest last.
     - `batched`: a Python function takes a batch of observations.
-
     **Returns:** a `Policy`, which any system takes as its policy or controller (`policy.act`), or
     the `rl.Policy` of an `.npz`.
-
     **Raises:** `FileNotFoundError`; `PolicyError` for a file that is damaged or not supported, and
     for unused options. Nothing in a file is executed.
     """

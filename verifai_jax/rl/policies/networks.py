@@ -27,7 +27,6 @@ ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
     "identity": lambda x: x,
 }
 """Functions between layers, by the lower-case names of PyTorch's classes."""
-
 Layers = tuple[tuple[Float[Array, "inputs outputs"], Float[Array, " outputs"]], ...]
 
 

@@ -36,11 +36,9 @@ def from_object(source: object, observation: ArrayLike | None, batched: bool) ->
     """Return the policy of a model or function.
 
     **Arguments:**
-
     - `source`: see `policy`.
     - `observation`: an example, where the object cannot be translated without one.
     - `batched`: a Python function takes a batch of observations.
-
     **Raises:** `PolicyError` for something that is not a policy.
     """
     root = type(source).__module__.partition(".")[0]
@@ -93,9 +91,7 @@ class RandomPolicy(Policy):
 
 
 jax.tree_util.register_dataclass(
-    RandomPolicy,
-    ["weights", "initial_memory", "normaliser"],
-    ["compute", "actions"],
+    RandomPolicy, ["weights", "initial_memory", "normaliser"], ["compute", "actions"]
 )
 
 

@@ -26,7 +26,6 @@ from verifai_jax.rl.policies.onnx_node import Node
 from verifai_jax.rl.policies.onnx_operators import OPERATORS, output_size
 
 Values = dict[str, Any]
-
 OPSET = 18
 """The operator set of the graphs that `writing` makes; runtimes since 2023 read it."""
 
@@ -178,15 +177,11 @@ def read_onnx(
     """Read a model of ONNX.
 
     **Arguments:**
-
     - `path`: the path of the file, next to which tensors may be kept; None for bytes alone.
-    - `data`: the model.
     - `what`: its name, for errors.
     - `output`: name of the output that is meant, of several.
     - `memory`: `{input: output}` of what the network remembers; found by the shapes where None.
-
     **Returns:** the graph, its weights, and its memory at the start: zeros, or None.
-
     **Raises:** `PolicyError` for a damaged model, or one with unsupported operators.
     """
     package = require("onnx", extra="policies")
@@ -229,9 +224,7 @@ def read_onnx(
     return Graph(nodes, constants, inputs, ordered, chosen), weights, start
 
 
-def _sorted_out(
-    arrays: Mapping[str, np.ndarray],
-) -> tuple[dict[str, Array], dict[str, np.ndarray]]:
+def _sorted_out(arrays: Mapping[str, np.ndarray]) -> tuple[dict[str, Array], dict[str, np.ndarray]]:
     """Return the weights among arrays, which are real numbers, and the others."""
     weights = {n: jnp.asarray(a) for n, a in arrays.items() if a.dtype.kind == "f" and a.size}
     return weights, {n: a for n, a in arrays.items() if n not in weights}

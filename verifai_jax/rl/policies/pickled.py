@@ -141,13 +141,9 @@ def read_pickle(data: bytes, what: str) -> Any:
     """Return what a pickle describes, without calling anything.
 
     **Arguments:**
-
-    - `data`: the bytes.
     - `what`: where they are from, for errors.
-
     **Returns:** numbers, texts, bytes, tuples, lists and dictionaries as they are; a `Name` for a
     class or function, a `Record` for an object, a `Persistent` for data outside.
-
     **Raises:** `PolicyError` for bytes that are no pickle.
     """
     stack = _Stack()

@@ -21,7 +21,6 @@ from verifai_jax.rl.policies.pickled import Name, Record, array_of, read_pickle
 from verifai_jax.rl.policies.torch_archive import open_archive, read_member, read_state
 
 Weights = Mapping[str, np.ndarray]
-
 _KINDS = (
     # What is there, the hidden layers, the last layer (None: the last of the hidden ones), the
     # features.
@@ -51,7 +50,11 @@ def read_sb3(data: bytes, what: str) -> Policy:
         settings = json.loads(read_member(archive, "data", what))
         observed = _space(settings["observation_space"], "observation", what)
         acts = _space(settings["action_space"], "action", what)
-        options = _options(settings.get("policy_kwargs", {}), what)
+        entry = settings.get("policy_kwargs", {})
+        options = _unpickled(entry, f"policy_kwargs of {what}")
+        if not isinstance(options, Mapping):
+            raise PolicyError(f"policy_kwargs of {what} is damaged")
+        options = {str(name): value for name, value in options.items()}
         weights = read_state(read_member(archive, "policy.pth", what), f"policy.pth of {what}")
         return _policy(weights, observed, acts, options, what)
     except PolicyError:
@@ -111,13 +114,6 @@ def _space(entry: Any, role: str, what: str) -> tuple[str, dict[str, Any]]:
         array = array_of(value)
         attributes[str(name)] = value if array is None else array
     return kind.name, attributes
-
-
-def _options(entry: Any, what: str) -> dict[str, Any]:
-    options = _unpickled(entry, f"policy_kwargs of {what}")
-    if not isinstance(options, Mapping):
-        raise PolicyError(f"policy_kwargs of {what} is damaged")
-    return {str(name): value for name, value in options.items()}
 
 
 def _policy(

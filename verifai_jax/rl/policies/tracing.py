@@ -26,7 +26,6 @@ Jaxpr = Any
 """A `jax.core.Jaxpr`, its equations, variables and their forms: JAX does not export the classes."""
 Value: TypeAlias = str | np.ndarray
 """The name of a value that depends on the observation or the weights, or a known array."""
-
 _SAME = {
     "add": "Add", "sub": "Sub", "mul": "Mul", "div": "Div", "max": "Max", "min": "Min",
     "pow": "Pow", "neg": "Neg", "exp": "Exp", "log": "Log", "tanh": "Tanh", "logistic": "Sigmoid",
@@ -65,14 +64,11 @@ def traced(
     """Translate a function `(weights, observation, memory) -> (action, memory)`.
 
     **Arguments:**
-
     - `function`: a pure function of JAX.
     - `weights`: pytree of arrays, which keep their paths in it as names.
     - `observation`: an example; several arrays by name become several inputs.
     - `memory`: pytree at the start of an episode; None for none.
-
     **Returns:** the graph, all its arrays by name, and its memory at the start.
-
     **Raises:** `PolicyError` for an operation that ONNX, or this translation of it, does not have.
     """
     named = observation if isinstance(observation, Mapping) else {"observation": observation}

@@ -18,10 +18,8 @@ from verifai_jax.systems.scenic.sampling import Sampling
 
 MIN_CHANCE = 2e-6
 """Probability of a soft requirement to be off, or on, at least."""
-
 FAST, SLOW = 16_384, 1024
 """Points from which the weights of soft requirements are fitted, compiled and in Python."""
-
 ROUNDS = 200
 """Rounds of that fit at most."""
 
@@ -49,7 +47,6 @@ def scenic(
     scenes that are accepted, as in Scenic.
 
     **Arguments:**
-
     - `program`: path of a `.scenic` file, or the code of a program.
     - `mode2D`: Scenic's planar mode. In three dimensions features are the same, but Scenic computes
       every scene, in Python.
@@ -59,7 +56,6 @@ def scenic(
     - `features`: domains by name, in addition to what the program draws. It reads their values as
       global parameters while it runs: with `{"push": vj.Reactive({"gap": (0, 50)})}` a behavior
       asks `globalParameters.push(gap=...)` at each step, and a search learns how to answer.
-
     **Raises:** `MissingExtra` without Scenic; `ProgramError` for a program that does not compile,
     with Scenic's message, file and line, and for one that draws nothing at random; `ValueError`
     for a feature whose name the program has taken.

@@ -64,14 +64,12 @@ def compile_program(
     """Compile a Scenic program.
 
     **Arguments:**
-
     - `program`: path of a `.scenic` file, or the code of a program, which has several lines or a
       space.
     - `mode2D`: of Scenic: objects lie in the plane.
     - `params`: global parameters to override.
     - `model`: Scenic module to use as world model instead of the program's own.
     - `scenario`: name of the modular scenario to compile, where there are several.
-
     **Raises:** `MissingExtra` without Scenic; `ProgramError` for a program that is not there or
     does not compile.
     """

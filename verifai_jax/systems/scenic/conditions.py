@@ -56,7 +56,6 @@ OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
     ast.Eq: operator.eq,
     ast.NotEq: operator.ne,
 }
-
 CALLS = ("abs", "min", "max", "sin", "cos", "tan", "sqrt", "hypot", "floor", "exp", "atan2")
 
 
@@ -72,11 +71,9 @@ class Condition:
     """The condition of one `require`, as a function of traced values.
 
     **Arguments:**
-
     - `requirement`: Scenic's compiled one.
     - `tree`: its parsed condition.
     - `compiled`: the program.
-
     **Raises:** `Unsupported` for one of another file, whose text is not at hand.
     """
 

@@ -102,9 +102,6 @@ def box_inside(box: Rectangle, edges: Float[np.ndarray, "n 2 2"], convex: bool) 
     """Return whether a rectangle lies in polygons.
 
     **Arguments:**
-
-    - `box`: the rectangle.
-    - `edges`: the edges of the polygons.
     - `convex`: True for one convex polygon, whose corners decide.
     """
     corners = box.corners

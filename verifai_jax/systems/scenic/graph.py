@@ -13,7 +13,6 @@ from typing import Any
 
 FRAMED = ("RectangularRegion", "CircularRegion", "SectorRegion")
 """Regions with coordinates of their own, whatever is random about them."""
-
 PIECEWISE = ("PolygonalRegion", "PolylineRegion")
 """Regions made of triangles or segments, which are invertible where they are fixed."""
 

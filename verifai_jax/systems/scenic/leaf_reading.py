@@ -6,14 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from verifai_jax.features import (
-    Box,
-    Categorical,
-    Constant,
-    DiscreteBox,
-    Normal,
-    TruncatedNormal,
-)
+from verifai_jax.features import Box, Categorical, Constant, DiscreteBox, Normal, TruncatedNormal
 from verifai_jax.features.domain import MAX_LEVELS, Domain
 from verifai_jax.systems.scenic.graph import field, is_random, kind_of, law
 from verifai_jax.systems.scenic.leaves import (
@@ -38,7 +31,6 @@ def leaf_of(node: Any, name: str, options: Sequence[Any] | None = None) -> Leaf 
     """Return a random node as a leaf with an inverse; None for one that has none.
 
     **Arguments:**
-
     - `node`: in Scenic's graph.
     - `name`: the name of the leaf.
     - `options`: what the node selects from, for a selector.

@@ -25,10 +25,8 @@ from verifai_jax.systems.scenic.graph import field, is_random, kind_of, law
 
 Given: TypeAlias = Callable[[Any], Any]
 """What a node that a leaf depends on is worth in this scene; constants are worth themselves."""
-
 Parts: TypeAlias = Mapping[str, Any]
 """The features of one leaf, by name."""
-
 LABEL = 24
 """Letters of the text of an option that has no name."""
 
@@ -49,7 +47,6 @@ class Leaf(abc.ABC):
     node: Any
     name: str
     domains: Mapping[str, Domain]
-
     is_point = False
     is_series = False
 
@@ -58,7 +55,6 @@ class Leaf(abc.ABC):
         """Return the value at these features: a number, or the coordinates of a point.
 
         **Arguments:**
-
         - `parts`: features of this leaf, by name.
         - `given`: values of what it depends on.
         - `xp`: `numpy` or `jax.numpy`, which computes.
@@ -152,7 +148,6 @@ class Series(Leaf):
     """
 
     one: Leaf
-
     is_series = True
 
     def draw(self, parts: Parts, given: Given, xp: Any) -> Any:
@@ -319,7 +314,6 @@ class InPolygon(Leaf):
 
     triangles: np.ndarray
     cumulative: np.ndarray
-
     is_point = True
 
     def draw(self, parts: Parts, given: Given, xp: Any) -> Any:
@@ -360,7 +354,6 @@ class OnPolyline(Leaf):
     starts: np.ndarray
     ends: np.ndarray
     cumulative: np.ndarray
-
     is_point = True
 
     def segment(self, along: Any, xp: Any) -> Any:

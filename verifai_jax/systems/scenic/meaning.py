@@ -67,7 +67,6 @@ ARITHMETIC: dict[str, Callable[[Any, Any], Any]] = {
     )
     for prefix in ("", "r")
 }
-
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     "normalizeAngle": normalize_angle,
     "Orientation.fromEuler": lambda _, *angles: from_euler(*angles),

@@ -20,13 +20,10 @@ from verifai_jax.systems.scenic.graph import (
 
 FIRST = ("position", "yaw", "parentOrientation", "heading", "orientation", "width", "length")
 """Properties that give their name to a value before others that depend on it too."""
-
 FRAME = ("position", "center", "heading", "width", "length", "radius", "angle")
 """Parts of a region that may be random."""
-
 ANGLES = ("yaw", "parentOrientation", "heading", "orientation", "pitch", "roll")
 """Properties that a person calls the heading."""
-
 LOCAL = ("offsetLocally", "offsetRotated", "offsetRadially")
 """Operations in which a vector is measured from another place, in axes of its own."""
 
@@ -37,10 +34,8 @@ def owner_names(
     """Return the names of the objects and points that a program makes by `new`, by identity.
 
     **Arguments:**
-
     - `scenario`: Scenic's.
     - `variables`: names of variables by the identity of what they hold.
-    - `order`: random nodes.
     """
     owners: list[Any] = []
     random_owners = [node for node in order if is_constructed(node)]

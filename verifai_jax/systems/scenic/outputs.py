@@ -20,10 +20,8 @@ from verifai_jax.systems.scenic.values import Unsupported, as_vec, as_yaw
 
 POSE = ("x", "y", "heading", "width", "length")
 """What every object has."""
-
 PARAMS = "params"
 """Name of the dictionary of the global parameters."""
-
 BASE = frozenset(
     (
         *("position", "parentOrientation", "yaw", "pitch", "roll", "heading", "orientation"),
@@ -45,10 +43,8 @@ BASE = frozenset(
     )
 )
 """Properties of Scenic's own that a system does not see as such."""
-
 WHERE_RANDOM = frozenset(("color", "viewAngle", "visibleDistance"))
 """Those that it sees where they are random."""
-
 Read = Callable[[Values], Any]
 
 

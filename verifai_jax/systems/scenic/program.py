@@ -26,8 +26,6 @@ from verifai_jax.systems.scenic.simulation import OnScenes, ScenicSimulation, ch
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
 HostSystem = BlackBox | PooledBlackBox | VectorisedBlackBox
 
 
@@ -84,10 +82,8 @@ class ScenicProgram:
         computed by Scenic, without derivatives.
 
         **Arguments:**
-
         - `features`: as `space.unflatten` gives them, or as a person writes them and `features_of`
           gives them.
-
         **Raises:** `ValueError` for features whose names or shapes are not those of the space.
         """
         return self._outputs(self.space.convert(features))
@@ -96,9 +92,7 @@ class ScenicProgram:
         """Return a system that JAX traces, given one of scenes.
 
         **Arguments:**
-
         - `function(scene, key) -> Trace`: pure JAX, of the numbers that `scenes` gives.
-
         **Raises:** `ValueError` for what cannot be called.
         """
         if not callable(function):
@@ -116,11 +110,9 @@ class ScenicProgram:
         """Return a system on the host, given one of Scenic's own scenes.
 
         **Arguments:**
-
         - `function(scene) -> Trace`: of Scenic's `Scene`; `function(scene, seed)` with `seeded`.
         - `options`: those of `verifai_jax.blackbox`, such as `workers` and `timeout`. A worker
           compiles the program once.
-
         **Raises:** as `verifai_jax.blackbox`.
         """
         if not callable(function):
@@ -143,7 +135,6 @@ class ScenicProgram:
         draw depends on the row alone.
 
         **Arguments:**
-
         - `steps`: the maximum number of steps of a simulation.
         - `records`: names of `record` statements, which become signals; all when left out.
         - `dt`: seconds of a step; the simulator's own when left out.
@@ -152,7 +143,6 @@ class ScenicProgram:
         - `timeout`: seconds of wall clock for one simulation; needs `workers`. A worker's first
           simulation compiles the program.
         - `options`: others of `verifai_jax.blackbox`.
-
         **Raises:** `ValueError` for steps, records or a step that can be none, and as
         `verifai_jax.blackbox`.
         """
@@ -182,10 +172,8 @@ class ScenicProgram:
         """Return Scenic's `Scene` of a row of a run's table.
 
         **Arguments:**
-
         - `run`: a `Run`, or its table.
         - `row`: number of the row, or the row itself.
-
         **Raises:** `IndexError` for a row that is not in the table, and as `scene`.
         """
         table = getattr(run, "table", run)
@@ -240,7 +228,6 @@ class ScenicProgram:
         """Draw a scene from above; returns the figure.
 
         **Arguments:**
-
         - `scene`: the scene of Scenic.
         - `path`: file to write the picture to.
         """
@@ -261,13 +248,10 @@ class ScenicProgram:
 
 POSE = ("position", "orientation", "parentOrientation", "heading", "yaw", "pitch", "roll")
 """Properties that `at` and `facing` set together."""
-
 UNWRITTEN = frozenset((*POSE, "shape", "regionContainedIn", "lastActions", "sensors"))
 """Properties that are written otherwise, or that say nothing about a scene that is drawn."""
-
 SIZE = ("width", "length", "height")
 """Properties that may come from a shape which is not written."""
-
 SHAPES = ("CylinderShape", "ConeShape", "SpheroidShape")
 """Shapes that are known by their name and the size of the object."""
 
@@ -284,7 +268,6 @@ def scene_code(scene: Any, planar: bool) -> str:
     in a comment. Requirements are left out, since they hold in this scene.
 
     **Arguments:**
-
     - `scene`: the scene of Scenic.
     - `planar`: Scenic's `mode2D`, in which the code is meant to be compiled.
     """

@@ -35,11 +35,8 @@ from verifai_jax.systems.scenic.sampling import LOCK, Refused, Sampling, _plain
 from verifai_jax.systems.scenic.values import Unsupported, as_vec, is_plain
 
 Check = Callable[[Values], Any]
-
 MAX_DECISIONS = 100_000
 """Decisions of Scenic that are kept: a run asks about some points more than once."""
-
-
 FIRST_SHOWN, SHOWN_EVERY = 2.0, 10.0
 """Seconds of one round of decisions after which a line says so, and seconds between such lines."""
 
@@ -109,7 +106,21 @@ class Constraint:
             case "IntersectionRequirement":
                 return _apart(requirement)
             case "ContainmentRequirement":
-                return _contained(requirement)
+                container, body = requirement.container, requirement.obj
+                polygons = (
+                    getattr(container, "polygons", None) if not is_random(container) else None
+                )
+                if polygons is None or kind_of(container) not in (
+                    *("PolygonalFootprintRegion", "PolygonalRegion", "RectangularRegion"),
+                    *("CircularRegion", "SectorRegion"),
+                ):
+                    raise Unsupported(
+                        f"a container that is not a fixed polygon ({kind_of(container)})"
+                    )
+                edges, convex = edges_of(polygons), is_convex(polygons)
+                if len(edges) > 2000:
+                    raise Unsupported(f"a container of {len(edges)} edges")
+                return lambda values: box_inside(rectangle_of(values.body(body)), edges, convex)
             case "VisibilityRequirement":
                 return _visible(requirement)
             case "CompiledRequirement":
@@ -194,20 +205,6 @@ def _apart(requirement: Any) -> Check:
     return lambda values: boxes_apart(
         rectangle_of(values.body(one)), rectangle_of(values.body(other))
     )
-
-
-def _contained(requirement: Any) -> Check:
-    container, body = requirement.container, requirement.obj
-    polygons = getattr(container, "polygons", None) if not is_random(container) else None
-    if polygons is None or kind_of(container) not in (
-        *("PolygonalFootprintRegion", "PolygonalRegion", "RectangularRegion"),
-        *("CircularRegion", "SectorRegion"),
-    ):
-        raise Unsupported(f"a container that is not a fixed polygon ({kind_of(container)})")
-    edges, convex = edges_of(polygons), is_convex(polygons)
-    if len(edges) > 2000:
-        raise Unsupported(f"a container of {len(edges)} edges")
-    return lambda values: box_inside(rectangle_of(values.body(body)), edges, convex)
 
 
 def _visible(requirement: Any) -> Check:

@@ -37,7 +37,6 @@ from verifai_jax.systems.scenic.naming import leaf_names, owner_names, unique
 
 SEED = "seed"
 """Name of the feature that seeds what has no inverse."""
-
 COMPUTED = {
     *("OperatorDistribution", "AttributeDistribution", "FunctionDistribution"),
     *("MethodDistribution", "VectorOperatorDistribution", "VectorMethodDistribution"),
@@ -45,10 +44,8 @@ COMPUTED = {
     *("MultiplexerDistribution", "Options", "VerifaiOptions", "UniformDistribution"),
 }
 """Distributions of Scenic that draw nothing themselves."""
-
 GUESSES = 64
 """Random positions that are tried for what a scene does not tell."""
-
 LOCK = threading.RLock()
 """Held while Scenic computes."""
 
@@ -154,9 +151,7 @@ class Sampling:
         """Return the value of each node at these features, as Scenic keeps them.
 
         **Arguments:**
-
         - `features`: numbers and choices by name, as `FeatureSpace.unflatten` gives them.
-
         **Raises:** `Refused` where Scenic refuses the scene while it draws it.
         """
         distributions = sys.modules["scenic.core.distributions"]
@@ -219,10 +214,7 @@ class Sampling:
         return scene
 
     def check_own(self, scene: Any) -> None:
-        """Refuse a scene that does not come from this compilation of the program.
-
-        **Raises:** `ValueError`.
-        """
+        """Refuse a scene that does not come from this compilation of the program."""
         if not hasattr(scene, "sample") or not hasattr(scene, "dynamicScenario"):
             raise ValueError(f"a scene is one that Scenic draws; got {type(scene).__name__}")
         if scene.dynamicScenario is not self.scenario.dynamicScenario:

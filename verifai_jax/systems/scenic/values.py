@@ -29,7 +29,6 @@ def function(name: str) -> Callable[..., Any]:
 
 
 ARRAY_NAMES = {"atan2": "arctan2", "acos": "arccos", "asin": "arcsin", "atan": "arctan"}
-
 sin, cos, sqrt, atan2 = map(function, ("sin", "cos", "sqrt", "atan2"))
 
 

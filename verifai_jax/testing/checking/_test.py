@@ -25,7 +25,6 @@ from verifai_jax.testing.checking.check import BUDGET, Check, CheckOutcome, Coun
 
 MARK = "verifai_jax_check"
 """Attribute of a test function by which the pytest plugin knows it."""
-
 TESTED = "verifai_jax_problem"
 """Attribute of a test function with its problem, or the name of it."""
 
@@ -48,7 +47,6 @@ def test(
     shrunk and added to the corpus. Under pytest `--vj-budget` and `--vj-seed` go first.
 
     **Arguments:**
-
     - `problem`: the problem, or `FILE.py:NAME`; one file is loaded once for all tests.
     - `budget`: simulations at most.
     - `max_failure_probability`: accept failures that are as rare, or rarer; the test passes only
@@ -59,10 +57,8 @@ def test(
     - `corpus`: folder of saved counterexamples, from the root of the project; by default
       `counterexamples`, or pytest's setting `vj_corpus`.
     - `rename`: new names of features that older files of the corpus have.
-
     **Returns:** a decorator of a test function, which is called after the test has passed; a
     parameter `run` gets the `Run`, and all others are pytest's fixtures.
-
     **Raises:** `TypeError` for something that is not a problem; `ValueError` for numbers out of
     range, and for a budget with which no test could pass.
     """

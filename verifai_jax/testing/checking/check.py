@@ -82,13 +82,10 @@ class Check:
         """Replay the corpus, and spend the budget where all of it is fixed.
 
         **Arguments:**
-
         - `problem`: to be tested.
         - `corpus`: folder of saved counterexamples, to which a new one is added; None for none.
         - `target`: the command line's name of the problem, for the files of the corpus.
-
         **Returns:** the outcome.
-
         **Raises:** `ValueError` for a corpus that is a file; as `falsify`.
         """
         replayed = None

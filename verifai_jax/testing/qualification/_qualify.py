@@ -21,11 +21,8 @@ def qualify(only: Sequence[str] | None = None) -> Qualification:
     """Run the tool's own oracles here: definitions, closed forms, kills, replays.
 
     **Arguments:**
-
     - `only`: names of oracles; all when left out, which takes a minute or two.
-
     **Returns:** the outcomes, with versions and one hash of all files of the package.
-
     **Raises:** `UnknownNameError` for the name of no oracle; it lists all names.
     """
     check_names("oracle", only or (), ORACLES)

@@ -209,10 +209,7 @@ _BY_ORACLE = {
         "a logarithmic feature is uniform",
         "weights of choices are ignored",
     ),
-    "steps": (
-        "an integrator is of lower order than it says",
-        "a finer step is not finer",
-    ),
+    "steps": ("an integrator is of lower order than it says", "a finer step is not finer"),
     "replays": (
         "the same seed gives another table",
         "another seed gives the same table",
@@ -228,10 +225,7 @@ _BY_ORACLE = {
         "a rate is given for samples that a search has chosen",
         "a shrunk counterexample does not fail",
     ),
-    "confirmations": (
-        "a failure of a coarse step alone is confirmed",
-        "a real failure is refuted",
-    ),
+    "confirmations": ("a failure of a coarse step alone is confirmed", "a real failure is refuted"),
     "comparisons": (
         "the two sides of a pair have other features or random numbers",
         "better and worse are exchanged",
@@ -241,7 +235,6 @@ _BY_ORACLE = {
         "a claim is said to bear a greater shift of the prior than it does",
     ),
 }
-
 HAZARDS = {
     f"E{number:02}": hazard
     for number, hazard in enumerate(

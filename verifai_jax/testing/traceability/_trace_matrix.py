@@ -47,7 +47,6 @@ def trace_matrix(
     formula, what the requirement says, the model, or the run that claims are about.
 
     **Arguments:**
-
     - `problems`: problems, or files `FILE.py` and names `FILE.py:NAME`, which are run.
     - `requirements`: a file, or what it says; those of the problems when left out.
     - `tests`: test functions of `vj.test`, files, and folders whose files `test_*.py` are run; a
@@ -55,9 +54,7 @@ def trace_matrix(
     - `runs`: folders of runs, and folders of such folders.
     - `reports`: files and folders of reports; those in the folders of the runs are always found.
       What is None is not asked for, and not missing.
-
     **Returns:** the matrix.
-
     **Raises:** `TargetError` for a file that cannot be run; `ValueError` for a damaged record,
     claims of another form, and two problems of one name.
     """
@@ -132,9 +129,7 @@ def _gaps_of(
             yield Gap("missing", kind, name, f"{MISSING_LINK[kind]} {name} {where}")
 
 
-def _problems(
-    given: Problem | Location | Sequence[Problem | Location],
-) -> Iterator[Problem]:
+def _problems(given: Problem | Location | Sequence[Problem | Location]) -> Iterator[Problem]:
     items = [given] if isinstance(given, Problem | str | Path) else given
     for item in items:
         if isinstance(item, Problem):
@@ -285,11 +280,7 @@ class Evidence:
         """Yield sentences on what has changed since.
 
         **Arguments:**
-
-        - `name`: the name of the formula.
-        - `formula`: its text now.
         - `about`: what it stands for now.
-        - `model`: the model of the problem now.
         """
         if (was := self.formulas[name]) != formula:
             yield f"{name}: the formula has changed since {self.name}: {was} then, {formula} now"

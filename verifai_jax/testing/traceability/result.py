@@ -18,7 +18,6 @@ from verifai_jax.reports.page import Page, Section, write_page
 
 if TYPE_CHECKING:
     import pandas as pd
-
 LINKS = ("tests", "runs", "claims", "reports")
 """Links of the chain after the problem, each with a column of its own."""
 

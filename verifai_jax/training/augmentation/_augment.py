@@ -76,7 +76,6 @@ def augment(
     - `pca_kept`, `rules_kept`: the same, of which only those are added on which the network errs.
 
     **Arguments:**
-
     - `task`: what is trained, and how its inputs are rendered.
     - `arms`: names of arms, or `"all"`; by default `none`, `random`, `counterexamples`, and
       `standard` where the task has a transformation.
@@ -96,10 +95,8 @@ def augment(
     - `progress`: show a progress bar; by default on a terminal or in a notebook.
     - `even_if_changed`: whether to go on with finished work of a folder although files of the task
       are others than those that were recorded when it began.
-
     **Returns:** the result: a table with a row for each arm and seed, and what follows from it. One
     that was interrupted (Ctrl-C) has the finished rows; its `complete` is False.
-
     **Raises:** before anything is trained, `UnknownNameError` for unknown arms, searches and
     options; `ValueError` for numbers out of range, and for a search that needs gradients that the
     task has not; `TaskError` for a task whose parts do not fit; `CacheError` for a folder that is

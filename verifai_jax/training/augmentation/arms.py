@@ -164,7 +164,6 @@ ARMS: dict[str, Arm] = {
     "rules_kept": rules_kept,
 }
 """Arms by name."""
-
 FROM_TABLE = tuple(name for name in ARMS if name not in ("none", "random", "standard"))
 """Arms that need the error table."""
 

@@ -87,7 +87,6 @@ class Workshop:
     """Draws, renders and judges examples of one task, with functions that compile once.
 
     **Arguments:**
-
     - `task`: the task.
     """
 

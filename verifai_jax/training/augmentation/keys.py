@@ -15,9 +15,6 @@ def purpose_key(seed: int, number: int, purpose: int) -> Key[Array, ""]:
     """Return the random key of a purpose, the same for all arms of a repetition.
 
     **Arguments:**
-
-    - `seed`: the seed of the augmentation.
-    - `number`: the number of the repetition.
     - `purpose`: one of the constants of this file.
     """
     repetition = jax.random.fold_in(run_keys(seed)[0], number)

@@ -59,10 +59,8 @@ class Outcome(NamedTuple):
         """Compare all arms with one of them, seed by seed.
 
         **Arguments:**
-
         - `metric`: the column to compare.
         - `reference`: the arm that is subtracted.
-
         **Returns:** the mean difference of each other arm, over the seeds in which both are finite.
         """
         other = self.values(reference, metric)

@@ -93,13 +93,10 @@ class Augmentation(InNotebook):
         is not compared.
 
         **Arguments:**
-
         - `metric`: name of a column that measures a network.
         - `reference`: the arm that is subtracted, or `"base"`.
-
         **Returns:** the mean difference of each other arm, over the seeds in which both are finite;
         without an interval where that is one seed.
-
         **Raises:** `UnknownNameError` for an arm or a metric that the table has not.
         """
         check_names("metric", [metric], self.metrics)
@@ -120,10 +117,8 @@ class Augmentation(InNotebook):
         """Return the inputs that an arm added, rendered again.
 
         **Arguments:**
-
         - `arm`: name of the arm.
         - `seed`: number of the seed.
-
         **Raises:** `UnknownNameError` for an arm that the table has not; `ValueError` for a seed.
         """
         check_names("arm", [arm], self.arms)
@@ -142,20 +137,14 @@ class Augmentation(InNotebook):
         return Workshop(self.task)
 
     def plot(
-        self,
-        path: str | Path | None = None,
-        metric: str = "error",
-        reference: str = "none",
+        self, path: str | Path | None = None, metric: str = "error", reference: str = "none"
     ) -> Figure:
         """Draw a metric of each arm and its paired difference with intervals.
 
         **Arguments:**
-
         - `path`: file that the picture is written to, if given.
         - `metric`, `reference`: as in `compare`.
-
         **Returns:** the figure.
-
         **Raises:** as `compare`.
         """
         draw = lazy_import("verifai_jax.reports.plotting.augmentation", "plot_arms")
@@ -171,13 +160,10 @@ class Augmentation(InNotebook):
         """Draw inputs that an arm added, for tasks whose inputs are images.
 
         **Arguments:**
-
         - `path`: file that the picture is written to, if given.
         - `arm`, `seed`: as in `examples`.
         - `count`: images at most.
-
         **Returns:** the figure.
-
         **Raises:** as `examples`; `ValueError` for inputs that are no images, or an arm that added
         nothing.
         """

@@ -27,19 +27,9 @@ from verifai_jax.core.store.log import Arrays
 from verifai_jax.core.user_errors import explain_user_error
 from verifai_jax.falsification import falsify
 from verifai_jax.search import Search
+from verifai_jax.training.augmentation import keys
 from verifai_jax.training.augmentation.arms import ARMS, FROM_TABLE, Addition, Base
 from verifai_jax.training.augmentation.examples import Examples, Judgement, Workshop, transformed
-from verifai_jax.training.augmentation.keys import (
-    CHOICE,
-    FURTHER,
-    INDEPENDENT,
-    INITIAL,
-    MEASURES,
-    SEARCH,
-    TEST,
-    TRAINING,
-    purpose_key,
-)
 from verifai_jax.training.augmentation.outcome import BASE, NOT_FINITE, TRAINED
 from verifai_jax.training.augmentation.result import Augmentation
 from verifai_jax.training.augmentation.searched import searched_problem
@@ -143,7 +133,7 @@ class Study:
         """Examples on which an independently trained network errs."""
 
         def compute() -> Arrays:
-            return encode_frame(_hard_rows(Seed(self, INDEPENDENT), self.plan.hard))
+            return encode_frame(_hard_rows(Seed(self, keys.INDEPENDENT), self.plan.hard))
 
         return self.workshop.render(decode_frame(self.cache.remember("hard", compute)))
 
@@ -182,19 +172,21 @@ class Seed:
 
     def key(self, purpose: int) -> Key[Array, ""]:
         """Return the random key of a purpose, the same for all arms."""
-        return purpose_key(self.plan.seed, self.number, purpose)
+        return keys.purpose_key(self.plan.seed, self.number, purpose)
 
     @cached_property
     def initial(self) -> Examples:
         """The initial set."""
         space = self.task.training_space or self.task.space
-        return self.workshop.render(self.workshop.draw(space, self.key(INITIAL), self.plan.initial))
+        return self.workshop.render(
+            self.workshop.draw(space, self.key(keys.INITIAL), self.plan.initial)
+        )
 
     @cached_property
     def test(self) -> Examples:
         """The uniform test."""
         return self.workshop.render(
-            self.workshop.draw(self.task.space, self.key(TEST), self.plan.test)
+            self.workshop.draw(self.task.space, self.key(keys.TEST), self.plan.test)
         )
 
     @cached_property
@@ -203,7 +195,7 @@ class Seed:
         known = self.study.weights.get((BASE, self.number))
         if known is not None:
             return known
-        weights = self.study.train(self.initial, None, self.plan.steps, self.key(TRAINING))
+        weights = self.study.train(self.initial, None, self.plan.steps, self.key(keys.TRAINING))
         one = self.initial.take(slice(0, 1))
         self.task.check_network(weights, one.inputs, one.labels)
         return weights
@@ -214,7 +206,7 @@ class Seed:
 
         def compute() -> Arrays:
             problem = searched_problem(self.task, self.base, self.plan.search, self.workshop)
-            seed = int(jax.random.bits(self.key(SEARCH)) >> 1)
+            seed = int(jax.random.bits(self.key(keys.SEARCH)) >> 1)
             run = falsify(
                 problem, self.plan.search, self.plan.budget,
                 seed=seed, confirm=False, progress=False,
@@ -229,7 +221,7 @@ class Seed:
 
     def base_entry(self) -> "Finished":
         """Train and measure the base."""
-        numbers = self.study.measure(self.base, self.test, self.key(MEASURES))
+        numbers = self.study.measure(self.base, self.test, self.key(keys.MEASURES))
         addition = Addition(_no_rows(self.task))
         return self._finished(numbers, addition, np.zeros(0), self.base)
 
@@ -246,7 +238,7 @@ class Seed:
             initial=self.initial,
             table=self.table if arm in FROM_TABLE else nothing,
             added=self.plan.added,
-            key=self.key(CHOICE),
+            key=self.key(keys.CHOICE),
         )
         addition = ARMS[arm](base)
         examples = self.workshop.render(addition.rows)
@@ -254,8 +246,10 @@ class Seed:
             examples = transformed(self.task, examples, base.key)
         judged = self.workshop.judge(self.base, examples)
         union = self.initial.join(examples)
-        weights = self.study.train(union, self.base, self.plan.further_steps, self.key(FURTHER))
-        numbers = self.study.measure(weights, self.test, self.key(MEASURES))
+        weights = self.study.train(
+            union, self.base, self.plan.further_steps, self.key(keys.FURTHER)
+        )
+        numbers = self.study.measure(weights, self.test, self.key(keys.MEASURES))
         addition = replace(addition, rows=examples.rows)
         return self._finished(numbers, addition, judged.wrongness, weights)
 
@@ -305,7 +299,7 @@ def _presence(judged: Judgement) -> dict[str, float]:
 def _hard_rows(seed: Seed, count: int) -> pd.DataFrame:
     """Draw features on which the base network of a seed errs, `count` at most."""
     workshop, task = seed.workshop, seed.task
-    parts, found, key = [_no_rows(task)], 0, seed.key(TEST)
+    parts, found, key = [_no_rows(task)], 0, seed.key(keys.TEST)
     for _ in range(_PER_HARD):
         key, now = jax.random.split(key)
         rows = workshop.draw(task.space, now, count)

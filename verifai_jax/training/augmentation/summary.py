@@ -46,7 +46,6 @@ def findings(outcome: Outcome, metric: str = "error") -> list[str]:
     An arm counts as better or worse where its interval of paired differences excludes zero.
 
     **Arguments:**
-
     - `outcome`: the numbers.
     - `metric`: name of the metric.
     """

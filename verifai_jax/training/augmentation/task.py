@@ -34,7 +34,6 @@ Labels: TypeAlias = PyTree
 """Labels of inputs, each leaf with a leading axis `[n]`."""
 Transformation: TypeAlias = Callable[[Inputs, Labels, Key[Array, ""]], tuple[Inputs, Labels]]
 """A transformation of labelled inputs that keeps the labels true, or corrects them."""
-
 MARGIN = "margin"
 """Signal of the problem of a network: minus the wrongness."""
 _RESERVED = (*RESERVED, "arm", "seed", "wrongness")
@@ -52,7 +51,6 @@ class SupervisedTask:
     """A network to train, and labelled inputs that are rendered from features.
 
     **Arguments:**
-
     - `name`: how results call it.
     - `space`: a `FeatureSpace`, or a dictionary of domains, of all inputs that the network is for.
     - `render`: features -> one input.
@@ -75,7 +73,6 @@ class SupervisedTask:
     - `lanes`: inputs that are rendered together.
     - `black_box`: True where render, label, predict, wrongness, present and detected are plain
       Python that JAX cannot trace; they get NumPy arrays, and searches do without gradients.
-
     **Raises:** `TaskError` for an empty name, a function that is none, spaces that do not fit, or a
     feature with the name of a column of results.
     """
@@ -168,7 +165,6 @@ class SupervisedTask:
         the task is a black box.
 
         **Arguments:**
-
         - `weights`: the weights of the network.
         """
         if self.black_box:

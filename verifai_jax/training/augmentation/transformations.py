@@ -42,9 +42,7 @@ def flip(share: float = 0.5) -> Transformation:
     """Return a transformation that mirrors images left to right.
 
     **Arguments:**
-
     - `share`: the share of images that are mirrored.
-
     **Raises:** `ValueError` for a share out of range.
     """
     check_fraction("share", share, zero=True, one=True)
@@ -63,9 +61,7 @@ def shift(pixels: int) -> Transformation:
     What comes in from beyond an edge repeats the edge.
 
     **Arguments:**
-
     - `pixels`: by which an image moves at most, in each direction.
-
     **Raises:** `ValueError` unless it is a positive integer.
     """
     check_count("pixels", pixels)
@@ -90,9 +86,7 @@ def brightness(max_change: float) -> Transformation:
     """Return a transformation that multiplies images by factors of `1 - most` to `1 + most`.
 
     **Arguments:**
-
     - `max_change`: change of brightness at most, a share.
-
     **Raises:** `ValueError` for a share out of range.
     """
     return _scaled(max_change, jnp.zeros_like)
@@ -102,9 +96,7 @@ def contrast(max_change: float) -> Transformation:
     """Return a transformation that scales images around their mean by `1 - most` to `1 + most`.
 
     **Arguments:**
-
     - `max_change`: change of contrast at most, a share.
-
     **Raises:** `ValueError` for a share out of range.
     """
 

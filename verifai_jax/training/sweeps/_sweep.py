@@ -60,7 +60,6 @@ def sweep(
     same seed gives the same table on one machine.
 
     **Arguments:**
-
     - `study`: hyper-parameters, trainer and specification.
     - `search`: over the hyper-parameters: a name, a `Search`, `"optuna:tpe"`, or an
       `OptunaSampler`. One that learns proposes in rounds and minimises the failure rate, then the
@@ -89,10 +88,8 @@ def sweep(
       `halving`, what goes on beyond a checkpoint is trained from its beginning, wherever it goes.
     - `even_if_changed`: whether to go on with finished work of a folder although files of the study
       are others than those that were recorded when it began; the record then says so.
-
     **Returns:** the policies with their returns and certificates. An interrupted sweep (Ctrl-C, out
     of time) returns its finished part; `record.complete` is False.
-
     **Raises:** before anything trains, `StudyError` and `UnknownNameError` as `Study.check`;
     `ValueError` for options out of range and for a search that needs gradients; `UnknownNameError`
     for an unknown search or option; `CacheError` for a folder that is damaged, foreign, of another
@@ -131,10 +128,7 @@ def sweep(
     if proposer.learns:
         # Its proposals depend on both.
         options |= {"configurations": configurations, "batch": proposer.batch}
-    with (
-        locked_cache(folder) as cache,
-        Clock(study.name, max_seconds, progress) as clock,
-    ):
+    with locked_cache(folder) as cache, Clock(study.name, max_seconds, progress) as clock:
         sources = cache.claim(fingerprint(study, options), study.sources(), even_if_changed)
         if note is not None:
             cache.note("command", dict(note))

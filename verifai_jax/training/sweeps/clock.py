@@ -27,7 +27,6 @@ class Clock:
     `seconds` are the seconds spent in each stage; compilation is not counted in training.
 
     **Arguments:**
-
     - `name`: the name of the sweep, before the progress bar.
     - `max_seconds`: after which `check` raises `OutOfTime`; None for no limit.
     - `show`: whether to draw a bar; None draws one on a terminal and in a notebook.
@@ -52,7 +51,6 @@ class Clock:
         """Time the statements inside as a stage.
 
         **Arguments:**
-
         - `name`: the name of the stage.
         - `total`: units of work in it, and `unit`, their name.
         - `share`: the share of `max_seconds`, after which the stage is out of time.

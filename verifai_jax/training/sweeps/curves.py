@@ -30,7 +30,6 @@ def check_curve(formula: Formula | str) -> Formula:
     """Parse a formula and check that its signals are those of a learning curve.
 
     **Returns:** the formula.
-
     **Raises:** `FormulaSyntaxError` for text that does not parse; `UnknownNameError` for another
     signal, with the nearest; `TypeError` for something that is not a formula.
     """
@@ -51,12 +50,9 @@ def curve_trace(
     value is that of the first: those episodes began with the training.
 
     **Arguments:**
-
     - `steps`: environment steps taken by the end of each update.
     - `mean_return`: the mean return of the episodes that ended in each update; NaN where none did.
-
     **Returns:** the trace, whose time is environment steps.
-
     **Raises:** `ValueError` where no episode ended at all, or for steps that do not increase.
     """
     steps, known = np.asarray(steps, np.float64), np.asarray(mean_return, np.float64)
@@ -87,13 +83,10 @@ def curve_robustness(
     """Return the robustness of a formula on a learning curve.
 
     **Arguments:**
-
     - `formula`: over the signal `return`, bounds in environment steps from 0 on, rounded down to
       whole updates. After the end of the curve its last value stays.
     - `steps`, `mean_return`: the curve, as in `curve_trace`.
-
     **Returns:** the robustness in units of the return; NaN where no episode ended.
-
     **Raises:** as `check_curve`.
     """
     formula = check_curve(formula)

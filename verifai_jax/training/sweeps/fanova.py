@@ -13,7 +13,6 @@ from jaxtyping import Float
 
 if TYPE_CHECKING:
     from sklearn.ensemble import ExtraTreesRegressor
-
 _MAX_ENTRIES = 2**22
 """Pairs of boxes times inputs in one block of memory."""
 
@@ -49,7 +48,6 @@ def leaf_boxes(
     """Return the leaves of a forest of regression trees over the unit cube.
 
     **Arguments:**
-
     - `forest`: the forest of scikit-learn, fitted.
     - `edges`: borders of the cells of each input, to the nearest of which thresholds move; None for
       a continuous input.

@@ -22,10 +22,7 @@ def fingerprint(study: Study, options: Mapping[str, Any]) -> dict[str, Any]:
     Code is described by its name only.
 
     **Arguments:**
-
-    - `study`: the study that is swept.
     - `options`: options of the sweep, as plain data.
-
     **Returns:** nested dictionaries of plain data.
     """
     problem = study.untrained_problem()

@@ -69,10 +69,6 @@ class FunctionRuns(TrainingRuns):
             )
 
     def add(self, values: Mapping[str, object], seed: int) -> int:
-        """Add a training.
-
-        **Returns:** its number.
-        """
         steps = whole_number(values.get(STEPS, self._trainer.steps), STEPS)
         key = digest({name: values[name] for name in sorted(values)})
         checkpoints = self.study.checkpoints_of(steps)
@@ -97,7 +93,6 @@ class FunctionRuns(TrainingRuns):
             self.forget(numbers)
 
     def forget(self, numbers: Sequence[int]) -> None:
-        """Delete the folders of trainings that do not continue."""
         for number in numbers:
             shutil.rmtree(self._folder_of(number), ignore_errors=True)
 
@@ -183,13 +178,11 @@ def train_once(
     """Call the function of a trainer, and turn its policy into arrays; a process runs this.
 
     **Arguments:**
-
     - `train`: see `Trainer`.
     - `observation`: an example for policies that do not say what they observe, or None.
     - `call`: the hyper-parameters `values`, the `steps` in all, the `folder` to resume from, and
       `starts` if it gets them.
     - `seed`: training seed.
-
     **Returns:** the arrays, which the pool hands on as they are.
     """
     random.seed(seed)

@@ -22,12 +22,10 @@ class Halving:
     """Successive halving: keep the best 1/reduction of the configurations at each checkpoint.
 
     **Arguments:**
-
     - `reduction`: greater than 1; of so many configurations one continues, rounded up.
     - `by`: the criterion. `"return"` is the nominal return at the checkpoint; `"safety"` is the
       failure rate of the closed loop in a few simulations, then the worst robustness, then the
       return.
-
     **Raises:** `ValueError` for a reduction of 1 or less; `UnknownNameError` for another criterion.
     """
 
@@ -48,10 +46,8 @@ class Halving:
         """Choose the configurations that continue.
 
         **Arguments:**
-
         - `objective`: the objective of each configuration, by its number; the least is best, and
           NaN is worst.
-
         **Returns:** numbers of the configurations, in ascending order; of equal ones the first
         continue.
         """

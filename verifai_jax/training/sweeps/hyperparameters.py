@@ -16,7 +16,6 @@ from verifai_jax.features.domain import Domain
 
 Hyperparameters: TypeAlias = dict[str, Any]
 """Plain Python values of hyper-parameters, by name."""
-
 _MAX_PROBES = 64
 """Choices of a domain up to which each is checked; only the ends of larger ones are."""
 _COMPANIONS = 16

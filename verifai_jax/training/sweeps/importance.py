@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from sklearn.ensemble import ExtraTreesRegressor
 
     from verifai_jax.analysis._pca import Components
-
-
 TARGETS = {"failure_rate": "failing", "nominal_return": "return"}
 """Columns that are explained, with their names in the summary."""
 MIN_ROWS_TO_LEARN = 10
@@ -66,7 +64,6 @@ class HyperparameterImportance(InNotebook):
     """The importance of each hyper-parameter for failing and for the return.
 
     **Fields:**
-
     - `table`: one row for each hyper-parameter, the most important first. For each of
       `failure_rate` and `nominal_return` it has the loss in R^2 on held-out configurations when the
       column is shuffled, with `_low` and `_high` two standard deviations of the repetitions away;
@@ -102,11 +99,8 @@ class HyperparameterImportance(InNotebook):
         """Draw the shares of the variance, or the trends where no model is reliable.
 
         **Arguments:**
-
         - `path`: file that the picture is written to, if given.
-
         **Returns:** the Matplotlib figure.
-
         **Raises:** `ValueError` with too few configurations.
         """
         if not self.scores:
@@ -200,13 +194,11 @@ def hyperparameter_importance(
     Nothing is trained or simulated.
 
     **Arguments:**
-
     - `table`: with columns `configuration`, `steps`, `verdict`, `failure_rate`, `nominal_return`
       and the hyper-parameters.
     - `hyperparameters`: names of their columns; those that do not vary are left out. `steps` is
       one of them where it varies.
     - `space`: the space of the study; None scales columns between their least and greatest entries.
-    - `name`: the name of the study.
     - `repeats`: number of times that the folds are drawn and each column is shuffled.
     - `seed`: the seed of folds, shuffles and forests.
     """
@@ -345,9 +337,7 @@ def _inputs(
 
 
 def _components(
-    table: "pd.DataFrame",
-    inputs: Sequence[_Input],
-    which: Literal["counterexamples", "safe"],
+    table: "pd.DataFrame", inputs: Sequence[_Input], which: Literal["counterexamples", "safe"]
 ) -> "Components | None":
     """Compute principal components of the ordered hyper-parameters of unsafe or safe rows."""
     import pandas as pd

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
     from optuna.samplers import BaseSampler
     from optuna.trial import Trial
-
 _SAMPLERS = {
     "tpe": "TPESampler",
     "random": "RandomSampler",
@@ -45,10 +44,8 @@ class OptunaSampler:
     """A sampler of Optuna with its options, such as `OptunaSampler("tpe", {"multivariate": 1})`.
 
     **Arguments:**
-
     - `name`: `tpe`, `random`, `cmaes`, `gp`, `nsgaii` or `qmc`.
     - `options`: keyword arguments of the sampler's class; the seed is the sweep's.
-
     **Raises:** `UnknownNameError` for another name; `ValueError` for a seed among the options.
     """
 
@@ -65,11 +62,9 @@ class OptunaSampler:
         """Make the proposer of this sampler.
 
         **Arguments:**
-
         - `space`: the space of the hyper-parameters.
         - `seed`: the seed of the sampler.
         - `batch`: configurations in a round.
-
         **Raises:** `MissingExtra` without Optuna or a package that the sampler needs; `TypeError`
         for options that the sampler does not have.
         """
@@ -87,7 +82,6 @@ class OptunaProposer:
     """A proposer that asks an Optuna study for trials.
 
     **Arguments:**
-
     - `description`: the sampler by name and options.
     - `sampler`: Optuna's own object.
     - `space`: the space of the hyper-parameters.
@@ -97,11 +91,7 @@ class OptunaProposer:
     learns = True
 
     def __init__(
-        self,
-        description: OptunaSampler,
-        sampler: "BaseSampler",
-        space: FeatureSpace,
-        batch: int,
+        self, description: OptunaSampler, sampler: "BaseSampler", space: FeatureSpace, batch: int
     ) -> None:
         self.description, self.space, self.batch = description, space, batch
         optuna = require("optuna", "optuna")

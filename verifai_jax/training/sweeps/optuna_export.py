@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
     from optuna.storages import BaseStorage
     from optuna.trial import FrozenTrial
-
 METRICS = ("upper end of the failure probability", "nominal return")
 """Names of a trial's values."""
 DIRECTIONS = ("minimize", "maximize")
@@ -54,14 +53,11 @@ def export_to_optuna(
     one. A domain that Optuna lacks becomes the range of the values that were tried.
 
     **Arguments:**
-
     - `configurations`: one row for each, as `Sweep.configurations`.
     - `hyperparameters`: names of their columns.
     - `space`: the space of the hyper-parameters, where it is known.
     - `used`: names of the hyper-parameters of each algorithm; empty if all have all.
-    - `name`: the name of the study.
     - `storage`: the storage of the study; in memory when left out.
-
     **Raises:** `MissingExtra` without Optuna.
     """
     optuna = require("optuna", "optuna")

@@ -55,25 +55,14 @@ class Proposer(Protocol):
 
 
 def make_proposer(
-    search: object,
-    space: FeatureSpace,
-    *,
-    configurations: int,
-    seed: int,
-    batch: int | None = None,
+    search: object, space: FeatureSpace, *, configurations: int, seed: int, batch: int | None = None
 ) -> Proposer:
     """Make the proposer of a search.
 
     **Arguments:**
-
     - `search`: a name, `"optuna:NAME"`, a `Search`, or an `OptunaSampler`.
-    - `space`: the space of the hyper-parameters.
     - `configurations`: number of proposals in all.
-    - `seed`: the seed of the proposals.
     - `batch`: configurations in a round.
-
-    **Returns:** the proposer.
-
     **Raises:** `UnknownNameError` for another name; `ValueError` for a search that needs gradients
     or does not fit this space; `TypeError` for something that is not a search; `MissingExtra`
     without Optuna.
@@ -144,12 +133,10 @@ def objective(
     among equal ones of these the return, squeezed into a hundredth.
 
     **Arguments:**
-
     - `failure_rate`: between 0 and 1.
     - `worst_robustness`: the least robustness of all simulations.
     - `nominal_return`: mean return on the nominal task.
     - `return_range`: least and greatest nominal return of the first round.
-
     **Returns:** the objective; None if the failure rate is not known.
     """
     if not math.isfinite(failure_rate):

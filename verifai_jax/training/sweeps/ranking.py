@@ -11,7 +11,6 @@ from verifai_jax.statistics.pareto import fronts
 
 if TYPE_CHECKING:
     import pandas as pd
-
 FULL = 0.01
 """Part of the span of nominal returns within which a return counts as full."""
 _WORST_FIRST = ("unsafe", "undecided")

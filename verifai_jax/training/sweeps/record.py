@@ -12,10 +12,8 @@ from verifai_jax.rl.policy import Policy
 
 if TYPE_CHECKING:
     from verifai_jax.estimation.certification.result import Certificates
-
 TrainedPolicy: TypeAlias = Policy | LoadedPolicy
 """A policy of an algorithm of `rl`, or of anybody's function."""
-
 TRAINED, NONFINITE, STOPPED = "trained", "nonfinite", "stopped"
 """Statuses of a row: trained, with a number that is not finite, and stopped here by halving.
 
@@ -109,7 +107,6 @@ def algorithm_uses(used: Mapping[str, Sequence[str]], algorithm: object, name: s
     """Return whether an algorithm has a hyper-parameter.
 
     **Arguments:**
-
     - `used`: names of the hyper-parameters of each algorithm; one that is missing has all.
     - `algorithm`: name of the algorithm; None has all.
     - `name`: the name of the hyper-parameter.

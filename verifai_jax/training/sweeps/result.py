@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.lazy import lazy_import
+from verifai_jax.core.figure import Drawn, Reported
 from verifai_jax.core.sources import Change, list_changes
 from verifai_jax.core.targets import load_target
 from verifai_jax.core.trace import Trace
@@ -59,11 +58,10 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Sweep(Drawn):
+class Sweep(Drawn, Reported):
     """The policies of a sweep with their returns and certificates, as `sweep` returns them.
 
     **Fields:**
-
     - `record`: everything that was trained and certified, as plain data.
     - `study`: the study that was swept; None for a loaded sweep without it.
     - `space`: the space of the hyper-parameters; the study's if left out, None if it is not known.
@@ -77,7 +75,6 @@ class Sweep(Drawn):
 
     _picture = "sweep", "plot_sweep"
     """Return against failure probability, learning curves and importances."""
-
     record: SweepRecord
     study: Study | None = None
     space: FeatureSpace | None = None
@@ -230,7 +227,6 @@ class Sweep(Drawn):
         Nothing is trained or simulated. With too few configurations the result says so.
 
         **Arguments:**
-
         - `repeats`: number of times that the folds are drawn and each column is shuffled.
         - `seed`: the seed of folds, shuffles and forests.
         """
@@ -258,13 +254,10 @@ class Sweep(Drawn):
         An empty table does not mean that there is no failure: the certificate bounds that.
 
         **Arguments:**
-
         - `i`: number of the row; the best when left out.
         - `simulations`: budget of a search for more than those of the sweep; needs the study.
         - `search`, `seed`: of these simulations.
-
         **Returns:** columns of the problem's features, and `rho`, the robustness.
-
         **Raises:** as `problem` and `best`; `ValueError` where more are looked for and the model
         has changed since the sweep.
         """
@@ -362,19 +355,6 @@ class Sweep(Drawn):
     def _repr_html_(self) -> str:
         return format_html(self.findings)
 
-    def report(self, path: str | Path, **options: Any) -> Path:
-        """Write the evidence report on the sweep: one HTML file, and its claims as JSON next to it.
-
-        **Arguments:**
-
-        - `path`: the path of the HTML file.
-        - `options`: the options of `reports.write_report`: `units` and `reasons` of
-          hyper-parameters.
-
-        **Returns:** the path.
-        """
-        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
-
     def save(self, folder: str | Path) -> Path:
         """Write the sweep to a folder: table, policies, curves, record.
 
@@ -400,11 +380,9 @@ class Sweep(Drawn):
         return, to maximise.
 
         **Arguments:**
-
         - `storage`: place where Optuna stores it, such as `"sqlite:///sweep.db"`; memory when left
           out.
         - `name`: the name of the study there; the sweep's own when left out.
-
         **Raises:** `MissingExtra` without the package.
         """
         return export_to_optuna(
@@ -423,11 +401,9 @@ def load_sweep(folder: str | Path, study: Study | str | None = None) -> Sweep:
     The certificates are those of the table, and the recorded counterexamples.
 
     **Arguments:**
-
     - `folder`: the folder.
     - `study`: the study or its name, such as `"specs/cartpole.py:safe_training"`; needed for
       `.problem(i)` and further counterexamples. The files never name code to run.
-
     **Raises:** `FileNotFoundError` for a folder without a sweep; `SweepFileError` for a damaged
     one, one of another format, or a study of another name or with other hyper-parameters.
     """

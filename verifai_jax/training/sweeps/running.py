@@ -15,20 +15,13 @@ from verifai_jax.estimation.certification._certify import certify
 from verifai_jax.estimation.certification.result import Certificate, Certificates
 from verifai_jax.rl._evaluate import batched_mean_returns
 from verifai_jax.search import Search
+from verifai_jax.training.sweeps import record
 from verifai_jax.training.sweeps.clock import CERTIFYING, TRAINING, Clock, OutOfTime
 from verifai_jax.training.sweeps.fingerprint import digest
 from verifai_jax.training.sweeps.function_runs import FunctionRuns
 from verifai_jax.training.sweeps.halving import SAFETY, Halving
 from verifai_jax.training.sweeps.hyperparameters import Hyperparameters
 from verifai_jax.training.sweeps.proposers import WORST, Proposer, objective
-from verifai_jax.training.sweeps.record import (
-    NONFINITE,
-    STOPPED,
-    TRAINED,
-    SweepRecord,
-    TrainedPolicy,
-    error_status,
-)
 from verifai_jax.training.sweeps.rows import Row, columns_of, tabulate
 from verifai_jax.training.sweeps.study import Study
 from verifai_jax.training.sweeps.trainer import FunctionTrainer
@@ -84,7 +77,7 @@ class RunningSweep:
         kind = FunctionRuns if by_function else TrainingRuns
         self.runs = kind(self.study, self.cache, self.clock, self.executor)
 
-    def run(self, proposer: Proposer) -> SweepRecord:
+    def run(self, proposer: Proposer) -> record.SweepRecord:
         """Train and certify, or as much of it as there is time for."""
         complete, certificates = True, None
         try:
@@ -205,7 +198,7 @@ class RunningSweep:
         checkpoint = self.runs.checkpoint(*entry)
         return checkpoint is not None and checkpoint.finite
 
-    def _policy(self, entry: tuple[int, int]) -> TrainedPolicy:
+    def _policy(self, entry: tuple[int, int]) -> record.TrainedPolicy:
         checkpoint = self.runs.checkpoint(*entry)
         assert checkpoint is not None
         return checkpoint.policy
@@ -308,7 +301,9 @@ class RunningSweep:
             self._notify(entry, {"nominal_return": self.returns[entry], **numbers})
         return certificates
 
-    def _certify_policies(self, policies: Sequence[TrainedPolicy], **options: Any) -> Certificates:
+    def _certify_policies(
+        self, policies: Sequence[record.TrainedPolicy], **options: Any
+    ) -> Certificates:
         def remember(name: str, compute: Callable[[], Arrays]) -> Arrays:
             try:
                 self.clock.check()
@@ -330,7 +325,7 @@ class RunningSweep:
 
     # The record
 
-    def _record(self, certificates: Certificates | None, complete: bool) -> SweepRecord:
+    def _record(self, certificates: Certificates | None, complete: bool) -> record.SweepRecord:
         rows: list[Row] = []
         certified: dict[tuple[int, int], int] = {}
         for number, configuration in enumerate(self.configurations):
@@ -340,7 +335,7 @@ class RunningSweep:
                         certified[row.entry] = len(rows)
                     rows.append(row)
         table = tabulate(rows, self.study)
-        return SweepRecord(
+        return record.SweepRecord(
             study=self.study.name,
             seed=self.options["seed"],
             columns=table.columns,
@@ -364,14 +359,14 @@ class RunningSweep:
             checkpoint = self.runs.checkpoint(run, rung)
             if checkpoint is None:
                 continue
-            status = TRAINED if configuration.stopped != rung else STOPPED
+            status = record.TRAINED if configuration.stopped != rung else record.STOPPED
             rows.append(
                 Row(
                     configuration=number,
                     seed=training.seed,
                     steps=steps,
                     values=configuration.values,
-                    status=status if checkpoint.finite else NONFINITE,
+                    status=status if checkpoint.finite else record.NONFINITE,
                     entry=(run, rung),
                     checkpoint=checkpoint,
                     nominal_return=self.returns.get((run, rung), float("nan")),
@@ -385,7 +380,7 @@ class RunningSweep:
                     seed=training.seed,
                     steps=training.checkpoints[-1],
                     values=configuration.values,
-                    status=error_status(self.runs.errors[run]),
+                    status=record.error_status(self.runs.errors[run]),
                     entry=(run, -1),
                 )
             )

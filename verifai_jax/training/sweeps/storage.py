@@ -31,7 +31,6 @@ from verifai_jax.training.sweeps.record import Curve, SweepRecord, TrainedPolicy
 
 if TYPE_CHECKING:
     import pandas as pd
-
 RECORD = "sweep.json"
 """File of everything that is neither table, policy nor curve."""
 TABLE = "table.parquet"
@@ -69,13 +68,8 @@ def write_sweep(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> Pat
     """Write a sweep to a folder, in place of one that it may hold.
 
     **Arguments:**
-
-    - `stored`: the sweep.
     - `table`: its table, the columns of the record.
     - `folder`: the folder; it is created.
-
-    **Returns:** the folder.
-
     **Raises:** `FolderInUse` where another process writes it; `OSError` for what the file system
     refuses, which leaves what was there.
     """
@@ -167,10 +161,7 @@ def read_sweep(description: Mapping[str, Any], folder: Path) -> StoredSweep:
     """Read a sweep from a folder.
 
     **Arguments:**
-
     - `description`: the description of the folder, as `read_description` returns it.
-    - `folder`: the folder.
-
     **Raises:** `SweepFileError` where a file is missing or damaged.
     """
     import pandas as pd

@@ -35,7 +35,6 @@ class Study(InNotebook):
     """A sweep to be made: hyper-parameters, their trainer, and the safety of a policy.
 
     **Arguments:**
-
     - `name`: name on the command line and in results.
     - `space`: the space of the hyper-parameters; a `FeatureSpace`, or a dictionary of domains.
     - `trainer`: the task and the algorithms.
@@ -168,33 +167,29 @@ class Study(InNotebook):
         """Return the study with these hyper-parameters varied alone; see `FeatureSpace.only`.
 
         **Arguments:**
-
         - `names`: hyper-parameters to vary.
         - `nominal`: values of the others.
-
         **Raises:** `UnknownNameError` for another name; `ValueError` for a missing value.
         """
         return replace(self, space=self.space.only(*names, nominal=nominal))
 
     def _problem_of(self, algorithm: str) -> Problem:
         if algorithm not in self._problems:
-            self._problems[algorithm] = self._build_problem(algorithm)
+            policy = self.trainer.untrained_policy(algorithm)
+            try:
+                problem = self.problem(policy)
+            except Exception as error:
+                raise StudyError(
+                    f"problem raised {type(error).__name__} for an untrained {algorithm!r} policy: "
+                    f"{error}"
+                ) from error
+            if not isinstance(problem, Problem):
+                raise StudyError(
+                    "problem must return a Problem for a policy; it returned "
+                    f"{type(problem).__name__}"
+                )
+            self._problems[algorithm] = problem
         return self._problems[algorithm]
-
-    def _build_problem(self, algorithm: str) -> Problem:
-        policy = self.trainer.untrained_policy(algorithm)
-        try:
-            problem = self.problem(policy)
-        except Exception as error:
-            raise StudyError(
-                f"problem raised {type(error).__name__} for an untrained {algorithm!r} policy: "
-                f"{error}"
-            ) from error
-        if not isinstance(problem, Problem):
-            raise StudyError(
-                f"problem must return a Problem for a policy; it returned {type(problem).__name__}"
-            )
-        return problem
 
     def __str__(self) -> str:
         lines = [f"{self.name}: {self.description}" if self.description else self.name]

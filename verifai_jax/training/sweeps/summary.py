@@ -25,7 +25,6 @@ from verifai_jax.training.sweeps.record import SweepRecord, algorithm_uses, erro
 
 if TYPE_CHECKING:
     import pandas as pd
-
 MAX_ROWS = 8
 """Rows that a notebook shows."""
 _VIEWS = ".table .safe .best .configurations .pareto() .importance() .plot() .problem(row)"

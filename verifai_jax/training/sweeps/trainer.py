@@ -58,7 +58,6 @@ class Trainer:
     `(policy, {"steps": [...], "mean_return": [...]})` with its learning curve.
 
     **Arguments:**
-
     - `task`: the task to learn, see `rl.Task`. If it is a dataclass its fields may be swept. Or a
       function that trains, whose `algorithms` is left out.
     - `algorithms`: an algorithm, or several by name; their fields are the values of the
@@ -72,7 +71,6 @@ class Trainer:
     - `observation`: for a function, an example of an observation where its policies do not say what
       they observe, as functions and modules of flax.
     - `workers`: for a function, processes at a time; as many as there are cores when left out.
-
     **Raises:** `StudyError` without an algorithm, for something that is not an algorithm or
     task, a number of steps that is not positive, or a nominal task with other actions or
     observations.
@@ -150,10 +148,8 @@ class Trainer:
         """Return the training with these hyper-parameters.
 
         **Arguments:**
-
         - `values`: plain Python values; the fields of algorithm and task decide the others.
         - `seed`: training seed.
-
         **Raises:** `ValueError` for a value that the algorithm or the task refuses.
         """
         algorithm = self.by_name[self.algorithm_name(values)]
@@ -329,12 +325,10 @@ class FunctionTrainer(Trainer):
 
     @property
     def name(self) -> str:
-        """Its name."""
         return getattr(self.train, "__name__", type(self.train).__name__)
 
     @property
     def evaluation_task(self) -> Task | None:
-        """Task on which nominal returns are measured; None for those of the learning curve."""
         return self.nominal
 
     @property
@@ -343,7 +337,6 @@ class FunctionTrainer(Trainer):
         return {self.name: self.train}
 
     def algorithms_in(self, space: FeatureSpace) -> tuple[str, ...]:
-        """Return its name, whatever the space calls an algorithm."""
         return (self.name,)
 
     def used_hyperparameters(self, values: Mapping[str, Any]) -> tuple[str, ...]:
@@ -351,7 +344,6 @@ class FunctionTrainer(Trainer):
         return tuple(values)
 
     def untrained_policy(self, name: str) -> Any:
-        """Return the example."""
         return load(self.example, observation=self.observation)
 
     def check(self, space: FeatureSpace) -> None:
@@ -419,10 +411,7 @@ def _cast(present: object, value: object, name: str) -> object:
 
 
 def whole_number(value: object, name: str) -> int:
-    """Return a whole number that a hyper-parameter must be.
-
-    **Raises:** `ValueError`.
-    """
+    """Return a whole number that a hyper-parameter must be."""
     if not is_number(value) or int(value) != value:
         raise ValueError(f"{name} must be a whole number (DiscreteBox, Categorical); got {value!r}")
     return int(value)

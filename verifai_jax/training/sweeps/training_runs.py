@@ -83,7 +83,6 @@ class TrainingRuns:
     """All training runs of a sweep, numbered in the order in which they were added.
 
     **Arguments:**
-
     - `study`: the study that is swept.
     - `cache`: stores each run at each checkpoint.
     - `clock`: times the training, and ends it.
@@ -145,11 +144,9 @@ class TrainingRuns:
         """Train runs up to a checkpoint, or up to their last if they have fewer.
 
         **Arguments:**
-
         - `numbers`: the runs.
         - `rung`: number of the checkpoint, from 0 on.
         - `further`: keep their states, because some will continue from there.
-
         **Raises:** `OutOfTime` where the seconds of the stage are over.
         """
         self._assign_batches()
@@ -308,10 +305,8 @@ def train_block(
     """Train runs side by side from their beginning; called by a worker.
 
     **Arguments:**
-
     - `shipment`: with the study.
     - `work`: of each run its hyper-parameters, its seed, and the steps of its checkpoints.
-
     **Returns:** of each run the arrays of its checkpoints, or the error that ended it in one line.
     """
     trainer = shipment.thing.trainer

@@ -33,7 +33,6 @@ from verifai_jax.verification.sets.whole import Whole
 
 WINDOWS = 1024
 """Positions of an array that an index may have in a box."""
-
 Move = Callable[[Params, np.ndarray, int], np.ndarray]
 """A function of the parameters of a step, an array and the number of its leading axes."""
 

@@ -56,7 +56,6 @@ SMOOTH = frozenset({
 """Operations with derivatives of all orders that jax.experimental.jet knows."""
 CHOOSING = {"select_n": (1, None), "dynamic_slice": (0, 1), "gather": (0, 1)}
 """Operations that are smooth in these operands alone; the others choose among them."""
-
 _solution = Primitive("flow")
 _solution.multiple_results = True
 
@@ -67,10 +66,8 @@ def flow(
     """Return what solutions are after some seconds, and at all times until then.
 
     **Arguments:**
-
     - `derivative(time, state)`: d state / d time; smooth in both.
     - `seconds`: the same in all boxes.
-
     **Raises:** `MissingRule` for dynamics that are not smooth, with the operation and its line.
     """
     leaves, tree = jax.tree.flatten(state)
@@ -174,7 +171,6 @@ class _Step:
     """One step of a differential equation, on sets.
 
     **Arguments:**
-
     - `program`: the derivatives of all orders of a state, of the shared operands, a time and a
       state.
     - `shared`: operands that do not change during the step.

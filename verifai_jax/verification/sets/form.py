@@ -29,7 +29,6 @@ from jax.typing import DTypeLike
 
 Reals = np.ndarray
 """Numbers of double precision, `[boxes, *shape]`; `[1, *shape]` if they are those of all boxes."""
-
 SLACK = 2.0**-45
 """Share of a number by which a result is widened for the rounding of its own bounds."""
 
@@ -124,7 +123,6 @@ class Form:
         """Return numbers between ends, each of which is the value of one symbol, or of none.
 
         **Arguments:**
-
         - `low`, `high`: `[boxes, *shape]`.
         - `symbols`: `[symbols, *shape]`, 1 where a number is that symbol's, 0 elsewhere.
         """
@@ -194,7 +192,6 @@ class Form:
         """Return a set without the symbols of inner frames, which become part of the radius.
 
         **Arguments:**
-
         - `keep`: whether to keep a frame, with all outside of it; none of them when left out.
         """
         frame, count = self.frame, None
@@ -235,7 +232,6 @@ def rounded(
     """Return the result of an operation, widened by its rounding.
 
     **Arguments:**
-
     - `ends`: an interval of the result, not widened yet.
     - `units`: error of the operation in units of rounding.
     - `exact`: whether the result is never rounded, such as that of a maximum.

@@ -39,7 +39,6 @@ def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[For
     """Return what a loop carries, its uncertainties as those of one frame of new symbols.
 
     **Arguments:**
-
     - `carry`: values of any shapes; whole numbers, and what all boxes share, stay as they are.
     - `boxes`: size of the batch.
     - `features`: symbols of the features.
@@ -96,7 +95,6 @@ def of_layer(units: Form, features: int) -> Form:
     """Return the numbers of a layer, the radius of each as a symbol of its own.
 
     **Arguments:**
-
     - `units`: an array of one axis.
     - `features`: symbols of the features.
     """
@@ -119,9 +117,7 @@ def _sides(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the sides of parallelepipeds around zonotopes, and what they miss by rounding.
 
     **Arguments:**
-
     - `noise`: `[boxes, numbers, symbols]`.
-
     **Returns:** `[boxes, numbers, numbers]`, each column a side, and `[boxes, numbers]`.
     """
     scale = np.abs(noise).sum(2)

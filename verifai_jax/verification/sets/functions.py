@@ -33,7 +33,6 @@ from verifai_jax.verification.sets.form import (
 
 Criticals = Callable[[Reals, Reals, Reals], Sequence[Reals]]
 """A function `(slope, low, high)` to points between which `f(x) - slope * x` is monotone."""
-
 UNITS = 16.0
 """Error of XLA's elementary functions in units of rounding, relative to their result: twice what
 was measured on a CPU at two million numbers of all sizes and with several options of XLA, which is
@@ -245,7 +244,6 @@ FUNCTIONS: dict[str, Callable[[Form], Form]] = {
     "sign": _whole(np.sign),
 }  # fmt: skip
 """Functions of one number, by the name of JAX's primitive."""
-
 _RAMP = Function(
     lambda x: np.maximum(x, 0.0), _single(np.zeros_like), units=0.0, range=(0.0, np.inf)
 )
@@ -384,7 +382,6 @@ def selected(truth: np.ndarray, maybe: np.ndarray, no: Form, yes: Form) -> Form:
     """Return a case by a truth value that may be open: their hull where it is.
 
     **Arguments:**
-
     - `truth`, `maybe`: where it is true for certain, and where it is open.
     """
     if not np.any(maybe):

@@ -25,9 +25,7 @@ Equation: TypeAlias = Any
 Program: TypeAlias = Any
 """A `Jaxpr` or a `ClosedJaxpr`."""
 Rule: TypeAlias = Callable[["Interpreter", Equation, list[Value]], list[Value]]
-
 Known: TypeAlias = Callable[[Program], Callable[[list[Value]], list[Value]] | None]
-
 RULES: dict[str, Rule] = {}
 """What each primitive does with sets, by its name."""
 
@@ -50,7 +48,6 @@ class Interpreter:
     """Evaluates programs with sets.
 
     **Arguments:**
-
     - `boxes`: size of the batch.
     - `features`: number of symbols that stand for features.
     - `known`: a rule for a function with a derivative of its own, by its program; or None.

@@ -159,7 +159,6 @@ FUNCTIONS: dict[str, Callable[[Whole], Whole]] = {
     "square": _squared,
 }
 """Operations on one set, by the name of JAX's primitive."""
-
 COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
 
 
