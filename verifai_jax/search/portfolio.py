@@ -50,16 +50,17 @@ succeeded always. Chosen by hand; no comparison with other values is recorded.""
 FILLED = 8
 """Batch from which on cross-entropy has nine tenths of what it and mutations have, whatever gains
 say: those of mutations are small ones, near what is known, and there are none where the best points
-are equally good. By gains six problems of choices, numbers and plateaus took 1.05 to 1.3 times as
-many simulations, in batches of 16, and with a fifth up to 1.5 times as many. Signals are left to
-the gains, as mutations know their shape: with nine tenths NN of the ARCH competition took 1.2 times
-as many, without gradients. In rounds of one simulation it draws from the prior alone, and has a
-fifth until there is evidence."""
+are equally good. By gains five problems of choices, numbers and plateaus took 1.07 to 1.23 times
+as many simulations, without gradients and in batches of 16, and with a fifth up to 1.5 times as
+many. Signals are left to the gains, as mutations know their shape: with nine tenths NN of the ARCH
+competition took 1.2 times as many. So are descents among numbers alone: the landscape of ripples
+took 1.07 times as many. In rounds of one simulation cross-entropy draws from the prior alone, and
+has a fifth until there is evidence."""
 
 IN_VAIN = 3
 """Power of the share of coordinates that descents can move with which they count, and their gains.
-Without a factor on the gains they got on as long as the numbers alone can: six problems of choices
-and numbers took 0.9 to 1.4 times as many simulations."""
+Without a factor on the gains they got on as long as the numbers alone can: five problems of choices
+and numbers took 1.03 to 1.4 times as many simulations."""
 
 PRIOR_COSTS = 4.0  # cost of these gains, in simulations: few, so that evidence soon decides
 DISCOUNT = 0.98
@@ -357,33 +358,29 @@ class Portfolio(Search[PortfolioState]):
     def warm_start(
         self, state: PortfolioState, cube: Cube, observations: Observations
     ) -> PortfolioState:
-        common = observations._replace(gradient=None, clauses=None, clause_gradients=None)
-        batch = len(observations.rho)
-        gradient = state.gradient
+        common, gradient = Wants().only(observations), state.gradient
         if gradient is not None:
             gradient = self._gradient(cube).warm_start(gradient, cube, common)
+        ce = self._cross_entropy(len(observations.rho))
         return state._replace(
             gradient=gradient,
             mutation=Mutation().tell(state.mutation, cube, common),
-            cross_entropy=self._cross_entropy(batch).tell(state.cross_entropy, cube, common),
+            cross_entropy=ce.tell(state.cross_entropy, cube, common),
         )
 
     def start_from(
         self, state: PortfolioState, cube: Cube, observations: Observations
     ) -> PortfolioState:
-        state = self.warm_start(state._replace(gradient=None), cube, observations)._replace(
-            gradient=state.gradient
-        )
-        if state.gradient is None:
+        gradient = state.gradient
+        state = self.warm_start(state._replace(gradient=None), cube, observations)
+        if gradient is None:
             return state
-        common = observations._replace(gradient=None, clauses=None, clause_gradients=None)
-        gradient = self._gradient(cube).start_from(state.gradient, cube, common)
-        # Whoever suggests a start wants a descent from it.
-        state = state._replace(barren=jnp.int32(NEVER))
+        gradient = self._gradient(cube).start_from(gradient, cube, Wants().only(observations))
         # The descents from there have their turn at once, whatever the shares are.
         min_share = jnp.where(jnp.any(jnp.isfinite(gradient.near)), len(gradient.fresh), -jnp.inf)
         credit = state.credit.at[GRADIENT].max(min_share.astype(jnp.float32))
-        return state._replace(gradient=gradient, credit=credit)
+        # Whoever suggests a start wants a descent from it.
+        return state._replace(gradient=gradient, credit=credit, barren=jnp.int32(NEVER))
 
     def _shares(self, state: PortfolioState, cube: Cube, batch: int) -> Float[Array, " members"]:
         prior = self._prior_gains(cube, batch)
@@ -391,17 +388,18 @@ class Portfolio(Search[PortfolioState]):
         # Descents move the continuous coordinates alone, and are in vain where a choice is wrong.
         moved = len(cube.continuous) / max(cube.dim, 1)
         rate = rate.astype(jnp.float32).at[GRADIENT].multiply(moved**IN_VAIN)
-        if batch >= FILLED and not cube.signals:
+        descends = state.gradient is not None and not len(cube.discrete)
+        if batch >= FILLED and not (descends or cube.signals):
             mutated, fitted = prior[MUTATION:] / np.sum(prior[MUTATION:])
             both = rate[MUTATION] + rate[CROSS_ENTROPY]
             rate = jnp.stack([rate[GRADIENT], mutated * both, fitted * both])
         if state.gradient is None:
-            rate = rate.at[GRADIENT].set(0.0)
-            min_share = np.array([0.0, MIN_SHARE, MIN_SHARE], np.float32)
+            dead, smallest = jnp.array(True), 0.0
         else:
             dead = state.gradient.useless >= 2
-            rate = rate.at[GRADIENT].multiply(jnp.where(dead, 0.0, 1.0))
-            min_share = jnp.stack([jnp.where(dead, 0.02, MIN_SHARE), MIN_SHARE, MIN_SHARE])
+            smallest = jnp.where(dead, 0.02, MIN_SHARE)
+        rate = rate.at[GRADIENT].multiply(jnp.where(dead, 0.0, 1.0))
+        min_share = jnp.full(3, MIN_SHARE, jnp.float32).at[GRADIENT].set(smallest)
         share = rate / jnp.maximum(jnp.sum(rate), 1e-9)
         share = jnp.maximum(share, min_share)
         return (share / jnp.sum(share)).astype(jnp.float32)
