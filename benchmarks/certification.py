@@ -17,8 +17,8 @@ import time
 
 import numpy as np
 
-from verifai_jax.certification import certify, race
-from verifai_jax.certification.allocation import Allocation
+from verifai_jax.estimation.certification import certify, race
+from verifai_jax.estimation.certification.allocation import Allocation
 from verifai_jax.statistics.confidence_sequences import simultaneous_interval, verdict
 
 PROFILES = {
@@ -145,7 +145,7 @@ def trained(configurations):
 
 def policies(configurations, runs, heavy):
     from specs.cartpole import balance_with
-    from verifai_jax.certification.blocks import Blocks
+    from verifai_jax.estimation.certification.blocks import Blocks
 
     some = trained(configurations)
     for kind in ("first", "again"):

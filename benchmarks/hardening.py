@@ -1,11 +1,13 @@
 """Hardening against plain domain randomisation at equal environment steps; see RESULTS.md.
 
-    python benchmarks/hardening.py cartpole [--first 100] [--seeds 5] [--folder hardenings]
+    python benchmarks/hardening.py CASE [--first 100] [--seeds 5] [--folder hardenings]
+
+A case is cartpole, mountain_car, hopper, reacher or lane_keeping.
 
 Of each seed both arms are one training up to the first round, and take the same steps afterwards.
-Failure probabilities are those of the last certificate, from samples that decided nothing. What is
-compared is the logarithm of the failure probability, with half a failure added to each count.
-Interrupted, it goes on where it was.
+The policies before, after and of randomisation are simulated at the same fresh samples, which
+decided nothing. What is compared is the logarithm of the failure probability, with half a failure
+added to each count. Interrupted, it goes on where it was.
 """
 
 import argparse
@@ -16,13 +18,20 @@ import numpy as np
 
 import verifai_jax as vj
 from envs.cartpole import CartPoleTask
+from envs.hopper import HopperTask, hopper
+from envs.hopper import neural as hopping
 from envs.lane_keeping import LaneKeepingTask, lane_keeping, neural
 from envs.mountain_car import MountainCarTask
+from envs.reacher import reacher_task, start_with
 from envs.train_cartpole import HYPER_PARAMETERS
+from envs.train_hopper import HYPER_PARAMETERS as HOPPER_PPO
 from envs.train_lane_keeping import HYPER_PARAMETERS as LANE_PPO
 from specs.cartpole import balance_with
+from specs.hopper import bodies, upright
 from specs.lane_keeping import learned
 from specs.mountain_car import climb_with, safe_training
+from specs.reacher import reach_with
+from verifai_jax.rl import PPO
 from verifai_jax.statistics.paired import paired_difference
 
 WIDE = {
@@ -54,6 +63,17 @@ def lane_with(policy):
     return dataclasses.replace(learned, system=lane_keeping(neural(policy)))
 
 
+def upright_with(policy):
+    """Return `upright` under another policy."""
+    return dataclasses.replace(upright, system=hopper(*bodies, controller=hopping(policy)))
+
+
+REACHING = PPO(
+    learning_rate=2e-3, entropy=0.0, discount=0.95, environments=32, horizon=64, minibatches=8,
+    hidden=(32, 32), normalise=True,
+)  # fmt: skip
+REACHER = reacher_task(varied=True)
+
 CASES = {
     "cartpole": (
         CartPoleTask(masspole_range=0.0, length_range=0.0), wide_with, HYPER_PARAMETERS,
@@ -64,15 +84,31 @@ CASES = {
     ),
     "mountain_car": (
         vj.Trainer(MountainCarTask(potential=10.0), safe_training.trainer.by_name["ppo"],
-                   steps=131_072, nominal=MountainCarTask()),
+                   steps=262_144, nominal=MountainCarTask()),
         weak_with, None, {"p": 0.001},
+    ),
+    "hopper": (HopperTask(), upright_with, HOPPER_PPO, {"steps": 1_500_000, "p": 0.001}),
+    "reacher": (
+        REACHER, reach_with, REACHING, {"steps": 400_000, "p": 0.001, "start": start_with(REACHER)},
     ),
 }  # fmt: skip
 
 
-def odds(certificate):
-    """Return the failure probability of a certificate, never 0."""
-    return (certificate.failures + certificate.not_finite + 0.5) / (certificate.simulations + 1)
+FRESH = {"hopper": 2048, "reacher": 4096}
+"""Fresh samples of the slow cases; of the others 40 000."""
+
+
+def failures(problem, result, count, seed):
+    """Return how often the policies before, after and of randomisation fail at the same samples."""
+    randomised = result.policies["randomised", result.chosen["randomised"]]
+    return [
+        len(
+            vj.falsify(
+                problem(policy), "uniform", count, seed=10**6 + seed, confirm=False, progress=False
+            ).table.violating
+        )
+        for policy in (result.start, result.policy, randomised)
+    ]
 
 
 def main():
@@ -83,7 +119,7 @@ def main():
     parser.add_argument("--folder", type=Path)
     args = parser.parse_args()
     task, problem, algorithm, options = CASES[args.case]
-    logs, seconds = [], 0.0
+    logs, seconds, count = [], 0.0, FRESH.get(args.case, 40_000)
     for seed in range(args.first, args.first + args.seeds):
         folder = None if args.folder is None else args.folder / args.case / str(seed)
         result = vj.harden(
@@ -91,7 +127,13 @@ def main():
             progress=False, **options,
         )  # fmt: skip
         print(result, flush=True)
-        logs.append([np.log(odds(each)) for each in result.certificates])
+        found = failures(problem, result, count, seed)
+        before, hardened, randomised = found
+        print(
+            f"  fresh samples that fail, of {count:,}: {before} before, {hardened} hardened, "
+            f"{randomised} randomised", flush=True,
+        )  # fmt: skip
+        logs.append(np.log((np.array(found) + 0.5) / (count + 1)))
         seconds += result.seconds
     before, hardened, randomised = np.array(logs).T
     print(f"\n{args.case}: {args.seeds} seeds, {seconds / args.seeds:.0f} s each")

@@ -8,7 +8,7 @@ under its foot. `HopperTask` is what the network was trained on (`envs/train_hop
 `hopper` is what is tested, in MJX or native MuJoCo.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -178,6 +178,13 @@ class HopperTask:
         lowest, maximum = jnp.array(list(TRAINED_FOR.values())).T
         made = lowest + (maximum - lowest) * jax.random.uniform(body, (4,))
         return State(qpos, spread * _even(speed, 6), jnp.zeros(6), jnp.zeros(3), made)
+
+    def start(self, key: Key[Array, ""], features: Mapping[str, Any]) -> State:
+        """Start with the features of a problem, at rest in `STANCE` but for the pitch."""
+        numbers = {**NOMINAL, **features}
+        qpos = jnp.asarray(STANCE, jnp.float32).at[2].set(numbers["pitch0"])
+        body = jnp.stack([jnp.asarray(numbers[name], jnp.float32) for name in TRAINED_FOR])
+        return State(qpos, jnp.zeros(6), jnp.zeros(6), jnp.zeros(3), body)
 
     def step(
         self, key: Key[Array, ""], state: State, action: Float[Array, "3"]

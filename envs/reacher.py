@@ -8,7 +8,7 @@ The arm lies in a horizontal plane: 0.4 m and 0.3 m long, 1 kg and 0.6 kg, with 
 joint. `reacher` is what is tested, in MJX or native MuJoCo.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.errors import check_names
 from verifai_jax.rl import Continuous, Policy, load_policy
-from verifai_jax.rl.task.mjx import MjxTask, mjx_task
+from verifai_jax.rl.task.mjx import MjxState, MjxTask, mjx_task
 from verifai_jax.systems.mujoco.bindings import Scaled
 from verifai_jax.systems.mujoco.system import MuJoCo, mujoco
 
@@ -168,7 +168,11 @@ def reacher(
 
 
 def reacher_task(
-    *, effort: float = 0.02, load_range: float = 0.0, strength_range: float = 0.0
+    *,
+    effort: float = 0.02,
+    load_range: float = 0.0,
+    strength_range: float = 0.0,
+    varied: bool = False,
 ) -> MjxTask:
     """Make the task: bring the tip to a target within reach, and keep it there; 2 s.
 
@@ -177,6 +181,7 @@ def reacher_task(
 
     - `load_range`: up to so many kg more at the tip, drawn for each episode.
     - `strength_range`: motors are as strong as nominal times 1 +- this.
+    - `varied`: whether an episode has an arm of its own, as for `start_with`, also without ranges.
     """
 
     def initial(key: Key[Array, ""], qpos: Array, qvel: Array) -> tuple[Array, Array]:
@@ -206,5 +211,26 @@ def reacher_task(
         reward=reward,
         observe=observe,
         initial=initial,
-        vary=vary if load_range or strength_range else None,
+        vary=vary if varied or load_range or strength_range else None,
     )
+
+
+def start_with(task: MjxTask) -> Callable[[Key[Array, ""], Mapping[str, Any]], MjxState]:
+    """Return what starts an episode of a task that varies with the features of a problem, at rest.
+
+    Dampers stay as they are.
+    """
+
+    def start(key: Key[Array, ""], features: Mapping[str, Any]) -> MjxState:
+        state, numbers = task.reset(key), {**NOMINAL, **features}
+        names = ("shoulder0", "elbow0", "target_angle", "target_radius")
+        qpos = jnp.stack([jnp.asarray(numbers[name], state.qpos.dtype) for name in names])
+        mass, gear = (jnp.asarray(task.compiled.body_mass), task.compiled.actuator_gear)
+        varied = {
+            "body_mass": mass.at[LOAD].set(numbers["load"]),
+            "actuator_gear": gear * numbers["strength"],
+        }
+        varied = {name: jnp.asarray(varied[name], old.dtype) for name, old in state.varied.items()}
+        return state._replace(qpos=qpos, qvel=jnp.zeros_like(state.qvel), varied=varied)
+
+    return start

@@ -3,7 +3,7 @@
     python tests/changed.py             # since main, with what is not committed
     python tests/changed.py HEAD~3
 
-A changed file of the package calls for the tests of its room and of every room with a file that
+A changed file of the package calls for the tests of its folder and of every folder with a file that
 imports it, directly or through others (the graph of `test_architecture.py`). A changed test is run
 itself. What all tests share, and files that no rule knows, call for all of them.
 """
@@ -21,8 +21,8 @@ SHARED = {"conftest.py", "checked_types.py", "xla_flags.py"}
 EVERYTHING = {"pyproject.toml", "constraints.txt", "_verifai_jax_pytest.py"}
 LAWS = ("test_architecture.py", "test_language.py", "test_public_names.py")
 """Tests that read the whole package, and run whenever a file of it changes."""
-ELSEWHERE = {"_version": "cli", "testing": "test_testing.py", "remote_client": "systems/remote"}
-"""Tests of rooms that have another name, or of files at the root."""
+ELSEWHERE = {"_version": "cli", "remote_client": "systems/remote"}
+"""Tests of files at the root."""
 
 
 def main() -> None:
@@ -73,16 +73,16 @@ def paths_for(files: Iterable[str]) -> list[str]:
     """
     names = {str(file.relative_to(ROOT)): module for module, file in FILES.items()}
     chosen: set[str] = set()
-    rooms: set[str] = set()
+    folders: set[Path] = set()
     for name in files:
         path = Path(name)
         if (path.name in SHARED and path.parts[0] == "tests") or name in EVERYTHING:
             return ["tests"]
         if path.parts[0] == PACKAGE.name:
             chosen.update(f"tests/{law}" for law in LAWS)
-            # A file that is gone was imported by what imports its room now.
-            modules = [names[name]] if name in names else _room(path)
-            rooms |= {room_of(module) for module in importers(modules)}
+            # A file that is gone was imported by what imports its folder now.
+            modules = [names[name]] if name in names else _near(path)
+            folders |= {_tests_of(module) for module in importers(modules)}
         elif path.parts[0] == "tests" and path.suffix == ".py":
             if (ROOT / path).exists():
                 chosen.add(name if path.name.startswith("test_") else str(path.parent))
@@ -94,15 +94,21 @@ def paths_for(files: Iterable[str]) -> list[str]:
             chosen.add("tests/test_notebooks.py")
         elif path.parts[0] in ("benchmarks", "examples"):
             chosen.add("tests/test_faults.py")
-    for room in rooms - {"__init__"}:
-        tests = TESTS / ELSEWHERE.get(room, room)
-        chosen |= {str(tests.relative_to(ROOT))} if tests.exists() else set()
+    chosen |= {str(folder.relative_to(ROOT)) for folder in folders - {TESTS}}
     inside = {name for name in chosen for other in chosen if _is_inside(name, other)}
     return sorted(chosen - inside)
 
 
-def _room(path: Path) -> list[str]:
-    return [module for module in FILES if room_of(module) == path.parts[1]]
+def _tests_of(module: str) -> Path:
+    """Return the folder of tests nearest to a file's own: it has the same path, or lies above."""
+    tests = TESTS / ELSEWHERE.get(room_of(module), module.partition(".")[2].replace(".", "/"))
+    return tests if tests.is_dir() else next(folder for folder in tests.parents if folder.is_dir())
+
+
+def _near(path: Path) -> list[str]:
+    """Return the modules in the folder of a file that is gone, or in its room."""
+    inside = [name for name, file in FILES.items() if file.parent == (ROOT / path).parent]
+    return inside or [module for module in FILES if room_of(module) == path.parts[1]]
 
 
 def _is_inside(name: str, other: str) -> bool:

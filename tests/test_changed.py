@@ -7,8 +7,8 @@ LAWS = ["tests/test_architecture.py", "tests/test_language.py", "tests/test_publ
 
 
 def test_a_file_calls_for_its_room_and_for_those_that_import_it():
-    found = paths_for(["verifai_jax/plotting/replay.py"])
-    assert found == ["tests/cli", "tests/plotting", "tests/reports", *LAWS, "tests/traceability"]
+    found = paths_for(["verifai_jax/reports/plotting/replay.py"])
+    assert found == ["tests/cli", "tests/reports", *LAWS, "tests/testing/traceability"]
 
 
 def test_importers_go_through_others():
@@ -18,8 +18,8 @@ def test_importers_go_through_others():
 
 
 def test_a_file_that_is_gone_calls_for_all_that_its_room_does():
-    gone = set(paths_for(["verifai_jax/comparison/gone.py"]))
-    assert {"tests/comparison", "tests/cli"} <= gone
+    gone = set(paths_for(["verifai_jax/estimation/comparison/gone.py"]))
+    assert {"tests/estimation/comparison", "tests/cli"} <= gone
     assert "tests/mtl" not in gone
 
 

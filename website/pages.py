@@ -12,6 +12,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+from markdown import Extension, Markdown
+from markdown.preprocessors import Preprocessor
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -27,6 +29,8 @@ LINK = re.compile(r"(!?)\[([^\]\n]*(?:\n[^\]\n]*)?)\]\(([\w./-]+)(#[\w-]+)?\)")
 IMAGE = re.compile(r'(<img src=")([\w./-]+)(")')
 BLOCK = re.compile(r"(^```.*?^```)", re.DOTALL | re.MULTILINE)
 ANSI = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
+SECTIONS = ("**Returns:**", "**Raises:**", "**Yields:**")
+"""Beginnings of paragraphs that follow arguments, or each other, in a docstring."""
 LONGEST_OUTPUT = 6000
 """Characters of an output of a notebook that are shown."""
 
@@ -46,7 +50,28 @@ def on_config(config: Any) -> Any:
         return lists.get(entry, entry)
 
     config["nav"] = filled(config["nav"])
+    config["markdown_extensions"].append(Sections())
     return config
+
+
+class Sections(Extension):
+    """Sections of docstrings, `**Arguments:**` and others, without empty lines between them."""
+
+    def extendMarkdown(self, md: Markdown) -> None:
+        """Add the empty lines that Markdown needs in front of a list and of a paragraph."""
+        md.preprocessors.register(_Spaced(md), "sections", priority=15)
+
+
+class _Spaced(Preprocessor):
+    def run(self, lines: list[str]) -> list[str]:
+        spaced: list[str] = []
+        for line in lines:
+            before = spaced[-1] if spaced else ""
+            begins = line.startswith("- ") and before.startswith("**")
+            if begins or (before and line.startswith(SECTIONS)):
+                spaced.append("")
+            spaced.append(line)
+        return spaced
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -54,8 +79,8 @@ def on_files(files: Files, config: Any) -> Files:
     made = {page: (ROOT / source).read_text() for source, page in PAGES.items()}
     for path in _notebooks():
         made[_page_of(path)] = _notebook(path, made)
-    for room, names in _rooms().items():
-        made[f"reference/{room}.md"] = _reference(room, names)
+    for room, (file, names) in _rooms().items():
+        made[f"reference/{room}.md"] = _reference(room, file, names)
     for page, content in made.items():
         files.append(File.generated(config, page, content=content))
     return files
@@ -136,29 +161,25 @@ def _output(output: dict[str, Any], name: str, made: dict[str, Any]) -> list[str
     return ["```text", text, "```", ""] if text else []
 
 
-def _rooms() -> dict[str, list[str]]:
-    """Return the names that a user imports, by room, as `verifai_jax/__init__.py` lists them."""
-    tree = ast.parse((ROOT / "verifai_jax" / "__init__.py").read_text())
-    rooms: dict[str, list[str]] = {}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("verifai_jax."):
-            room = (node.module or "").split(".")[1]
-            if not (ROOT / "verifai_jax" / room).is_dir():
-                continue
-            names = [alias.name for alias in node.names if alias.asname == alias.name]
-            if names:
-                rooms.setdefault(room, []).extend(names)
-    packages = [
-        alias.name
-        for node in ast.walk(tree)
-        if isinstance(node, ast.ImportFrom) and node.module == "verifai_jax"
-        for alias in node.names
-        if alias.asname == alias.name
-    ]
-    for package in packages:
-        names = _exported(ROOT / "verifai_jax" / package / "__init__.py")
-        rooms.setdefault(package, [])
-        rooms[package] += [f"{package}.{name}" for name in names if name not in rooms[package]]
+def _rooms() -> dict[str, tuple[Path, list[str]]]:
+    """Return the names that a user imports, by room or module, with the file that describes it.
+
+    They are those of `verifai_jax/__init__.py`.
+    """
+    package = ROOT / "verifai_jax"
+    rooms: dict[str, tuple[Path, list[str]]] = {}
+    for node in ast.walk(ast.parse((package / "__init__.py").read_text())):
+        if not isinstance(node, ast.ImportFrom) or not str(node.module).startswith(package.name):
+            continue
+        folder = ROOT.joinpath(*str(node.module).split("."))
+        for name in [alias.name for alias in node.names if alias.asname == alias.name]:
+            files = (folder / name / "__init__.py", folder / f"{name}.py")
+            file = next((each for each in files if each.exists()), None)
+            if file is not None:
+                names = [f"{name}.{each}" for each in _exported(file)]
+                rooms.setdefault(name, (file, []))[1].extend(names)
+            elif (room := package.joinpath(*folder.relative_to(package).parts[:1])).is_dir():
+                rooms.setdefault(room.name, (room / "__init__.py", []))[1].append(name)
     return dict(sorted(rooms.items()))
 
 
@@ -172,8 +193,8 @@ def _exported(file: Path) -> list[str]:
     )
 
 
-def _reference(room: str, names: list[str]) -> str:
-    about = ast.get_docstring(ast.parse((ROOT / "verifai_jax" / room / "__init__.py").read_text()))
+def _reference(room: str, file: Path, names: list[str]) -> str:
+    about = ast.get_docstring(ast.parse(file.read_text()))
     lines = [f"# {room}", "", (about or "").partition("\n")[0], ""]
     for name in names:
         lines += [f"::: verifai_jax.{name}", ""]

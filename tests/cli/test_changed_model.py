@@ -137,7 +137,7 @@ def test_a_report_has_both_hashes_on_its_first_page(call, folder):
 
 @pytest.mark.slow
 def test_a_run_that_recorded_no_model_is_reported_as_such(call, folder):
-    from verifai_jax.store.files import sealed
+    from verifai_jax.core.store.files import sealed
 
     record = json.loads((folder / "run.json").read_text())
     record["sources"] = []

@@ -18,8 +18,8 @@ from verifai_jax.cli import arguments, doctor
 from verifai_jax.cli.doctor import TESTED, bad_pairs
 from verifai_jax.cli.main import main
 from verifai_jax.cli.next_folder import next_folder
+from verifai_jax.core.store.files import sealed
 from verifai_jax.falsification.run_folder import load
-from verifai_jax.store.files import sealed
 
 ROOT = Path(__file__).parents[2]
 PROBLEM = """

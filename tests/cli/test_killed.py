@@ -220,7 +220,7 @@ def test_another_model_has_no_finished_work(tmp_path, monkeypatch):
 
 @pytest.mark.thorough
 def test_a_full_disk_ends_no_estimate(tmp_path, monkeypatch, problem, capsys):
-    from verifai_jax.store import log
+    from verifai_jax.core.store import log
 
     def full(*_):
         raise OSError(28, "No space left on device")

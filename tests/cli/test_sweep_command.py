@@ -11,10 +11,10 @@ from drifting import quick_certificates
 
 from verifai_jax.cli.main import main
 from verifai_jax.core import progress
+from verifai_jax.core.store.cache import Cache
 from verifai_jax.core.targets import TargetError, definitions, load_target
-from verifai_jax.store.cache import Cache
-from verifai_jax.sweeps import Study
-from verifai_jax.sweeps import running as driver
+from verifai_jax.training.sweeps import Study
+from verifai_jax.training.sweeps import running as driver
 
 STUDY = """
 import verifai_jax as vj
@@ -30,7 +30,7 @@ other = replace(safe, name="other")
 @pytest.fixture
 def call(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "sweeps")
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "training" / "sweeps")
     monkeypatch.setattr(driver, "certify", quick_certificates)
     # However slow the machine is, no command takes so long that it says how to go on.
     monkeypatch.setattr(progress, "MOMENT", 3600.0)
@@ -68,7 +68,7 @@ def test_resume_goes_on_with_what_was_asked_for(call, tmp_path, monkeypatch):
     asked = ("--search", "cross_entropy", "--set", "elite=0.5", "--halving", 2, "--seed", 3)
     whole = call("specs/drift.py:safe", *SMALL, *asked, "--folder", "whole")
     stopped = _Stopping(after=7)
-    monkeypatch.setattr("verifai_jax.store.cache.Cache", stopped)
+    monkeypatch.setattr("verifai_jax.core.store.cache.Cache", stopped)
     part = call("specs/drift.py:safe", *SMALL, *asked, "--folder", "part", "--cache", "work done")
     assert "NOT FINISHED" in part
     (printed,) = (line for line in part.splitlines() if line.startswith("  resume "))
@@ -76,7 +76,7 @@ def test_resume_goes_on_with_what_was_asked_for(call, tmp_path, monkeypatch):
     assert words == ["verifai-jax", "sweep", "--resume", "part", "--cache", "work done"]
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "sweeps")
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "training" / "sweeps")
     monkeypatch.setattr(driver, "certify", quick_certificates)
     again = call(*words[2:], "--no-pictures")
 
@@ -116,7 +116,7 @@ def test_an_interruption_outside_of_the_work_prints_the_command_too(call, monkey
         Cache(folder).note("command", {})
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("verifai_jax.sweeps._sweep.sweep", interrupted)
+    monkeypatch.setattr("verifai_jax.training.sweeps._sweep.sweep", interrupted)
     output = call("specs/drift.py:safe", *SMALL, "--folder", "part", code=130)
     assert "  resume       verifai-jax sweep --resume part\n" in output
 

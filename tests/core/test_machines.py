@@ -86,7 +86,7 @@ def test_an_accelerator_trains_many_at_a_time():
 
 CODE = """
 import json, sys, zlib
-sys.path[:0] = ["tests/core", "tests/sweeps"]
+sys.path[:0] = ["tests/core", "tests/training/sweeps"]
 import jax, numpy as np
 import verifai_jax as vj
 from test_machines import LINE

@@ -56,21 +56,22 @@ def test_results_show_themselves(problem, run):
 
 
 def test_results_of_every_verb_show_themselves():
-    from verifai_jax import analysis, compositional, counterexamples, failure_modes, synthesis
-    from verifai_jax.certification.result import Certificate
-    from verifai_jax.checking.check import CheckOutcome
-    from verifai_jax.comparison.result import Transfer
+    from verifai_jax import analysis, synthesis
+    from verifai_jax.analysis import counterexamples
     from verifai_jax.core.notebook import InNotebook
+    from verifai_jax.estimation.certification.result import Certificate
+    from verifai_jax.estimation.comparison.result import Transfer
     from verifai_jax.estimation.sequence_result import SequenceEstimate
-    from verifai_jax.failure_table.result import FailureTable
-    from verifai_jax.hardening.result import Hardening
+    from verifai_jax.faults.failure_table.result import FailureTable
     from verifai_jax.perception.training import Score
-    from verifai_jax.sweeps.importance import HyperparameterImportance
+    from verifai_jax.testing.checking.check import CheckOutcome
+    from verifai_jax.training.hardening.result import Hardening
+    from verifai_jax.training.sweeps.importance import HyperparameterImportance
 
     verbs = [vj.Estimate, vj.Modes, vj.Comparison, vj.Trials, vj.Certificates, vj.Augmentation]
     verbs += [vj.Synthesis, vj.Repair, vj.Confirmation, vj.Confirmations, vj.FuzzRun]
-    verbs += [counterexamples.Explained, counterexamples.Shrunk, failure_modes.Mode]
-    verbs += [compositional.Compositional, synthesis.Repair, vj.mtl.Explanation, vj.mtl.Mined]
+    verbs += [counterexamples.Explained, counterexamples.Shrunk, vj.Mode]
+    verbs += [vj.perception.Compositional, synthesis.Repair, vj.mtl.Explanation, vj.mtl.Mined]
     verbs += [vj.mtl.Judgement, Transfer, Hardening, vj.Study, Certificate]
     verbs += [analysis.Clusters, analysis.Diverse, analysis.FrequentPatterns, analysis.Neighbours]
     verbs += [CheckOutcome, SequenceEstimate, HyperparameterImportance, Score, FailureTable]

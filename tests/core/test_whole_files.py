@@ -10,7 +10,7 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax.core.atomic_files import append, replacing, unwritable
-from verifai_jax.plotting.style import new_figure, show_or_save
+from verifai_jax.reports.plotting.style import new_figure, show_or_save
 from verifai_jax.rl import Continuous, Policy
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.blocks import LookupTable, delay_line
 from verifai_jax.core.keys import run_keys
 from verifai_jax.evaluation.confirmer import Confirmer
 from verifai_jax.evaluation.replay import replay
+from verifai_jax.systems.ode.blocks import LookupTable, delay_line
 
 CAR = vj.Struct({"size": vj.Box(1, 2), "at": vj.Struct({"kind": vj.Categorical("a", "b")})})
 TRAFFIC = vj.events.Automaton(

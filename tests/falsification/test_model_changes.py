@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
+from verifai_jax.core.store.files import sealed
 from verifai_jax.core.targets import load_target
 from verifai_jax.falsification.shards import Shard, merge, simulate_shard
-from verifai_jax.store.files import sealed
 
 SPEC = """
 import numpy as np

@@ -11,8 +11,8 @@ from checked_types import unchecked
 
 import verifai_jax as vj
 from verifai_jax import search
+from verifai_jax.core.store.files import sealed
 from verifai_jax.falsification.run_folder import STATE
-from verifai_jax.store.files import sealed
 
 SPACE = {"a": vj.Box(0, 1), "b": vj.Box(-1, 1), "kind": vj.Categorical("slow", "fast")}
 

@@ -6,8 +6,8 @@ import pandas as pd
 import pytest
 
 import verifai_jax as vj
+from verifai_jax.core.store.log import MARK, Log
 from verifai_jax.falsification.shards import SHARD, Shard, merge, simulate_shard
-from verifai_jax.store.log import MARK, Log
 
 
 def line(features, key):

@@ -17,6 +17,9 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
+from verifai_jax.core.store.files import sealed
+from verifai_jax.core.store.locks import LOCK, FolderInUse, write_lock
+from verifai_jax.core.store.log import Log
 from verifai_jax.falsification.run_folder import (
     RECORD,
     RECORD_CHECKSUM,
@@ -25,9 +28,6 @@ from verifai_jax.falsification.run_folder import (
     write_checkpoint,
 )
 from verifai_jax.falsification.tail import TAIL
-from verifai_jax.store.files import sealed
-from verifai_jax.store.locks import LOCK, FolderInUse, write_lock
-from verifai_jax.store.log import Log
 
 SPACE = {"a": vj.Box(0, 1), "b": vj.Box(-1, 1)}
 

@@ -13,11 +13,11 @@ from planted_sweep import SPACE, planted_rows, record_of
 import verifai_jax as vj
 from verifai_jax.cli.json_output import as_plain
 from verifai_jax.cli.main import main
-from verifai_jax.comparison.result import Compared, Comparison
+from verifai_jax.estimation.comparison.result import Compared, Comparison
 from verifai_jax.estimation.result import Estimate
 from verifai_jax.reports.stored import read_result
 from verifai_jax.statistics.paired_rates import paired_rates
-from verifai_jax.sweeps.result import Sweep, load_sweep
+from verifai_jax.training.sweeps.result import Sweep, load_sweep
 
 PROBLEM = vj.Problem(
     "fall",

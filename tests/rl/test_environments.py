@@ -13,8 +13,8 @@ from verifai_jax.rl import PPO, Continuous, Discrete, Policy, Task, train
 from verifai_jax.rl.policy import new_layers
 from verifai_jax.rl.task.mjx import mjx_task
 from verifai_jax.rl.task.ode import ode_task
-from verifai_jax.sweeps import Trainer
 from verifai_jax.systems.ode import ode
+from verifai_jax.training.sweeps import Trainer
 
 KEY = jax.random.key(5)
 

@@ -11,7 +11,7 @@ from checked_types import unchecked
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.search import CrossEntropy, Gradient, Observations, Search, Uniform, Wants
-from verifai_jax.search.diverse import Diverse, apart, distinct
+from verifai_jax.search.diverse import Diverse, Points, apart, distinct
 from verifai_jax.testing import check_search
 
 MIXED = Cube((0, 4, 0, 3), ordered=(True, True, True, False))
@@ -199,7 +199,7 @@ def test_the_gradient_is_that_of_the_raised_robustness():
     told_of = Observations(u, jax.vmap(rho)(u), jnp.ones(4, bool), jax.vmap(jax.grad(rho))(u))
     seen = search._deflate(state, cube, told_of)
     wanted = jax.vmap(
-        jax.grad(lambda p: search._raise(state, cube, p[None], None, rho(p)[None])[0])
+        jax.grad(lambda p: search._raise(state, cube, Points(p[None], None), rho(p)[None])[0])
     )(u)
     assert seen.gradient is not None
     np.testing.assert_allclose(seen.gradient, wanted, rtol=1e-4, atol=1e-5)
@@ -228,7 +228,7 @@ def test_clauses_and_their_gradients_are_raised_alike():
     )
 
     def raised(point):
-        near, _ = search._nearness(state, cube, point[None], None)
+        near, _ = search._nearness(state, cube, Points(point[None], None))
         return jnp.where(
             near[0] > 0, jnp.maximum(clauses(point)[:2], 0) + near[0], clauses(point)[:2]
         )

@@ -6,9 +6,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import verifai_jax as vj
-from verifai_jax.sets import MissingRule
 from verifai_jax.verification.continuous import between_samples
 from verifai_jax.verification.enclosure import Enclosure
+from verifai_jax.verification.sets import MissingRule
 
 
 def oscillator(t, s):

@@ -1,34 +1,45 @@
 """Analyses of error tables: components, neighbours, patterns, clusters, rules, coverage."""
 
-from verifai_jax.analysis._boundary import Boundary, boundary
-from verifai_jax.analysis._coverage import Coverage, coverage
-from verifai_jax.analysis._diverse import Diverse, diverse
-from verifai_jax.analysis._frequent_patterns import FrequentPatterns, frequent_patterns
-from verifai_jax.analysis._importance import Importance, importance
-from verifai_jax.analysis._pca import Components, pca
-from verifai_jax.analysis._rules import Rule, Rules, rules
-from verifai_jax.analysis.clustering.clusters import Clusters, clusters
-from verifai_jax.analysis.data.columns import Column
-from verifai_jax.analysis.data.samples import Samples
-from verifai_jax.analysis.neighbours import Neighbours, k_closest, nearest, random_rows
-from verifai_jax.analysis.odd_coverage import OddCoverage
-from verifai_jax.analysis.odd_files import odd_of, read_odd
-from verifai_jax.analysis.operational_domain import OperationalDomain
-from verifai_jax.analysis.overview import Analysis, analyze
-from verifai_jax.analysis.sensitivity.gradients import gradient_sensitivity
-from verifai_jax.analysis.sensitivity.morris import morris
-from verifai_jax.analysis.sensitivity.sensitivity import Sensitivity
-from verifai_jax.analysis.sensitivity.sobol import sobol_indices
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "Analysis", "Boundary", "Clusters", "Column", "Components", "Coverage", "Diverse",
-    "FrequentPatterns", "Importance", "Neighbours", "OddCoverage", "OperationalDomain", "Rule",
-    "Rules", "Samples", "Sensitivity",
-    "analyze", "boundary", "clusters", "coverage", "diverse", "frequent_patterns",
-    "gradient_sensitivity", "importance", "k_closest", "morris", "nearest", "odd_of", "pca",
-    "random_rows", "read_odd", "rules", "sobol_indices",
-]  # fmt: skip
+from verifai_jax.core.lazy import attach
 
+if TYPE_CHECKING:
+    from verifai_jax.analysis._boundary import Boundary as Boundary
+    from verifai_jax.analysis._boundary import boundary as boundary
+    from verifai_jax.analysis._coverage import Coverage as Coverage
+    from verifai_jax.analysis._coverage import coverage as coverage
+    from verifai_jax.analysis._diverse import Diverse as Diverse
+    from verifai_jax.analysis._diverse import diverse as diverse
+    from verifai_jax.analysis._frequent_patterns import FrequentPatterns as FrequentPatterns
+    from verifai_jax.analysis._frequent_patterns import frequent_patterns as frequent_patterns
+    from verifai_jax.analysis._importance import Importance as Importance
+    from verifai_jax.analysis._importance import importance as importance
+    from verifai_jax.analysis._pca import Components as Components
+    from verifai_jax.analysis._pca import pca as pca
+    from verifai_jax.analysis._rules import Rule as Rule
+    from verifai_jax.analysis._rules import Rules as Rules
+    from verifai_jax.analysis._rules import rules as rules
+    from verifai_jax.analysis.clustering.clusters import Clusters as Clusters
+    from verifai_jax.analysis.clustering.clusters import clusters as clusters
+    from verifai_jax.analysis.data.columns import Column as Column
+    from verifai_jax.analysis.data.samples import Samples as Samples
+    from verifai_jax.analysis.neighbours import Neighbours as Neighbours
+    from verifai_jax.analysis.neighbours import k_closest as k_closest
+    from verifai_jax.analysis.neighbours import nearest as nearest
+    from verifai_jax.analysis.neighbours import random_rows as random_rows
+    from verifai_jax.analysis.odd_coverage import OddCoverage as OddCoverage
+    from verifai_jax.analysis.odd_files import odd_of as odd_of
+    from verifai_jax.analysis.odd_files import read_odd as read_odd
+    from verifai_jax.analysis.operational_domain import OperationalDomain as OperationalDomain
+    from verifai_jax.analysis.overview import Analysis as Analysis
+    from verifai_jax.analysis.overview import analyze as analyze
+    from verifai_jax.analysis.sensitivity.gradients import (
+        gradient_sensitivity as gradient_sensitivity,
+    )
+    from verifai_jax.analysis.sensitivity.morris import morris as morris
+    from verifai_jax.analysis.sensitivity.sensitivity import Sensitivity as Sensitivity
+    from verifai_jax.analysis.sensitivity.sobol import sobol_indices as sobol_indices
 
-def __dir__() -> list[str]:
-    return list(__all__)
+# Imported when first used: a folder inside needs few of these names.
+__getattr__, __dir__, __all__ = attach(__name__)

@@ -41,7 +41,6 @@ FAR = 2.0
 """Greatest robustness that learners see, in medians of its size."""
 NEAR = 0.99
 """Share of the rows that have another row within the reach of one."""
-
 Points = pd.DataFrame | Mapping[str, Any]
 Matrix = Float[np.ndarray, "n d"]
 Margin = Float[np.ndarray, " n"]
@@ -76,11 +75,8 @@ class Boundary(InNotebook):
         """Return the probability of a failure at points.
 
         **Arguments:**
-
         - `points`: a dictionary of the features of one point, or a DataFrame of several.
-
         **Returns:** a number, or an array; NaN where no row lies near (`sampled`).
-
         **Raises:** `KeyError` for a feature that is missing.
         """
         frame = _frame(points, self.samples)
@@ -99,11 +95,8 @@ class Boundary(InNotebook):
         the others.
 
         **Arguments:**
-
         - `count`: number of points.
-
         **Returns:** their features, with `probability` and `sampled`.
-
         **Raises:** `ValueError` for rows whose space is not known.
         """
         check_count("count", count)
@@ -130,7 +123,7 @@ class Boundary(InNotebook):
         lines = [
             f"the failing boundary of {self.samples.name}, from {len(self.samples):,} rows: "
             f"Brier score {self.brier:z.3g} on rows not learned from, {self.base:z.3g} by the "
-            "share of failures alone",
+            "share of failures alone"
         ]
         if self._prior is not None:
             lines.append(
@@ -156,12 +149,9 @@ def boundary(source: Source, *, seed: int = 0) -> Boundary:
     It is calibrated on rows that were not learned from, and says where no row lies near.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame, or `Samples`; rows with a verdict count.
     - `seed`: the seed of the folds, and of the points of the prior.
-
     **Returns:** the `Boundary`.
-
     **Raises:** `ValueError` for fewer than ten failures, or ten safe rows.
     """
     samples = Samples.of(source, "all")

@@ -58,7 +58,6 @@ class Coverage(Drawn, InNotebook):
 
     _picture = "coverage", "plot_coverage"
     """How often each cell is occupied, and the least occupied pair."""
-
     table: pd.DataFrame
     untried: pd.DataFrame
     untried_count: int
@@ -119,13 +118,11 @@ def coverage(source: Source, *, cells: int = 10, seed: int = 0) -> Coverage:
     """Measure how well samples cover the space of features.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame, or `Samples`; of the first three all rows with a
       verdict.
     - `cells`: into how many equal parts the range of a feature is cut, fewer where rows are too few
       to fill them; a discrete feature of up to 20 values has a cell for each.
     - `seed`: the seed of everything that is drawn at random.
-
     **Returns:** a `Coverage`.
 
     Uniform means distributed by the prior: coordinates are those in which it is uniform, or shares
@@ -278,10 +275,8 @@ def largest_hole(
     more than 8 dimensions.
 
     **Arguments:**
-
     - `points`: in the unit cube.
     - `parts`: the prior distributions of their columns.
-    - `seed`: the seed of the probes.
     - `among`: the only points that may be probes, where not all of the cube is allowed.
     """
     from scipy.spatial import KDTree

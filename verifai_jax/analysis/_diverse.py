@@ -17,14 +17,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
 
-from verifai_jax.analysis.data.samples import (
-    Samples,
-    Scale,
-    Source,
-    Which,
-    distances,
-    with_columns,
-)
+from verifai_jax.analysis.data.samples import Samples, Scale, Source, Which, distances, with_columns
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.figure import Drawn
 from verifai_jax.core.notebook import InNotebook
@@ -43,7 +36,6 @@ class Diverse(Drawn, InNotebook):
 
     _picture = "clusters", "plot_diverse"
     """The rows among all, in their order, and the distances."""
-
     samples: Samples
     rows: Int[np.ndarray, " k"]
     distances: Float[np.ndarray, " k"]
@@ -81,13 +73,11 @@ def diverse(
     """Select `k` rows: the worst one first, then always the row farthest from all before.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
     - `k`: how many; all rows if there are no more.
     - `start`: the number of the first row, instead of that of the least robustness.
     - `scale`: as in `Samples.scaling`.
-
     **Returns:** a `Diverse`.
 
     Rows that equal a chosen one come last, at a distance of 0. Of rows that are equally far the

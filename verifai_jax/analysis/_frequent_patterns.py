@@ -56,7 +56,6 @@ class FrequentPatterns(Drawn, InNotebook):
 
     _picture = "frequent_patterns", "plot_frequent_patterns"
     """The shares of the most distinctive combinations, and those expected."""
-
     samples: Samples
     items: tuple[Item, ...]
     combinations: tuple[tuple[int, ...], ...]
@@ -178,7 +177,6 @@ def frequent_patterns(
     """Find frequent values of unordered columns, and combinations of up to `size` of them.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
     - `size`: values that a combination has at most.
@@ -192,7 +190,6 @@ def frequent_patterns(
     An absent item of an array has no value.
 
     **Returns:** `FrequentPatterns`.
-
     **Raises:** `ValueError` for no unordered column and no
     `bins`; a `size` or number of bins below 1; a minimum outside (0, 1]; `against="prior"` without
     a space that knows the prior; more than 50 000 combinations.

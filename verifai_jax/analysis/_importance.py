@@ -50,7 +50,6 @@ class Importance(Drawn, InNotebook):
 
     _picture = "overview", "plot_importance"
     """The losses as bars."""
-
     table: pd.DataFrame
     scores: dict[str, float]
     missing: dict[str, str]
@@ -100,13 +99,11 @@ def importance(
     """Measure how important each feature is to a model trained on the table; nothing is simulated.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame, or `Samples`; of the first three all rows with a
       verdict.
     - `repeats`: how often each feature is shuffled.
     - `seed`: the seed of everything that is drawn at random.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Returns:** an `Importance`.
 
     Half of the rows (4000 at most) train an ensemble of trees; the loss is measured on others. Two

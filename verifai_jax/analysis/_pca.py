@@ -67,7 +67,6 @@ class Components(Drawn, InNotebook):
 
     _picture = "pca", "plot_components"
     """The rows along the first two components, and the loadings."""
-
     samples: Samples
     pivot: Float[np.ndarray, " k"]
     directions: Float[np.ndarray, "m k"]
@@ -95,7 +94,6 @@ class Components(Drawn, InNotebook):
         """Return coordinates along the components, in scaled units, a column each; 0 is the pivot.
 
         **Arguments:**
-
         - `rows`: row numbers of the table, or a DataFrame with the columns; by default the rows
           that were analysed.
 
@@ -116,7 +114,6 @@ class Components(Drawn, InNotebook):
         """Draw features: normal along the components around the pivot, within the space's bounds.
 
         **Arguments:**
-
         - `seed`: an integer, a NumPy generator or a `jax.random` key.
         - `n`: how many.
         - `spread`: times the standard deviations of the rows.
@@ -236,7 +233,6 @@ def pca(
     """Compute principal components of the ordered features.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
       Unordered columns are left out.
@@ -245,9 +241,7 @@ def pca(
     - `scale`: `"range"` compares features by their range in the space, `"raw"` does not scale
       (VerifAI), `"standard"` gives the components of the correlation matrix, `"rows"` compares by
       the range of the rows.
-
     **Returns:** `Components`.
-
     **Raises:** `ValueError` for no ordered column, or more components than rows or columns.
     """
     samples = Samples.of(source, which, columns, space)

@@ -94,7 +94,6 @@ class Rules(Drawn, InNotebook):
 
     _picture = "panels", "plot_rules"
     """The rules over the two features that they use most."""
-
     rules: tuple[Rule, ...]
     coverage: float
     precision: Rate | None
@@ -179,14 +178,12 @@ def rules(
     """Describe the failure region by a few boxes.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame, or `Samples` of `"all"` rows.
     - `depth`: features that a rule has conditions on at most.
     - `cover`: share of the failures to cover; `max_rules` rules at most.
     - `held_out`: share of the rows that are kept aside to measure coverage and precision, drawn by
       `seed` among failing and safe rows alike.
     - `seed`: the seed of the rows kept aside.
-
     **Returns:** `Rules`; with fewer than 10 failing or safe rows there are no rules, and the result
     says so. Nor does it have a box in which fewer than 3 of the failing rows kept aside lie, or
     failures are not clearly denser (by the interval of its precision) than everywhere. A condition

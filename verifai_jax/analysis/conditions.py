@@ -141,7 +141,6 @@ class Region:
         """Round the bounds to short numbers, so that the region covers the same of these rows.
 
         **Arguments:**
-
         - `values` and `codes` of the rows.
         - `integer`: for each ordered column, whether it holds whole numbers only.
         """

@@ -50,7 +50,6 @@ class Neighbours(Drawn, InNotebook):
 
     _picture = "clusters", "plot_neighbours"
     """The rows among the others, over the two features that vary most."""
-
     samples: Samples
     rows: Int[np.ndarray, " k"]
     distances: Float[np.ndarray, " k"]
@@ -84,14 +83,12 @@ def k_closest(
     """Select the tightest group: a row and its `k - 1` nearest, of the least sum of distances.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
       Unordered columns count 1 where they differ; VerifAI leaves them out and includes `rho`:
       name the columns for that.
     - `k`: how many; None or more than there are gives all.
     - `scale`: as in `Samples.scaling`; `"rows"` is VerifAI's.
-
     **Returns:** `Neighbours`, the nearest first.
 
     Takes about `n log n` steps over up to 20 ordered columns, `n^2` over more.
@@ -129,16 +126,13 @@ def nearest(
     """Select the `k` rows nearest to a point, the nearest first.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
     - `point`: features (a mapping with all analysed columns, or a row of a table), or the number of
       a row of the table, which need not be among those looked at.
     - `k`: how many; all rows if there are no more.
     - `scale`: as in `Samples.scaling`.
-
     **Returns:** `Neighbours`, the nearest first.
-
     **Raises:** `ValueError` for a `k` below 1, or a feature that is missing or none of the choices;
     `IndexError` for a row number that is not in the table.
     """
@@ -172,14 +166,11 @@ def random_rows(
     """Draw `k` different rows, each as likely as any other; all of them if there are no more.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
     - `k`: how many.
     - `seed`: an integer, a NumPy generator or a `jax.random` key.
-
     **Returns:** `Neighbours`, in the order drawn.
-
     **Raises:** `ValueError` for a `k` below 1.
     """
     samples = Samples.of(source, which, columns, space)

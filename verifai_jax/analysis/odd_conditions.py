@@ -26,11 +26,9 @@ Truth: TypeAlias = np.ndarray | jax.Array | bool
 Hull: TypeAlias = tuple[float, float] | frozenset[int]
 """Values that an attribute can have: an interval, or indices of literals."""
 EVERYTHING = (-math.inf, math.inf)
-
 NUMBER = r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?INF)"
 RANGE = re.compile(rf"\[\s*{NUMBER}\s*\.\.\s*{NUMBER}\s*\]\s*(\S+)?")
 COMPARED = re.compile(rf"(<=|>=|<|>)?\s*{NUMBER}\s*(\S+)?")
-
 UNITS: dict[str, tuple[str, float]] = {
     "m/s": ("velocity", 1.0), "km/h": ("velocity", 1 / 3.6), "mph": ("velocity", 0.44704),
     "kt": ("velocity", 1852 / 3600), "m": ("length", 1.0), "km": ("length", 1e3),
@@ -45,8 +43,6 @@ UNITS: dict[str, tuple[str, float]] = {
 """What a unit measures, and how many of the first unit of that kind it is."""
 UNIT_OF = {"duration": "s"} | {kind: unit for unit, (kind, size) in UNITS.items() if size == 1}
 """The default unit of an attribute, by what it measures."""
-
-
 Conversions: TypeAlias = Mapping[tuple[str, str], tuple[float, float]]
 """Scale and offset from one unit to another, as a file says them."""
 

@@ -31,7 +31,6 @@ MAX_CELLS = 2**30
 """Cells of an attribute at most, for which a pair of cells is one number."""
 CANDIDATES = 4096
 """Points of the domain among which the next ones are chosen."""
-
 Codes = dict[str, np.ndarray]
 """The cell of each row by attribute; -1 outside."""
 
@@ -62,9 +61,7 @@ class OddCoverage(InNotebook):
         """Return points inside the domain that occupy the most empty cells and pairs of cells.
 
         **Arguments:**
-
         - `count`: number of points.
-
         **Returns:** their features, a row each, with `new`, the cells and pairs that each occupies.
         """
         check_count("count", count)
@@ -124,15 +121,12 @@ def odd_coverage(
     """Measure how much of a domain rows cover: by attribute, by pairs, by volume, by prior mass.
 
     **Arguments:**
-
     - `domain`: the domain; its attributes are cut into cells of equal width, not the features.
     - `source`: a run, its table, or a DataFrame; all rows with a verdict.
     - `cells`: cells of a range; an integer of up to 20 values and literals have one a value.
     - `seed`: the seed of the points by which shares of a domain are measured whose conditions
       couple attributes, and of those of the prior.
-
     **Returns:** an `OddCoverage`.
-
     **Raises:** `ValueError` for no rows, and an attribute with a feature and without a range.
     """
     check_count("cells", cells, 2)

@@ -46,9 +46,7 @@ def read_odd(path: str | Path) -> OperationalDomain:
     module that holds or not. Units are converted into that of the feature.
 
     **Arguments:**
-
     - `path`: the file. Without `features` each attribute is a feature of its last name.
-
     **Raises:** `FileNotFoundError`; `ValueError` naming the entry, for any other file.
     """
     path = Path(path)

@@ -23,19 +23,8 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 
+from verifai_jax.analysis import odd_conditions
 from verifai_jax.analysis.data.samples import Source
-from verifai_jax.analysis.odd_conditions import (
-    Attribute,
-    Group,
-    Hull,
-    Module,
-    Test,
-    Values,
-    both,
-    hull_of,
-    module_holds,
-    written,
-)
 from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.foreign_files import write_yaml
 from verifai_jax.core.lazy import lazy_import
@@ -53,13 +42,13 @@ class OperationalDomain:
     """
 
     name: str
-    attributes: tuple[Attribute, ...]
-    modules: Mapping[str, Module] = field(repr=False)
+    attributes: tuple[odd_conditions.Attribute, ...]
+    modules: Mapping[str, odd_conditions.Module] = field(repr=False)
     roots: tuple[str, ...]
     document: Mapping[str, Any] = field(repr=False)
 
     @property
-    def features(self) -> dict[str, Attribute]:
+    def features(self) -> dict[str, odd_conditions.Attribute]:
         """The attributes that features stand for, by feature."""
         return {each.feature: each for each in self.attributes if each.feature}
 
@@ -74,10 +63,10 @@ class OperationalDomain:
         said = {name: (each.reason, each.source) for name, each in self.features.items()}
         return {name: ", ".join(filter(None, each)) for name, each in said.items() if any(each)}
 
-    def hull(self, attribute: Attribute) -> Hull:
+    def hull(self, attribute: odd_conditions.Attribute) -> odd_conditions.Hull:
         """Return the interval, or the indices of literals, that an attribute has inside."""
-        hulls = (hull_of(attribute, name, self.modules) for name in self.roots)
-        return reduce(both, hulls, attribute.everything)
+        hulls = (odd_conditions.hull_of(attribute, name, self.modules) for name in self.roots)
+        return reduce(odd_conditions.both, hulls, attribute.everything)
 
     def holds(self, rows: pd.DataFrame | Mapping[str, Any]) -> Bool[np.ndarray, " n"]:
         """Return which rows of features lie inside. What a row does not have is not asked for."""
@@ -94,24 +83,24 @@ class OperationalDomain:
             column = frame[name]
             if each.literals:
                 codes = {literal: index for index, literal in enumerate(each.literals)}
-                texts = [written(value) for value in column]
+                texts = [odd_conditions.written(value) for value in column]
                 found[each.name] = np.array([codes.get(text, -1) for text in texts], float)
             else:
                 found[each.name] = column.to_numpy(float)
         return found
 
-    def _inside(self, values: Values) -> Any:
+    def _inside(self, values: odd_conditions.Values) -> Any:
         found: Any = True
         for name in self.roots:
-            found = found & module_holds(name, values, self.modules, unknown=True)
+            found = found & odd_conditions.module_holds(name, values, self.modules, unknown=True)
         return found
 
     @property
     def is_box(self) -> bool:
         """True if no condition couples attributes, so that each has its own values."""
         each = [condition for name in self.roots for condition in self.modules[name].conditions()]
-        groups = [condition for condition in each if isinstance(condition, Group)]
-        tests = [condition for condition in each if isinstance(condition, Test)]
+        groups = [condition for condition in each if isinstance(condition, odd_conditions.Group)]
+        tests = [condition for condition in each if isinstance(condition, odd_conditions.Test)]
         plain = all(self.modules[name].exclude is None for name in self.roots)
         simple = all(group.every for group in groups) and len(groups) + len(tests) == len(each)
         return plain and simple and not any(test.strict for test in tests)
@@ -161,7 +150,9 @@ class OperationalDomain:
         return "\n".join(lines)
 
 
-def choices_of(attribute: Attribute, hull: Hull) -> tuple[float, float] | list[str] | list[bool]:
+def choices_of(
+    attribute: odd_conditions.Attribute, hull: odd_conditions.Hull
+) -> tuple[float, float] | list[str] | list[bool]:
     """Return the ends of an attribute's interval, or its literals.
 
     **Raises:** `ValueError` for an interval without an end, and for nothing.
@@ -182,7 +173,7 @@ def choices_of(attribute: Attribute, hull: Hull) -> tuple[float, float] | list[s
     return (int(low), int(high)) if attribute.kind == "integer" else (low, high)
 
 
-def words(attribute: Attribute, hull: Hull) -> str:
+def words(attribute: odd_conditions.Attribute, hull: odd_conditions.Hull) -> str:
     """Write the values of an attribute."""
     if isinstance(hull, frozenset):
         return ", ".join(attribute.literals[code] for code in sorted(hull)) or "nothing"

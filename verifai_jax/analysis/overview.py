@@ -74,7 +74,6 @@ class Analysis(Drawn):
     _picture = "overview", "plot_overview"
     """The failures over the two most important features, with the boxes of the rules, the
     representatives of clusters, and the importances as bars."""
-
     name: str
     parts: tuple[Part, ...]
     samples: Samples | None
@@ -154,11 +153,9 @@ def analyze(
     """Apply every analysis of the error table that fits it, and say why others do not.
 
     **Arguments:**
-
     - `source`: a run, its table, or a DataFrame with feature columns.
     - `seed`: the seed of everything that is drawn at random.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Returns:** an `Analysis`.
 
     Failures, rules, importance of features, clusters, principal components, frequent patterns,

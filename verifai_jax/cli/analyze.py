@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import FOLDER, ODD, PROBLEM, RUN, load_judged_run
+from verifai_jax.cli.arguments import FOLDER, ODD, PROBLEM, RUN, load_judged_run, option
 from verifai_jax.cli.json_output import command, give_result
 
 
@@ -12,20 +12,15 @@ from verifai_jax.cli.json_output import command, give_result
 @RUN
 @PROBLEM
 @FOLDER
-@click.option(
+@option(
     "--boundary",
     type=click.IntRange(1),
     metavar="POINTS",
     help="Learn where the boundary runs, and say so many points to simulate next.",
 )
 @ODD
-@click.option(
-    "--next",
-    "count",
-    type=click.IntRange(1),
-    default=10,
-    show_default=True,
-    help="Points of --odd to simulate next.",
+@option(
+    "--next", "count", type=click.IntRange(1), default=10, help="Points of --odd to simulate next."
 )
 def analyze(
     folder: Path,

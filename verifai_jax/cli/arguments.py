@@ -16,154 +16,111 @@ from verifai_jax.cli.exit_codes import BROKEN, CommandError
 if TYPE_CHECKING:
     from verifai_jax import Problem, Run
     from verifai_jax.core.executors import Executor
-
 Command = TypeVar("Command", bound=Callable[..., object])
-
 COMMON = ("as_json", "pictures", "progress", "keep_going")
 """Options about what a command prints and draws, and whether it goes on, not about its result."""
+PATH = click.Path(path_type=Path)
+"""A file or a folder, which need not exist."""
 
-RUN = click.argument("folder", metavar="RUN", type=click.Path(path_type=Path))
+
+def option(*names: str, **settings: Any) -> Callable[[Command], Command]:
+    """Return an option of a command; its help shows the default where there is one."""
+    return click.option(*names, show_default=settings.get("default") is not None, **settings)
+
+
+RUN = click.argument("folder", metavar="RUN", type=PATH)
 """The run folder that a command reads."""
-
 ROW = click.argument("row", type=int, required=False)
 """A row of its table."""
-
 TARGET = click.argument("target")
 """The problem, as FILE.py:NAME."""
-
-PROBLEM = click.option(
+PROBLEM = option(
     "--problem",
     "target",
     metavar="FILE.py:NAME",
     help="Problem of the run  [default: the one it records]",
 )
 """The problem of a run that does not record one of this project."""
-
-FOLDER = click.option(
-    "--folder",
-    "into",
-    type=click.Path(path_type=Path),
-    help="Folder to write to  [default: the run's]",
-)
+FOLDER = option("--folder", "into", type=PATH, help="Folder to write to  [default: the run's]")
 """Where a command that reads a run writes."""
-
-RUN_FOLDER = click.option(
-    "--folder",
-    type=click.Path(path_type=Path),
-    help="Run folder to write  [default: runs/NAME-1, -2, ...]",
+RUN_FOLDER = option(
+    "--folder", type=PATH, help="Run folder to write  [default: runs/NAME-1, -2, ...]"
 )
 """Where a command that makes a run writes it."""
-
-PICTURES = click.option(
-    "--pictures/--no-pictures", default=True, show_default=True, help="Draw pictures."
-)
+PICTURES = option("--pictures/--no-pictures", default=True, help="Draw pictures.")
 """Pictures can be left out."""
-
-KEEP_GOING = click.option(
+KEEP_GOING = option(
     "--keep-going", is_flag=True, help="Simulate on where all of the first simulations raise."
 )
 PROGRESS = click.option(
-    "--progress/--no-progress",
-    default=None,
-    help="Show a progress bar  [default: on a terminal]",
+    "--progress/--no-progress", default=None, help="Show a progress bar  [default: on a terminal]"
 )
 """The progress bar can be forced or left out."""
-
-SEED = click.option("--seed", type=int, default=0, show_default=True, help="Seed of all chance.")
+SEED = option("--seed", default=0, help="Seed of all chance.")
 """The seed of everything random in a command."""
-
-
-ONLY = click.option(
+ONLY = option(
     "--only",
     metavar="NAMES",
     help="Features to vary, comma-separated; the others stay at their nominal values.",
 )
 """Features that vary."""
-
-BATCH = click.option("--batch", type=int, help="Simulations per call  [default: chosen]")
+BATCH = option("--batch", type=int, help="Simulations per call  [default: chosen]")
 """Simulations per call of the simulator."""
-
-MAX_SECONDS = click.option(
-    "--max-seconds", type=float, help="Seconds at most, compilation included."
-)
+MAX_SECONDS = option("--max-seconds", type=float, help="Seconds at most, compilation included.")
 """A limit of time."""
-
-STOP_AFTER = click.option("--stop-after", type=int, help="Stop at that many counterexamples.")
+STOP_AFTER = option("--stop-after", type=int, help="Stop at that many counterexamples.")
 """A number of failures that ends a run."""
-
-PRECISION = click.option(
-    "--precision", type=click.Choice(["float32", "float64"]), default="float32", show_default=True
-)
+PRECISION = option("--precision", type=click.Choice(["float32", "float64"]), default="float32")
 """Floating-point numbers of the simulations."""
-
-BACKEND = click.option(
-    "--backend", help="mjx or native, for a MuJoCo model  [default: the faster one]"
-)
+BACKEND = option("--backend", help="mjx or native, for a MuJoCo model  [default: the faster one]")
 """Simulator of a system that has several."""
-
-ENGINE = click.option(
+ENGINE = option(
     "--engine",
     type=click.Choice(["auto", "xla", "native"]),
     default="auto",
-    show_default=True,
     help="native: code by this machine's C++ compiler, auto: for many simulations.",
 )
 """What a traced system is compiled by."""
-
-CLUSTER = click.option(
+CLUSTER = option(
     "--cluster",
     metavar="ADDRESS",
     help="Simulate on a cluster: dask://HOST:PORT, ray://HOST:PORT or slurm.",
 )
 """A cluster whose workers do the work."""
-
-PLOT = click.option(
-    "--plot", type=click.Path(path_type=Path), metavar="PNG", help="Draw the result into a PNG."
-)
+PLOT = option("--plot", type=PATH, metavar="PNG", help="Draw the result into a PNG.")
 """File of the one picture of a result."""
-
-PROVED = click.option(
+PROVED = option(
     "--proved",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="JSON",
     help="What verify wrote with --into: spend nothing on what it proved.",
 )
 """File of a verification."""
-
-REPORT = click.option(
-    "--report",
-    type=click.Path(path_type=Path),
-    metavar="HTML",
-    help="Write the evidence report into an HTML file.",
+REPORT = option(
+    "--report", type=PATH, metavar="HTML", help="Write the evidence report into an HTML file."
 )
 """File of the evidence report on a result."""
-
-ERRORS = click.option(
+ERRORS = option(
     "--errors",
     type=click.IntRange(1),
     metavar="PAIRS",
     help="Say how wrong the number can be, by so many pairs of simulations for each part.",
 )
 """Simulations by which the parts of an error are measured."""
-
-ODD = click.option(
+ODD = option(
     "--odd",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="YAML",
     help="The operational design domain, a file of OpenODD: say what is covered of it.",
 )
 """The file of a domain."""
-
-EVEN_IF_CHANGED = click.option(
+EVEN_IF_CHANGED = option(
     "--even-if-changed",
     is_flag=True,
     help="The model was changed on purpose: go on with it, and note what differs.",
 )
 """For commands that go on with what another model may have simulated."""
-
-SET = click.option(
-    "--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search."
-)
+SET = option("--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search.")
 """Options of a search that is given by name."""
 
 
@@ -179,25 +136,18 @@ def all_of(*decorators: Callable[[Any], Any]) -> Callable[[Command], Command]:
 
 
 PARAMETER_CHOICE = all_of(
-    click.option(
+    option(
         "--aim",
         type=click.Choice(("robustness", "probability")),
         default="robustness",
-        show_default=True,
         help="Robustness against an attack, or the least failure probability.",
     ),
-    click.option("--margin", type=float, default=0.0, show_default=True, help="Robustness wanted."),
-    click.option(
-        "--attack", default="cross_entropy", show_default=True, help="Search that attacks."
-    ),
-    click.option(
-        "--held-out", type=int, default=2000, show_default=True, help="Simulations of the result."
-    ),
-    click.option(
+    option("--margin", default=0.0, help="Robustness wanted."),
+    option("--attack", default="cross_entropy", help="Search that attacks."),
+    option("--held-out", default=2000, help="Simulations of the result."),
+    option(
         "--mass",
-        type=float,
         default=0.999,
-        show_default=True,
         help="Probability of the part of the prior that is attacked; 1 for all of it.",
     ),
     click.option(
@@ -210,11 +160,9 @@ PARAMETER_CHOICE = all_of(
     BACKEND,
 )
 """Options of `synthesize` and `repair`: keywords of both functions."""
-
-
 NAMES = all_of(
-    click.option("--const", "constants", multiple=True, metavar="NAME=NUMBER"),
-    click.option("--define", "definitions", multiple=True, metavar="NAME=FORMULA"),
+    option("--const", "constants", multiple=True, metavar="NAME=NUMBER"),
+    option("--define", "definitions", multiple=True, metavar="NAME=FORMULA"),
 )
 """Names that a formula may use."""
 
@@ -238,7 +186,7 @@ def on_cluster(address: str | None) -> "Iterator[Executor | None]":
     if address is None:
         yield None
         return
-    from verifai_jax.clusters import connect
+    from verifai_jax.evaluation.clusters import connect
 
     try:
         held = contextlib.ExitStack()
@@ -367,7 +315,6 @@ def refuse_others(allowed: Container[str], why: str) -> None:
     """Raise a usage error for an option of this command that was given and is not allowed now.
 
     **Arguments:**
-
     - `allowed`: names of parameters, in addition to those that every command has.
     - `why`: the end of the message, after the option.
     """
@@ -397,7 +344,6 @@ def resuming(command: str, folder: Path, target: str | None, options: Mapping[st
     """Write the command that goes on with a folder, as a shell reads it.
 
     **Arguments:**
-
     - `command`: `falsify` or `sweep`.
     - `target`: that the folder records; it is named where the record alone would not do.
     - `options`: that the record does not hold, with their values; those that are None are left out.

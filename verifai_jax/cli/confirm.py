@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import EVEN_IF_CHANGED, PROBLEM, ROW, RUN, load_judged_run
+from verifai_jax.cli.arguments import EVEN_IF_CHANGED, PROBLEM, ROW, RUN, load_judged_run, option
 from verifai_jax.cli.exit_codes import check_again
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import as_plain, command, give_result
@@ -14,7 +14,7 @@ from verifai_jax.cli.json_output import as_plain, command, give_result
 @RUN
 @ROW
 @PROBLEM
-@click.option(
+@option(
     "--engine",
     "engines",
     multiple=True,
@@ -32,13 +32,13 @@ def confirm(
     fail_on: Gate | None,
 ) -> None:
     """Replay the counterexamples of the run in RUN, or its ROW, at a finer step."""
-    from verifai_jax import counterexamples
+    import verifai_jax as vj
     from verifai_jax.core.text import printable
 
     run = load_judged_run(folder, target)
-    result = counterexamples.confirm(run, row, engines=engines or None)
+    result = vj.confirm(run, row, engines=engines or None)
     click.echo(printable(str(result)))
-    if isinstance(result, counterexamples.Confirmation):
+    if isinstance(result, vj.Confirmation):
         confirmed, examined = int(result.confirmed), 1
     else:
         confirmed, examined = len(result.confirmed), len(result)
@@ -46,7 +46,7 @@ def confirm(
     give_result(
         confirmed=confirmed, examined=examined, transferable=transferable, **as_plain(result)
     )
-    if isinstance(result, counterexamples.Confirmations):
+    if isinstance(result, vj.Confirmations):
         give_result(counts=result.counts, rows=result.table)
     check_gate(fail_on, {"unconfirmed": confirmed < examined, "counterexample": confirmed > 0})
     check_again(result.finding, even_if_changed)

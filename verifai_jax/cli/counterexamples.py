@@ -5,6 +5,7 @@ from pathlib import Path
 import click
 
 from verifai_jax.cli import arguments
+from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result
 
@@ -14,20 +15,12 @@ CORPUS = "counterexamples"
 
 @command("save-counterexamples")
 @arguments.RUN
-@click.option(
-    "--into",
-    type=click.Path(path_type=Path),
-    default=Path(CORPUS),
-    show_default=True,
-    help="Folder of the files, made for version control.",
+@option(
+    "--into", type=PATH, default=Path(CORPUS), help="Folder of the files, made for version control."
 )
-@click.option(
-    "--max-count", type=int, default=5, show_default=True, help="Counterexamples at most."
-)
-@click.option("--shrink/--no-shrink", default=True, show_default=True, help="Shrink each first.")
-@click.option(
-    "--budget", type=int, default=1000, show_default=True, help="Simulations to shrink one with."
-)
+@option("--max-count", default=5, help="Counterexamples at most.")
+@option("--shrink/--no-shrink", default=True, help="Shrink each first.")
+@option("--budget", default=1000, help="Simulations to shrink one with.")
 @arguments.PROBLEM
 def save_counterexamples(
     folder: Path, into: Path, max_count: int, shrink: bool, budget: int, target: str | None
@@ -42,8 +35,8 @@ def save_counterexamples(
 
 @command("replay-counterexamples")
 @arguments.TARGET
-@click.argument("folder", metavar="FOLDER", type=click.Path(path_type=Path), default=Path(CORPUS))
-@click.option("--rename", multiple=True, metavar="OLD=NEW", help="New name of a feature.")
+@click.argument("folder", metavar="FOLDER", type=PATH, default=Path(CORPUS))
+@option("--rename", multiple=True, metavar="OLD=NEW", help="New name of a feature.")
 @fail_on(counterexample="unless every one is simulated and fixed")
 def replay_counterexamples(
     target: str, folder: Path, rename: tuple[str, ...], fail_on: Gate | None

@@ -18,7 +18,6 @@ from verifai_jax.core.cores import available_cores
 
 PACKAGES = ("jax", "jaxlib", "numpy", "optax", "lark", "pandas", "pyarrow", "matplotlib", "rich")
 """Required packages whose versions are reported."""
-
 EXTRAS = {
     "mujoco": "mujoco",
     "mujoco-mjx": "mujoco",

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from verifai_jax.cli import arguments
+from verifai_jax.cli.arguments import option
 from verifai_jax.cli.exit_codes import BROKEN, INTERRUPTED, CommandError
 from verifai_jax.cli.gates import RATE, Gate, check_gate, fail_on
 from verifai_jax.cli.going_on import kept_until_done
@@ -17,18 +18,17 @@ if TYPE_CHECKING:
 
 @command()
 @arguments.TARGET
-@click.option("--method", help="monte_carlo, importance, splitting or surrogate  [default: chosen]")
-@click.option("--budget", type=int, default=50_000, show_default=True, help="Simulations at most.")
-@click.option("--p0", type=float, help="Probability that it should be below.")
-@click.option(
+@option("--method", help="monte_carlo, importance, splitting or surrogate  [default: chosen]")
+@option("--budget", default=50_000, help="Simulations at most.")
+@option("--p0", type=float, help="Probability that it should be below.")
+@option(
     "--simulations-are",
     type=click.Choice(["auto", "slow", "fast"]),
     default="auto",
-    show_default=True,
     help="slow: a surrogate proposes, for a few hundred simulations.",
 )
-@click.option("--within", type=float, help="Slow simulations end at this factor to the ends.")
-@click.option("--confidence", type=float, default=0.95, show_default=True)
+@option("--within", type=float, help="Slow simulations end at this factor to the ends.")
+@option("--confidence", default=0.95)
 @arguments.SEED
 @arguments.ONLY
 @arguments.BATCH

@@ -25,7 +25,6 @@ BROKEN = 3
 NOT_AGAIN = 4
 INTERRUPTED = 130
 CLOSED_PIPE = 141
-
 EPILOG = """\b
 Exit codes:
   0  it did its work; falsify that finds failures has done its work
@@ -35,10 +34,8 @@ Exit codes:
   4  a row that was simulated again did not give its number
 """
 """What `--help` says of them."""
-
 _MAX_ERROR_LENGTH = 4000
 """Characters of an error that are printed: it may quote a file, or the message of a system."""
-
 USAGE_ERRORS = (
     ValueError,
     TypeError,
@@ -70,7 +67,6 @@ def check_again(finding: str, even_if_changed: bool) -> None:
     """End the command with code 4 where a row did not give its number again.
 
     **Arguments:**
-
     - `finding`: what differs, as text; empty if nothing does.
     - `even_if_changed`: whether the user has said that another model is meant.
     """

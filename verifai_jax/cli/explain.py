@@ -27,11 +27,11 @@ def explain(
     """Say why a ROW (by default the worst) of the run in RUN fails, and draw it."""
     import textwrap
 
-    from verifai_jax import counterexamples
+    import verifai_jax as vj
     from verifai_jax.core.text import printable
 
     run = arguments.load_judged_run(folder, target)
-    why = counterexamples.explain(run, row)
+    why = vj.explain(run, row)
     for line in printable(str(why)).splitlines():
         click.echo(textwrap.fill(line, 88, break_on_hyphens=False))
     influences = {one.name: why.effect(one) for one in why.influences}

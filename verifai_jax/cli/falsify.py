@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from verifai_jax.cli import arguments
+from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.exit_codes import BROKEN, INTERRUPTED, CommandError
 from verifai_jax.cli.gates import RATE, Gate, check_gate, exceeds, fail_on
 from verifai_jax.cli.json_output import command, describe_run, give_result
@@ -18,8 +19,6 @@ from verifai_jax.cli.next_folder import given_or_next
 if TYPE_CHECKING:
     from verifai_jax import Decided, Problem, Run, Within
     from verifai_jax.search import Search
-
-
 _RESUMES = (
     *("resume", "target", "only", "budget", "max_seconds", "stop_after", "within", "decide"),
     *("even_if_changed", "cluster", "fail_on"),
@@ -34,20 +33,20 @@ _PARTS = (
 
 @command()
 @click.argument("target", required=False)
-@click.option("--search", help="Name of the search  [default: auto]")
+@option("--search", help="Name of the search  [default: auto]")
 @arguments.SET
-@click.option("--budget", type=int, help="Simulations at most  [default: 10000]")
+@option("--budget", type=int, help="Simulations at most  [default: 10000]")
 @arguments.BATCH
 @arguments.SEED
 @arguments.ONLY
 @arguments.MAX_SECONDS
 @arguments.STOP_AFTER
-@click.option("--within", type=float, help="Stop when the failure rate is known as closely.")
-@click.option("--decide", type=float, help="Stop when the rate is clearly above or below this.")
-@click.option("--warm-start", type=click.Path(path_type=Path), help="Run to learn from first.")
-@click.option(
+@option("--within", type=float, help="Stop when the failure rate is known as closely.")
+@option("--decide", type=float, help="Stop when the rate is clearly above or below this.")
+@option("--warm-start", type=PATH, help="Run to learn from first.")
+@option(
     "--resume",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Run folder to go on with; with a larger --budget the run of that budget and this batch.",
 )
 @arguments.EVEN_IF_CHANGED
@@ -56,7 +55,7 @@ _PARTS = (
 @arguments.ENGINE
 @arguments.CLUSTER
 @arguments.PROVED
-@click.option(
+@option(
     "--shard",
     metavar="I/N",
     help="Simulate part I of N alone, as a job of an array; merge makes the run of them.",
@@ -66,17 +65,16 @@ _PARTS = (
     default=True,
     help="Claim only what closer replays confirm  [default: confirm]",
 )
-@click.option("--diverse", is_flag=True, help="Look for failures of different kinds.")
-@click.option(
+@option("--diverse", is_flag=True, help="Look for failures of different kinds.")
+@option(
     "--diverse-by",
     type=click.Choice(["inputs", "behaviour"]),
     help="Of kinds that differ in this  [default: inputs]",
 )
-@click.option(
+@option(
     "--objective",
     type=click.Choice(["robustness", "likelihood"]),
     default="robustness",
-    show_default=True,
     help="Failures that break the property by most, or the likeliest.",
 )
 @arguments.RUN_FOLDER
@@ -115,7 +113,6 @@ def falsify(
 
     if pictures:
         while_compiling(figure.load)
-
     stop_when = _stopping_rule(within, decide)
     if shard is not None:
         arguments.refuse_others(_PARTS, "needs all rows of a run; --shard has a part")
@@ -141,10 +138,7 @@ def falsify(
         asked = {
             name: given[name] for name in ("max_seconds", "stop_after", "progress", "keep_going")
         }
-        with (
-            given_or_next(resume, "runs", "", goes_on),
-            arguments.on_cluster(cluster) as executor,
-        ):
+        with given_or_next(resume, "runs", "", goes_on), arguments.on_cluster(cluster) as executor:
             run = falsification.resume(
                 resume,
                 problem,
@@ -236,10 +230,8 @@ def print_run(
     """Print the summary of a run and how to see more of it.
 
     **Arguments:**
-
     - `options`: the options of the command that the record does not hold, to be given again on
       resuming.
-
     **Raises:** `CommandError` where no simulation has a verdict.
     """
     click.echo(run.summary())
@@ -250,7 +242,7 @@ def print_run(
         click.echo(f"  resume       {again}")
     click.echo(f"  table        {run.table_path}")
     if pictures and run.simulations:
-        from verifai_jax.plotting import write_run_pictures
+        from verifai_jax.reports.plotting import write_run_pictures
 
         for path in write_run_pictures(run, run.folder):
             click.echo(f"  picture      {path}")

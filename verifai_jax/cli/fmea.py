@@ -6,31 +6,22 @@ from typing import Any
 import click
 
 from verifai_jax.cli import arguments
+from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.json_output import command, draw, give_result
 
 
 @command()
 @arguments.TARGET
-@click.option("--rate", type=float, help="Occurrences of each fault in an hour.")
-@click.option("--mission-time", type=float, help="Hours of a mission.")
-@click.option(
-    "--samples", type=int, default=512, show_default=True, help="Simulations of each fault."
+@option("--rate", type=float, help="Occurrences of each fault in an hour.")
+@option("--mission-time", type=float, help="Hours of a mission.")
+@option("--samples", default=512, help="Simulations of each fault.")
+@option(
+    "--budget", default=2000, help="Simulations of the search where no sample of a fault fails."
 )
-@click.option(
-    "--budget",
-    type=int,
-    default=2000,
-    show_default=True,
-    help="Simulations of the search where no sample of a fault fails.",
-)
-@click.option("--pairs/--no-pairs", default=True, show_default=True, help="Try pairs of faults.")
-@click.option("--confidence", type=float, default=0.95, show_default=True)
+@option("--pairs/--no-pairs", default=True, help="Try pairs of faults.")
+@option("--confidence", default=0.95)
 @arguments.SEED
-@click.option(
-    "--folder",
-    type=click.Path(path_type=Path),
-    help="Folder to write, and to go on in  [default: runs/fmea-NAME]",
-)
+@option("--folder", type=PATH, help="Folder to write, and to go on in  [default: runs/fmea-NAME]")
 @arguments.PLOT
 @arguments.PROGRESS
 def fmea(target: str, folder: Path | None, plot: Path | None, **options: Any) -> None:

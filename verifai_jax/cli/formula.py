@@ -6,27 +6,22 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from verifai_jax.cli import arguments
+from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result, show_result
 from verifai_jax.cli.monitor_fleet import load_requirements
 
 if TYPE_CHECKING:
     from verifai_jax import Formula
-
 End = Literal["hold", "truncate"]
-
-FILES = click.argument(
-    "recordings", metavar="[RECORDING]...", nargs=-1, type=click.Path(path_type=Path)
-)
+FILES = click.argument("recordings", metavar="[RECORDING]...", nargs=-1, type=PATH)
 """Recordings: files, or folders of them."""
-
 ASKED = arguments.all_of(
-    click.option("--problem", metavar="FILE.py:NAME", help="A problem, instead of recordings."),
-    click.option(
+    option("--problem", metavar="FILE.py:NAME", help="A problem, instead of recordings."),
+    option(
         "--end",
         type=click.Choice(["hold", "truncate"]),
         default="hold",
-        show_default=True,
         help="Semantics after the last sample.",
     ),
     arguments.NAMES,
@@ -42,7 +37,7 @@ def formula() -> None:
 @command()
 @click.argument("formula")
 @FILES
-@click.option("--unit", "units", multiple=True, metavar="SIGNAL=UNIT", help="Unit of a signal.")
+@option("--unit", "units", multiple=True, metavar="SIGNAL=UNIT", help="Unit of a signal.")
 @ASKED
 @fail_on(finding="if anything is suspicious")
 def lint(
@@ -98,9 +93,7 @@ def mutants(
 @click.argument("other")
 @FILES
 @ASKED
-@click.option(
-    "--budget", type=int, default=2000, show_default=True, help="Simulations of a problem at most."
-)
+@option("--budget", default=2000, help="Simulations of a problem at most.")
 @arguments.SEED
 @arguments.PLOT
 @fail_on(apart="if a trace tells the formulas apart")
@@ -128,8 +121,8 @@ def distinguish(
 @click.argument("formula")
 @FILES
 @ASKED
-@click.option("--dt", type=float, help="Sampling period of the traces in seconds.")
-@click.option("--duration", type=float, help="Duration of the traces in seconds.")
+@option("--dt", type=float, help="Sampling period of the traces in seconds.")
+@option("--duration", type=float, help="Duration of the traces in seconds.")
 @arguments.SEED
 @arguments.PLOT
 def examples(
@@ -154,7 +147,7 @@ def examples(
 
 @command()
 @click.argument("words", nargs=-1)
-@click.option("--domain", help="Domain, such as driving, flight, medical or power.")
+@option("--domain", help="Domain, such as driving, flight, medical or power.")
 def templates(words: tuple[str, ...], domain: str | None) -> None:
     """Print the requirements of the library that have all WORDS, with their sources and units."""
     from verifai_jax import mtl

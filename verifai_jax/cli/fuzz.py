@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from verifai_jax.cli import arguments
+from verifai_jax.cli.arguments import option
 from verifai_jax.cli.falsify import print_run
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result
@@ -15,8 +16,8 @@ from verifai_jax.cli.next_folder import given_or_next
 
 @command()
 @arguments.TARGET
-@click.option("--budget", type=int, default=10_000, show_default=True, help="Simulations at most.")
-@click.option(
+@option("--budget", default=10_000, help="Simulations at most.")
+@option(
     "--cells",
     multiple=True,
     metavar="SIGNAL=LOW:HIGH:COUNT",

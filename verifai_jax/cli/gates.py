@@ -18,7 +18,6 @@ from verifai_jax.cli.json_output import give_result
 from verifai_jax.core.errors import nearest_names
 
 Command = TypeVar("Command", bound=Callable[..., object])
-
 RATE = "rate"
 """Name of the gate with a bound."""
 
@@ -75,7 +74,6 @@ def fail_on(**gates: str) -> Callable[[Command], Command]:
     """Return the option `--fail-on` of a command.
 
     **Arguments:**
-
     - `gates`: when each fails, as text, by name; `rate` has a bound, `rate>P`.
     """
     words = "; ".join(f"{'rate>P' if name == RATE else name}: {t}" for name, t in gates.items())
@@ -86,7 +84,6 @@ def check_gate(asked: Gate | None, failed: Mapping[str, bool]) -> None:
     """End the command with code 1 where the gate that was asked for failed.
 
     **Arguments:**
-
     - `asked`: the gate; None for none.
     - `failed`: by name of the gate.
     """

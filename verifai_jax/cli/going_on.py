@@ -21,7 +21,6 @@ from verifai_jax.cli.json_output import as_plain
 
 if TYPE_CHECKING:
     from verifai_jax.evaluation.unfinished import Unfinished
-
 WORDS = "verifai_jax.words"
 """Entry of a context that has the words of the command line."""
 FOLDER = Path("runs") / "unfinished"
@@ -44,7 +43,6 @@ class Kept:
         """Note that the result exists, and what ended the work.
 
         **Arguments:**
-
         - `why`: what ended it early; None or anything else if it is done.
         """
         if self._work is None:

@@ -6,27 +6,24 @@ from typing import Any
 import click
 
 from verifai_jax.cli import arguments
+from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, draw, give_result
 
 
 @command()
 @arguments.TARGET
-@click.option("--rounds", type=int, default=8, show_default=True, help="Attacks, at most.")
-@click.option("--steps", type=int, help="Environment steps of the first training.")
-@click.option("--further-steps", type=int, help="Of each round  [default: an eighth of --steps]")
-@click.option("--samples", type=int, default=512, show_default=True, help="Of each certificate.")
-@click.option("--attack", default="cross_entropy", show_default=True, help="Search that attacks.")
-@click.option("--attack-simulations", type=int, default=512, show_default=True)
-@click.option("--confidence", type=float, default=0.95, show_default=True)
-@click.option("--baseline", is_flag=True, help="Train with plain domain randomisation as well.")
+@option("--rounds", default=8, help="Attacks, at most.")
+@option("--steps", type=int, help="Environment steps of the first training.")
+@option("--further-steps", type=int, help="Of each round  [default: an eighth of --steps]")
+@option("--samples", default=512, help="Of each certificate.")
+@option("--attack", default="cross_entropy", help="Search that attacks.")
+@option("--attack-simulations", default=512)
+@option("--confidence", default=0.95)
+@option("--baseline", is_flag=True, help="Train with plain domain randomisation as well.")
 @arguments.SEED
 @arguments.MAX_SECONDS
-@click.option(
-    "--folder",
-    type=click.Path(path_type=Path),
-    help="Folder to write, and to go on in  [default: runs/harden-NAME]",
-)
+@option("--folder", type=PATH, help="Folder to write, and to go on in  [default: runs/harden-NAME]")
 @arguments.EVEN_IF_CHANGED
 @arguments.PLOT
 @arguments.PROGRESS

@@ -61,7 +61,6 @@ def give_result(**values: object) -> None:
     """Set entries of the present command's result.
 
     **Arguments:**
-
     - `values`: anything that `as_plain` knows.
     """
     context = click.get_current_context(silent=True)
@@ -73,8 +72,6 @@ def show_result(found: Any, plot: Path | None, *names: str) -> None:
     """Print a result, give it as plain data, and draw it into a file where one is named.
 
     **Arguments:**
-
-    - `found`: what the Python API returned.
     - `plot`: the file of its picture, whose folder is made; None for no picture.
     - `names`: attributes to give; all fields that its `repr` shows when left out.
     """

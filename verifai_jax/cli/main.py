@@ -24,13 +24,7 @@ from verifai_jax.cli.confirm import confirm
 from verifai_jax.cli.counterexamples import replay_counterexamples, save_counterexamples
 from verifai_jax.cli.doctor import doctor
 from verifai_jax.cli.estimate import estimate
-from verifai_jax.cli.exit_codes import (
-    CLOSED_PIPE,
-    EPILOG,
-    INTERRUPTED,
-    CommandError,
-    command_error,
-)
+from verifai_jax.cli.exit_codes import CLOSED_PIPE, EPILOG, INTERRUPTED, CommandError, command_error
 from verifai_jax.cli.explain import explain
 from verifai_jax.cli.falsify import falsify
 from verifai_jax.cli.fmea import fmea
@@ -185,7 +179,5 @@ def main(traceback: bool) -> None:
 for _command in COMMANDS:
     _command.epilog = EPILOG
     main.add_command(_command)
-
-
 if __name__ == "__main__":
     main(prog_name="verifai-jax")

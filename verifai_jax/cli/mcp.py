@@ -28,7 +28,6 @@ SHOWN = 8000
 OWN = "agent_problems"
 """Folder of the problems that `check` writes."""
 NAME = r"[A-Za-z_][A-Za-z0-9_]{0,60}"
-
 Schema = Mapping[str, Any]
 PROBLEM = {"type": "string", "description": "A problem, FILE.py:NAME, of the folder."}
 RUN = {"type": "string", "description": "The folder of a run, as falsify returned it."}

@@ -5,6 +5,7 @@ from pathlib import Path
 import click
 
 from verifai_jax.cli import arguments
+from verifai_jax.cli.arguments import PATH
 from verifai_jax.cli.falsify import check_run, print_run
 from verifai_jax.cli.gates import Gate, fail_on
 from verifai_jax.cli.json_output import command
@@ -12,9 +13,7 @@ from verifai_jax.cli.next_folder import given_or_next
 
 
 @command()
-@click.argument(
-    "folders", metavar="PARTS...", nargs=-1, required=True, type=click.Path(path_type=Path)
-)
+@click.argument("folders", metavar="PARTS...", nargs=-1, required=True, type=PATH)
 @arguments.PROBLEM
 @arguments.ONLY
 @arguments.RUN_FOLDER

@@ -3,22 +3,19 @@
 from pathlib import Path
 from typing import Any
 
-import click
-
 from verifai_jax.cli import arguments
+from verifai_jax.cli.arguments import option
 from verifai_jax.cli.going_on import kept_until_done
 from verifai_jax.cli.json_output import command, show_result
 
 
 @command()
 @arguments.TARGET
-@click.option("--budget", type=int, default=50_000, show_default=True, help="Simulations at most.")
-@click.option("--confidence", type=float, default=0.95, show_default=True)
-@click.option(
+@option("--budget", default=50_000, help="Simulations at most.")
+@option("--confidence", default=0.95)
+@option(
     "--min-share",
-    type=float,
     default=0.001,
-    show_default=True,
     help="Part of the failure probability below which a mode is not listed.",
 )
 @arguments.SEED

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import click
 
-from verifai_jax.cli.arguments import NAMES, PLOT, read_names
+from verifai_jax.cli.arguments import NAMES, PATH, PLOT, option, read_names
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result
@@ -35,33 +35,32 @@ if TYPE_CHECKING:
 
 @command()
 @click.argument("formula")
-@click.argument("recording", nargs=-1, type=click.Path(path_type=Path))
-@click.option("--dt", type=float, help="Sampling period in seconds, instead of a column of times.")
-@click.option("--time", default="time", show_default=True, help="Column of sample times.")
-@click.option("--resample", "period", type=float, help="Period in seconds to resample to.")
-@click.option("--method", type=click.Choice(["hold", "linear"]), help="Interpolation to resample.")
-@click.option(
+@click.argument("recording", nargs=-1, type=PATH)
+@option("--dt", type=float, help="Sampling period in seconds, instead of a column of times.")
+@option("--time", default="time", help="Column of sample times.")
+@option("--resample", "period", type=float, help="Period in seconds to resample to.")
+@option("--method", type=click.Choice(["hold", "linear"]), help="Interpolation to resample.")
+@option(
     "--missing",
     type=click.Choice(["hold", "drop", "interpolate"]),
     help="Treatment of gaps  [default: no verdict where they matter]",
 )
-@click.option(
+@option(
     "--end",
     type=click.Choice(["hold", "truncate", "strict"]),
     default="hold",
-    show_default=True,
     help="Semantics after the last sample.",
 )
-@click.option("--compat", type=click.Choice(["pymtl"]), help="Right-open windows, as in py-mtl.")
+@option("--compat", type=click.Choice(["pymtl"]), help="Right-open windows, as in py-mtl.")
 @NAMES
-@click.option(
+@option(
     "--export-c",
     "header",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="FILE.h",
     help="Write FORMULA as a monitor in C (or FILE.fmu) instead, for samples --dt seconds apart.",
 )
-@click.option("--explain", is_flag=True, help="Say which predicate decides, and when.")
+@option("--explain", is_flag=True, help="Say which predicate decides, and when.")
 @PLOT
 @fleet_options
 @fail_on(violation="if a formula fails", incomplete="if one fails or has no verdict on a recording")
@@ -237,15 +236,12 @@ def monitor_stream(
     """Monitor samples until the verdict is certain whatever follows, or until they end.
 
     **Arguments:**
-
     - `lines`: the lines of CSV; the first has the names.
     - `time`: the column of sample times in seconds, or of dates (ISO 8601).
     - `dt`: the sampling period in seconds, instead of a column of times.
     - `show`: what prints a line.
     - `hold`: whether a gap keeps the last value of its signal.
-
     **Returns:** whether the formula holds; with the last sample held, if the samples have ended.
-
     **Raises:** `ValueError` for lines that are no evenly spaced samples; `CommandError` for a NaN.
     """
     from verifai_jax import mtl

@@ -9,25 +9,25 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from verifai_jax.cli.arguments import option
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.json_output import give_result
 from verifai_jax.core.text import printable
 
 if TYPE_CHECKING:
     from verifai_jax.mtl import Judgement, Requirement
-
 Command = TypeVar("Command", bound=Callable[..., object])
 
 
 def fleet_options(command: Command) -> Command:
     """Add the options of many requirements on many recordings."""
     files = click.Path(path_type=Path, dir_okay=False)
-    for option in (
+    for each in (
         click.option("--jobs", type=click.IntRange(1), default=1, help="Processes that judge."),
-        click.option("--junit", type=files, help="File of the verdicts as JUnit XML."),
-        click.option("--report", type=files, help="HTML file of the report."),
+        option("--junit", type=files, help="File of the verdicts as JUnit XML."),
+        option("--report", type=files, help="HTML file of the report."),
     ):
-        command = option(command)
+        command = each(command)
     return command
 
 
@@ -52,10 +52,8 @@ def monitor_fleet(
     """Judge requirements, a file of them or one formula, on recordings; print what was found.
 
     **Arguments:**
-
     - `jobs`: processes that judge; more than one are started for it.
     - `options`: the options of `judge`: how recordings are read.
-
     **Raises:** `CommandError` where nothing has a verdict.
     """
     from verifai_jax import mtl

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from verifai_jax.cli.arguments import PATH
 from verifai_jax.cli.json_output import command, give_result
 from verifai_jax.core.atomic_files import replacing
 
@@ -21,7 +22,7 @@ FILES = {
 
 
 @command()
-@click.argument("folder", metavar="FOLDER", type=click.Path(path_type=Path))
+@click.argument("folder", metavar="FOLDER", type=PATH)
 def new(folder: Path) -> None:
     """Write a small project into FOLDER: a system, a specification, and tests of it."""
     there = sorted(name for name in FILES if (folder / name).exists())

@@ -16,7 +16,6 @@ def given_or_next(
     """Return the folder that was given, or else the next one, as `next_folder` makes it.
 
     **Arguments:**
-
     - `goes_on`: writes the command that goes on with the folder, which is said for those who kill
       this one.
     - `record`: file that the folder has from when on that is possible.
@@ -36,8 +35,8 @@ def next_folder(parent: str, name: str) -> Iterator[Path]:
 
     A command that ends without a file in it removes it.
     """
+    from verifai_jax.core.store.locks import writing
     from verifai_jax.core.text import folder_name
-    from verifai_jax.store.locks import writing
 
     name, number, first = folder_name(name), 1, not Path(parent).exists()
     while True:

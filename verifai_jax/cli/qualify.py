@@ -4,19 +4,19 @@ from pathlib import Path
 
 import click
 
+from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.exit_codes import BROKEN
 from verifai_jax.cli.json_output import command, give_result
 
 
 @command()
-@click.option(
+@option(
     "--folder",
-    type=click.Path(path_type=Path),
+    type=PATH,
     default=Path("qualification"),
-    show_default=True,
     help="Folder for qualification.html and qualification.json.",
 )
-@click.option("--only", multiple=True, help="Name of an oracle, several times for several.")
+@option("--only", multiple=True, help="Name of an oracle, several times for several.")
 def qualify(folder: Path, only: tuple[str, ...]) -> None:
     """Run the tool's own oracles on this machine, and write the record to be signed.
 

@@ -6,6 +6,7 @@ from typing import Any
 import click
 
 from verifai_jax.cli import arguments
+from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.going_on import kept_until_done
 from verifai_jax.cli.json_output import command, draw, give_result, show_result
@@ -13,19 +14,17 @@ from verifai_jax.cli.json_output import command, draw, give_result, show_result
 
 @command()
 @arguments.TARGET
-@click.option(
-    "--parameters", required=True, metavar="NAMES", help="Features to change, comma-separated."
-)
-@click.option(
+@option("--parameters", required=True, metavar="NAMES", help="Features to change, comma-separated.")
+@option(
     "--nominal",
     "nominal",
     multiple=True,
     metavar="NAME=VALUE",
     help="Value a parameter starts from  [default: the problem's nominal value]",
 )
-@click.option("--run", "folder", type=click.Path(path_type=Path), help="Run with counterexamples.")
-@click.option("--budget", type=int, default=20_000, show_default=True, help="Simulations at most.")
-@click.option(
+@option("--run", "folder", type=PATH, help="Run with counterexamples.")
+@option("--budget", default=20_000, help="Simulations at most.")
+@option(
     "--estimate",
     type=int,
     help="Simulations for each of the failure probabilities before and after  [default: none]",

@@ -5,6 +5,7 @@ from pathlib import Path
 import click
 
 from verifai_jax.cli import arguments
+from verifai_jax.cli.arguments import option
 from verifai_jax.cli.exit_codes import check_again
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result
@@ -14,7 +15,7 @@ from verifai_jax.cli.json_output import command, give_result
 @arguments.RUN
 @arguments.ROW
 @arguments.PROBLEM
-@click.option(
+@option(
     "--precision",
     type=click.Choice(["float32", "float64"]),
     help="[default: float64, and that of the run for a system that draws random numbers]",
@@ -35,7 +36,7 @@ def replay(
 ) -> None:
     """Simulate a ROW (by default the worst) of the run in RUN again, and draw it."""
     from verifai_jax.core.text import one_line, printable
-    from verifai_jax.plotting import write_replay_pictures
+    from verifai_jax.reports.plotting import write_replay_pictures
 
     run = (arguments.load_judged_run if row is None else arguments.load_run)(folder, target)
     number = int(run.best.name) if row is None else row  # pyright: ignore[reportArgumentType]

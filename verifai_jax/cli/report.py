@@ -5,43 +5,40 @@ from pathlib import Path
 import click
 
 from verifai_jax.cli import arguments
+from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.json_output import command, give_result
 
 
 @command()
-@click.argument("folder", metavar="FOLDER", type=click.Path(path_type=Path))
+@click.argument("folder", metavar="FOLDER", type=PATH)
 @arguments.PROBLEM
-@click.option(
+@option(
     "--output",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="HTML",
     help="File to write  [default: report.html in the folder]",
 )
-@click.option("--unit", "units", multiple=True, metavar="FEATURE=UNIT", help="Unit of a feature.")
-@click.option(
-    "--reason", "reasons", multiple=True, metavar="FEATURE=TEXT", help="Reason of its range."
-)
-@click.option("--traces", type=int, help="Rows simulated beforehand at most  [default: chosen]")
+@option("--unit", "units", multiple=True, metavar="FEATURE=UNIT", help="Unit of a feature.")
+@option("--reason", "reasons", multiple=True, metavar="FEATURE=TEXT", help="Reason of its range.")
+@option("--traces", type=int, help="Rows simulated beforehand at most  [default: chosen]")
 @click.option(
     "--studies/--no-studies",
     default=None,
     help="Explain and shrink the worst failure  [default: unless it takes long]",
 )
-@click.option(
+@option(
     "--modes",
     type=int,
     metavar="SIMULATIONS",
     help="Add all ways of failing of a run and their probabilities, by so many simulations.",
 )
 @arguments.ODD
-@click.option(
+@option(
     "--assessment",
     is_flag=True,
     help="Add the claims as a tree, boxes on credibility, and a page to be signed.",
 )
-@click.option(
-    "--without-problem", is_flag=True, help="Simulate nothing: report what the folder says."
-)
+@option("--without-problem", is_flag=True, help="Simulate nothing: report what the folder says.")
 def report(
     folder: Path,
     target: str | None,

@@ -6,6 +6,7 @@ from typing import Any
 import click
 
 from verifai_jax.cli import arguments
+from verifai_jax.cli.arguments import option
 from verifai_jax.cli.exit_codes import check_again
 from verifai_jax.cli.going_on import kept_until_done
 from verifai_jax.cli.json_output import command, give_result, show_result
@@ -15,20 +16,16 @@ from verifai_jax.cli.json_output import command, give_result, show_result
 @arguments.RUN
 @arguments.ROW
 @arguments.PROBLEM
-@click.option(
+@option(
     "--by",
     type=click.Choice(["count", "distance", "likelihood"]),
     default="count",
-    show_default=True,
     help="Fewest features first, least distance first, or the likeliest failure.",
 )
-@click.option("--budget", type=int, default=2000, show_default=True, help="Simulations at most.")
+@option("--budget", default=2000, help="Simulations at most.")
 @arguments.SEED
-@click.option(
-    "--others/--no-others",
-    default=True,
-    show_default=True,
-    help="Start from other counterexamples of the run too.",
+@option(
+    "--others/--no-others", default=True, help="Start from other counterexamples of the run too."
 )
 @arguments.EVEN_IF_CHANGED
 @arguments.FOLDER
@@ -43,11 +40,11 @@ def shrink(
     **options: Any,
 ) -> None:
     """Make a ROW (by default the worst) of the run in RUN small: few features, near nominal."""
-    from verifai_jax import counterexamples
+    import verifai_jax as vj
 
     run = arguments.load_judged_run(folder, target)
     with kept_until_done() as kept:
-        small = counterexamples.shrink(run, row, **options)
+        small = vj.shrink(run, row, **options)
         give_result(robustness=small.rho)
         show_result(
             small, (into or folder) / f"shrunk-{small.row}.png" if pictures else None, "row",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from verifai_jax.cli import arguments
+from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, draw, give_result
@@ -16,7 +17,6 @@ from verifai_jax.cli.next_folder import given_or_next
 
 if TYPE_CHECKING:
     from verifai_jax import Sweep
-
 _RESUMES = (
     *("resume", "target", "configurations", "max_seconds", "cache", "even_if_changed", "cluster"),
     "fail_on",
@@ -30,39 +30,24 @@ _MAX_ROWS = 12
 
 @command()
 @click.argument("target", required=False)
-@click.option("--configurations", type=int, help="Configurations at most  [default: 32]")
-@click.option("--search", help="Name of the search, or optuna:tpe  [default: halton]")
+@option("--configurations", type=int, help="Configurations at most  [default: 32]")
+@option("--search", help="Name of the search, or optuna:tpe  [default: halton]")
 @arguments.SET
-@click.option("--seed", type=int, help="Seed of the search and the samples  [default: 0]")
-@click.option("--samples", type=int, help="Samples of each policy, at least  [default: 512]")
-@click.option("--confidence", type=float, help="Of all verdicts together  [default: 0.95]")
-@click.option("--budget", type=int, help="Simulations of the certification in all.")
-@click.option("--attack", help="Search that attacks each policy  [default: cross_entropy]")
-@click.option("--attack-simulations", type=int, help="Simulations of each attack  [default: 256]")
-@click.option(
-    "--halving",
-    "reduction",
-    type=float,
-    help="One of so many configurations continues.",
-)
-@click.option("--halving-by", "by", help="Criterion: return or safety  [default: return]")
-@click.option("--only", metavar="NAMES", help="Hyper-parameters to vary, comma-separated.")
-@click.option(
-    "--nominal", multiple=True, metavar="NAME=VALUE", help="Value of one that --only fixes."
-)
+@option("--seed", type=int, help="Seed of the search and the samples  [default: 0]")
+@option("--samples", type=int, help="Samples of each policy, at least  [default: 512]")
+@option("--confidence", type=float, help="Of all verdicts together  [default: 0.95]")
+@option("--budget", type=int, help="Simulations of the certification in all.")
+@option("--attack", help="Search that attacks each policy  [default: cross_entropy]")
+@option("--attack-simulations", type=int, help="Simulations of each attack  [default: 256]")
+@option("--halving", "reduction", type=float, help="One of so many configurations continues.")
+@option("--halving-by", "by", help="Criterion: return or safety  [default: return]")
+@option("--only", metavar="NAMES", help="Hyper-parameters to vary, comma-separated.")
+@option("--nominal", multiple=True, metavar="NAME=VALUE", help="Value of one that --only fixes.")
 @arguments.MAX_SECONDS
-@click.option(
-    "--cache",
-    type=click.Path(path_type=Path),
-    help="Folder of finished work  [default: the sweep's folder]",
-)
-@click.option("--resume", type=click.Path(path_type=Path), help="Folder of a sweep to resume.")
+@option("--cache", type=PATH, help="Folder of finished work  [default: the sweep's folder]")
+@option("--resume", type=PATH, help="Folder of a sweep to resume.")
 @arguments.EVEN_IF_CHANGED
-@click.option(
-    "--folder",
-    type=click.Path(path_type=Path),
-    help="Folder to write  [default: sweeps/NAME-1, -2, ...]",
-)
+@option("--folder", type=PATH, help="Folder to write  [default: sweeps/NAME-1, -2, ...]")
 @arguments.CLUSTER
 @arguments.PICTURES
 @fail_on(unsafe="unless a policy is shown to be safe")
@@ -83,20 +68,17 @@ def sweep(
 ) -> None:
     """Train configurations of the study TARGET (specs/FILE.py:NAME), certify their policies."""
     from verifai_jax import Study
+    from verifai_jax.core.store.cache import cache_file
     from verifai_jax.core.targets import load_target, target_of_project
     from verifai_jax.core.text import printable
-    from verifai_jax.store.cache import cache_file
-    from verifai_jax.sweeps._sweep import sweep as run_sweep
+    from verifai_jax.training.sweeps._sweep import sweep as run_sweep
 
     if resume is not None:
         arguments.refuse_others(_RESUMES, "is fixed in the sweep that --resume goes on with")
         folder, cache = resume, resume if cache is None else cache
         before = _read_command(cache)
         target = target or target_of_project(
-            before["target"],
-            resume,
-            kind="study",
-            remedy="specs/FILE.py:NAME --resume ...",
+            before["target"], resume, kind="study", remedy="specs/FILE.py:NAME --resume ..."
         )
         given, configurations = before["given"], configurations or before["configurations"]
         options, nominal = tuple(before["options"]), tuple(before["nominal"])
@@ -202,7 +184,7 @@ def _keywords(given: Mapping[str, Any], options: tuple[str, ...]) -> dict[str, A
 
 def _read_command(folder: Path) -> dict[str, Any]:
     """Read the command of an interrupted sweep from its cache."""
-    from verifai_jax.store.cache import Cache, CacheError, cache_file
+    from verifai_jax.core.store.cache import Cache, CacheError, cache_file
 
     if not cache_file(folder).exists():
         raise FileNotFoundError(f"no sweep to resume in {folder}{_describe_folder(folder)}")
@@ -236,7 +218,7 @@ def _describe_folder(folder: Path) -> str:
 def _format_table(result: "Sweep") -> str:
     """Write the most preferable rows of the table."""
     from verifai_jax.core.text import printable
-    from verifai_jax.sweeps.ranking import preference_order
+    from verifai_jax.training.sweeps.ranking import preference_order
 
     table = result.table
     order = list(preference_order(table))

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from verifai_jax.cli.arguments import PARAMETER_CHOICE, TARGET, load_problem
+from verifai_jax.cli.arguments import PARAMETER_CHOICE, PATH, TARGET, load_problem, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.going_on import kept_until_done
 from verifai_jax.cli.json_output import command, show_result
@@ -13,17 +13,10 @@ from verifai_jax.cli.json_output import command, show_result
 
 @command()
 @TARGET
-@click.option(
-    "--parameters", metavar="NAMES", help="Features to choose, comma-separated  [default: all]"
-)
-@click.option("--budget", type=int, default=10_000, show_default=True, help="Simulations at most.")
+@option("--parameters", metavar="NAMES", help="Features to choose, comma-separated  [default: all]")
+@option("--budget", default=10_000, help="Simulations at most.")
 @PARAMETER_CHOICE
-@click.option(
-    "--table",
-    type=click.Path(path_type=Path),
-    metavar="CSV",
-    help="Write the candidates into a CSV file.",
-)
+@option("--table", type=PATH, metavar="CSV", help="Write the candidates into a CSV file.")
 @fail_on(unsafe="unless the formula holds with the parameters, in the check too")
 def synthesize(
     target: str,

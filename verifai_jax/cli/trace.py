@@ -4,26 +4,27 @@ from pathlib import Path
 
 import click
 
+from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result
 
-FOLDER = click.Path(path_type=Path)
+FOLDER = PATH
 
 
 @command()
 @click.argument("targets", metavar="FILE.py...", nargs=-1, required=True)
-@click.option("--requirements", type=FOLDER, help="File of them  [default: those of the problems]")
-@click.option("--tests", type=FOLDER, multiple=True, help="Files or folders  [default: tests]")
-@click.option("--runs", type=FOLDER, multiple=True, help="Folders of runs  [default: runs]")
-@click.option("--reports", type=FOLDER, multiple=True, help="Files or folders  [default: reports]")
-@click.option(
+@option("--requirements", type=FOLDER, help="File of them  [default: those of the problems]")
+@option("--tests", type=FOLDER, multiple=True, help="Files or folders  [default: tests]")
+@option("--runs", type=FOLDER, multiple=True, help="Folders of runs  [default: runs]")
+@option("--reports", type=FOLDER, multiple=True, help="Files or folders  [default: reports]")
+@option(
     "--without",
     multiple=True,
     type=click.Choice(["tests", "runs", "reports"]),
     help="A kind of link that is not asked for.",
 )
-@click.option("--csv", type=FOLDER, help="File to write the table to.")
-@click.option("--report", type=FOLDER, help="HTML file to write.")
+@option("--csv", type=FOLDER, help="File to write the table to.")
+@option("--report", type=FOLDER, help="HTML file to write.")
 @fail_on(
     missing="if a link is missing",
     suspect="if a link is suspect",

@@ -6,21 +6,22 @@ from typing import Any
 import click
 
 from verifai_jax.cli import arguments
+from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.going_on import kept_until_done
 from verifai_jax.cli.json_output import as_plain, command, give_result
 
 
 @command()
 @arguments.TARGET
-@click.argument("trials", type=click.Path(path_type=Path), required=False)
-@click.option("--simulations", type=int, default=10_000, show_default=True, help="Of the prior.")
-@click.option("--confidence", type=float, default=0.95, show_default=True)
-@click.option("--allocated", is_flag=True, help="Trials were chosen as --next does.")
-@click.option("--at-any-time", is_flag=True, help="Verdicts decided when to stop, or what to try.")
-@click.option("--next", "count", type=int, help="Choose so many trials to make next.")
-@click.option(
+@click.argument("trials", type=PATH, required=False)
+@option("--simulations", default=10_000, help="Of the prior.")
+@option("--confidence", default=0.95)
+@option("--allocated", is_flag=True, help="Trials were chosen as --next does.")
+@option("--at-any-time", is_flag=True, help="Verdicts decided when to stop, or what to try.")
+@option("--next", "count", type=int, help="Choose so many trials to make next.")
+@option(
     "--sheet",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="HTML",
     help="Write a protocol of the next trials to print, and a CSV to fill in.",
 )

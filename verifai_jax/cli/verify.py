@@ -6,23 +6,22 @@ from typing import Any
 import click
 
 from verifai_jax.cli import arguments
+from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result, show_result
 
 
 @command()
 @arguments.TARGET
-@click.option("--budget", type=float, help="Seconds, about.  [default: 60]")
-@click.option("--boxes", type=int, help="Boxes to look at, at most.")
-@click.option("--samples", type=int, default=4096, show_default=True, help="Of what is undecided.")
-@click.option("--confidence", type=float, default=0.95, show_default=True)
+@option("--budget", type=float, help="Seconds, about.  [default: 60]")
+@option("--boxes", type=int, help="Boxes to look at, at most.")
+@option("--samples", default=4096, help="Of what is undecided.")
+@option("--confidence", default=0.95)
 @arguments.SEED
 @arguments.ONLY
 @arguments.PRECISION
-@click.option("--continuous", is_flag=True, help="Verify the differential equation at all times.")
-@click.option(
-    "--into", type=click.Path(path_type=Path), help="File for the result, or to go on with."
-)
+@option("--continuous", is_flag=True, help="Verify the differential equation at all times.")
+@option("--into", type=PATH, help="File for the result, or to go on with.")
 @arguments.PLOT
 @arguments.REPORT
 @arguments.PROGRESS
@@ -54,6 +53,5 @@ def verify(
     if report is not None:
         click.echo(f"  report       {found.report(report, problem=problem)}")
     check_gate(
-        fail_on,
-        {"counterexample": found.broken.mass > 0, "undecided": found.proved.mass < 1},
+        fail_on, {"counterexample": found.broken.mass > 0, "undecided": found.proved.mass < 1}
     )

@@ -37,11 +37,8 @@ def replacing(path: str | Path, *, locked: bool = False) -> Iterator[Path]:
     made.
 
     **Arguments:**
-
-    - `path`: the path of the file.
     - `locked`: whether its folder is there and has no other writer. Then the file that a killed
       process leaves has a name that does not change, and the next writer takes it.
-
     **Raises:** `OSError` that names `path`, the reason and a remedy, for whatever the file system
     refuses.
     """
@@ -95,11 +92,8 @@ def unwritable(path: str | Path, error: OSError, more: str = "") -> OSError:
     """Return the error for a file or folder that cannot be written.
 
     **Arguments:**
-
-    - `path`: the path of the file or folder.
     - `error`: the error of the file system; one of this function will do.
     - `more`: what becomes of the results, as a sentence.
-
     **Returns:** an error of the same kind and `errno`, whose message names the path, the reason
     and a remedy.
     """

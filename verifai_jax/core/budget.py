@@ -10,7 +10,6 @@ class Budget:
     """A budget of simulations, and perhaps of time.
 
     **Arguments:**
-
     - `spent()`: simulations so far.
     - `maximum`: simulations at most.
     - `until`: a time of `time.perf_counter` in seconds, or None.
@@ -55,7 +54,6 @@ def split_budget(
     """Return the budget of a search and that of the check after it, which has no simulation limit.
 
     **Arguments:**
-
     - `spent()`: simulations so far.
     - `budget`: simulations of the search at most.
     - `started`: a time of `time.perf_counter` in seconds.

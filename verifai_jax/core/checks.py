@@ -25,14 +25,9 @@ def check_name(
     """Check a name that tables and files can hold.
 
     **Arguments:**
-
     - `what`: what it names, for the message: `the name of a signal`.
-    - `name`: name to check.
     - `lines`: whether it may have line breaks and other control characters.
     - `error`: type of the error to raise.
-
-    **Returns:** the name.
-
     **Raises:** `error` for anything but a text that is not empty and that UTF-8 can hold.
     """
     if not isinstance(name, str) or not name:
@@ -63,15 +58,10 @@ def check_fraction(
     """Check a probability or another share of one.
 
     **Arguments:**
-
     - `name`: name of the argument in the error message.
-    - `value`: value to check.
     - `zero`: whether 0 itself is allowed.
     - `one`: whether 1 itself is allowed.
     - `error`: type of the error to raise.
-
-    **Returns:** the value, a number.
-
     **Raises:** `error` unless `0 < value < 1`, or the value is an end that is allowed.
     """
     if is_number(value) and (0 < value < 1 or (zero and value == 0) or (one and value == 1)):
@@ -88,14 +78,9 @@ def check_positive(
     """Check a number above zero.
 
     **Arguments:**
-
     - `name`: name of the argument in the error message.
-    - `value`: value to check.
     - `finite`: whether infinity is refused too.
     - `error`: type of the error to raise.
-
-    **Returns:** the value, a number.
-
     **Raises:** `error` unless `value > 0`.
     """
     if not (is_number(value) and value > 0 and not (finite and math.isinf(value))):
@@ -109,14 +94,11 @@ def check_count(
     """Check an integer that counts something.
 
     **Arguments:**
-
     - `name`: name of the argument in the error message.
     - `value`: value to check; NumPy's integers are welcome, truth values and floats are not.
     - `minimum`: smallest value allowed.
     - `error`: type of the error to raise.
-
     **Returns:** the value as a Python integer.
-
     **Raises:** `error` for anything but an integer of at least `minimum`.
     """
     count = None
@@ -133,10 +115,7 @@ def check_count(
 def check_options(
     budget: object, batch: object, seed: object, max_seconds: object, stop_after: object
 ) -> None:
-    """Refuse numbers out of range.
-
-    **Raises:** `ValueError`.
-    """
+    """Refuse numbers out of range."""
     for name, value in (("budget", budget), ("batch", batch), ("stop_after", stop_after)):
         if name == "stop_after" and value is None:
             continue

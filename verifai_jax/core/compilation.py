@@ -30,31 +30,25 @@ XlaOptimization = Literal["most", "little", "least"]
 """How much XLA does to make a program fast on a processor. `little` computes what `most` does, on
 some processors to the last bit, in programs without long chains of products and sums; `least`
 rounds each product."""
-
 _OPTIONS: dict[XlaOptimization, dict[str, Any]] = {
     "most": {},
     "little": {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1},
     "least": {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0},
 }
-
 _WHOLE_LOOPS = {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
 """Without the pass that splits a loop over cores: each time it is waited for takes longer than a
 step of a simulation."""
 _WIDE = {"xla_cpu_prefer_vector_width": 512}
 """The widest vectors of any processor, of which XLA takes half by itself: with them simulations ran
 up to 1.25 times as fast."""
-
 _running: dict[int, tuple[str, float]] = {}
 """What is being compiled: a name for people, and when it began."""
 _lock = threading.Lock()
-
 _waited = 0.0
 """Seconds that this process has waited for programs."""
-
 LONG = 0.4
 """Seconds of waiting for a program, from which on work is done that is needed later only: it would
 delay a result for which programs need but be loaded."""
-
 _meanwhile: dict[Callable[[], object], float] = {}
 """What is done at the next wait for a program, and after how many seconds of it."""
 
@@ -101,7 +95,8 @@ class Compilation:
                 self._program = _compiled(self.name, self._lowered, *self._how)
             except KeyboardInterrupt:
                 # Or else the process would not end before all others are compiled.
-                _cancel_waiting()
+                _pool().shutdown(wait=False, cancel_futures=True)
+                _pool.cache_clear()
                 raise
             finally:
                 _count_waiting(time.perf_counter() - began)
@@ -134,7 +129,6 @@ def compile_soon(
     """Compile a program in the background.
 
     **Arguments:**
-
     - `name`: the name of the program, for people: "the search".
     - `lowered`: the program, lowered by JAX.
     - `effort`: how much XLA does to make it fast; accelerators always do the most.
@@ -151,7 +145,6 @@ def while_compiling(work: Callable[[], object], after: float = LONG) -> None:
     """Have work done once where this process next waits for a program; never where it does not.
 
     **Arguments:**
-
     - `work`: what will be needed anyway, such as an import; nothing that results depend on.
     - `after`: seconds of the wait before; 0 for what a first result needs.
     """
@@ -166,7 +159,6 @@ def tracing(name: str = "") -> Iterator[None]:
     would look at all of them again and again, for a fifth of the time.
 
     **Arguments:**
-
     - `name`: the name of the program, which `describe_compilation` then says already; none by
       default.
     """
@@ -214,12 +206,6 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(available_cores(), "compile")
 
 
-def _cancel_waiting() -> None:
-    """Give up what waits for its turn; it is compiled when it is called, if it ever is."""
-    _pool().shutdown(wait=False, cancel_futures=True)
-    _pool.cache_clear()
-
-
 def _compiled(
     name: str, lowered: jax.stages.Lowered, effort: XlaOptimization, splits: bool, wide: bool
 ) -> jax.stages.Compiled:
@@ -259,7 +245,6 @@ def known_options(options: Mapping[str, Any]) -> dict[str, Any]:
     it does not know, and ends a process that gets it in `XLA_FLAGS`.
 
     **Arguments:**
-
     - `options`: values by their names.
     """
     nothing = jax.jit(lambda: np.float32(0)).lower()

@@ -14,7 +14,6 @@ class Cube:
     """The unit cube `[0, 1]^d` with the prior uniform on it.
 
     **Arguments:** for each coordinate
-
     - `levels`: 0 if it is continuous, or the number `n >= 1` of its cells, inside which points
       mean the same.
     - `weights`: the probabilities of its cells, which are their widths; None if they are equal.

@@ -29,12 +29,10 @@ def spread_over_devices(
     """Split the leading axis of some arguments, and of all results, over devices.
 
     **Arguments:**
-
     - `function`: the function of arrays whose leading axes are a device's share.
     - `split`: for each argument whether its leading axis is split; the others are given whole.
     - `devices`: JAX devices; all of this process when left out. Leading axes must be multiples of
       their number.
-
     **Returns:** a function of the whole arrays, to be traced by `jax.jit`; `function` itself where
     there is one device.
     """

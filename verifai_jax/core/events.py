@@ -38,7 +38,6 @@ class Events:
 
     # JAX rebuilds the class with placeholders and with batches, which have other shapes.
     __no_type_check__ = True
-
     kinds: Int[Array | np.ndarray, " slots"]
     waits: Float[Array | np.ndarray, " slots"]
     parameters: dict[str, Any]
@@ -102,7 +101,6 @@ class Events:
         """Return whether an event of this name has happened in the last `seconds`.
 
         **Arguments:**
-
         - `seconds`: how long an event lasts: a number, or the name of a parameter that says so.
         """
         ends = self[seconds] if isinstance(seconds, str) else seconds

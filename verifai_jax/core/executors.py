@@ -25,7 +25,6 @@ from verifai_jax.core.targets import load_target
 from verifai_jax.core.text import format_error, one_line
 
 T = TypeVar("T")
-
 USUAL_WORKERS = 8
 """Workers of an executor that does not say how many it has."""
 KEPT = 8
@@ -36,8 +35,6 @@ LOOK = 0.02
 """Seconds between two looks at futures that nothing can wait for together."""
 SENDS_CODE = ("dask", "distributed", "ray", "submitit", "loky", "joblib", "verifai_jax")
 """Packages whose executors send functions and classes that no module of the worker has."""
-
-
 _NO_MODULE = re.compile(r"No module named '([\w.]+)'")
 
 
@@ -78,7 +75,7 @@ def check_executor(executor: object) -> None:
     if not callable(getattr(executor, "submit", None)):
         raise TypeError(
             "executor must have concurrent.futures' submit, such as Dask's client.get_executor(), "
-            f"verifai_jax.clusters.RayExecutor() or a process pool; got {type(executor).__name__}"
+            f"vj.clusters.RayExecutor() or a process pool; got {type(executor).__name__}"
         )
     context = getattr(executor, "_mp_context", None)
     method = getattr(context, "get_start_method", lambda: "")()
@@ -180,7 +177,6 @@ class Shipment(Generic[T]):
     """An object that is sent to workers; each worker keeps it with the programs compiled for it.
 
     **Arguments:**
-
     - `thing`: the object.
     - `target`: its name `FILE.py:NAME`; given, the workers load it by that name, and it is not sent
       itself.

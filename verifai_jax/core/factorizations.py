@@ -22,7 +22,6 @@ from jax.interpreters import mlir
 
 _BEGINS, _ENDS = (0, 10, 0), (0, 11, 2)
 """Versions of jaxlib that cut batches, the second one no more."""
-
 _UNCUT = 200_000
 """Operations of a batch up to which jaxlib does not cut it."""
 

@@ -21,7 +21,7 @@ else:
 class Drawn:
     """A result that has a picture.
 
-    - `_picture`: a module of `verifai_jax.plotting`, and its function that draws the result.
+    - `_picture`: a module of `verifai_jax.reports.plotting`, and its function that draws it.
     """
 
     _picture: ClassVar[tuple[str, str]]
@@ -30,13 +30,29 @@ class Drawn:
         """Draw the result.
 
         **Arguments:**
-
         - `path`: file that the picture is written to, if given.
-
         **Returns:** the Matplotlib figure.
         """
         module, function = self._picture
-        return lazy_import(f"verifai_jax.plotting.{module}", function)(self, path)
+        return lazy_import(f"verifai_jax.reports.plotting.{module}", function)(self, path)
+
+
+class Reported:
+    """A result on which an evidence report can be written."""
+
+    def report(self, path: str | Path, **options: Any) -> Path:
+        """Write the evidence report as one HTML file, and its claims as JSON next to it.
+
+        **Arguments:**
+        - `path`: the path of the HTML file.
+        - `options`: the options of `reports.write_report` for a result of this kind: of a run
+          `units` and `reasons` of features, `traces`, `studies`, `modes`, `odd`, `assessment`; of a
+          sweep `units` and `reasons` of hyper-parameters; of a transfer `units` and `reasons` of
+          features, and of any other result its `problem`, too; of an estimate and a comparison also
+          `errors`.
+        **Returns:** the path of the HTML file.
+        """
+        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
 
 
 def new_figure(**options: Any) -> Figure:
@@ -45,7 +61,6 @@ def new_figure(**options: Any) -> Figure:
     As the last value of a notebook cell it is drawn, with or without `%matplotlib inline`.
 
     **Arguments:**
-
     - `options`: those of `matplotlib.figure.Figure`.
     """
     return _figure_class()(**options)

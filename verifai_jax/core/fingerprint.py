@@ -36,8 +36,6 @@ _CUSTOM = ("custom_jvp_call", "custom_vjp_call")
 """Primitives of functions that bring their own derivative."""
 _NAMED = ("UnspecifiedValue", "PRNGImpl", "Mesh", "AbstractMesh", "PyTreeDef", "Device", "FTTuple")
 """Classes of JAX whose text says all of them; the last one groups the operands of a loop (0.12)."""
-
-
 _ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")
 """Addresses in memory, which differ between processes."""
 
@@ -50,11 +48,9 @@ def fingerprint(program: Any, derivatives: bool = True) -> str | None:
     """Return a hash of all that a traced function computes, with its constants.
 
     **Arguments:**
-
     - `program`: what JAX traced, with its constants.
     - `derivatives`: whether rules of derivatives are read too. They are traced for that, and only
       programs that differentiate this one depend on them.
-
     **Returns:** the hash in hexadecimal digits; None if a part of the function is opaque, such
     as a call of Python from the device.
     """
@@ -255,7 +251,6 @@ def without_unused(program: Any, wanted: Sequence[bool]) -> Any:
     """Return a program that computes some of the results of another, from the same inputs.
 
     **Arguments:**
-
     - `program`: a `Jaxpr`.
     - `wanted`: which of its results.
     """
@@ -266,10 +261,8 @@ def as_function(program: Any, step: Any) -> tuple[Callable[..., list[Any]], list
     """Return a function that takes one step of a program, and the variables that are its arguments.
 
     **Arguments:**
-
     - `program`: a `Jaxpr`.
     - `step`: one of its equations.
-
     **Returns:** the function, of one array for each variable, which returns the step's results; and
     the variables, each once.
     """
@@ -288,11 +281,9 @@ def of_some(
     """Return a function of some arguments of another, to be differentiated.
 
     **Arguments:**
-
     - `call`: the other function, of arrays.
     - `values`: all of its arguments.
     - `indices`: numbers of those that the function takes; the others keep their values.
-
     **Returns:** the function, which returns those results that can have a derivative.
     """
 

@@ -23,7 +23,6 @@ def monotone_cubic(knots: Any, gaps: Any, left: Any, share: Any, xp: Any) -> Any
     Computing with MATLAB, section 3.6: the scheme of MATLAB's and SciPy's `pchip`.
 
     **Arguments:**
-
     - `knots`: `[n, ...]`, at least 2.
     - `gaps`: `[n - 1]`, the distances between their positions.
     - `left`: index of the number before the position, from 0 to n - 2.

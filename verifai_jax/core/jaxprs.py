@@ -6,7 +6,6 @@ from typing import Any, TypeVar
 from jax.extend.core import Literal
 
 V = TypeVar("V")
-
 CALLS = frozenset({
     "checkpoint", "closed_call", "core_call", "custom_vmap_call", "jit", "pjit", "remat", "remat2",
 })  # fmt: skip
@@ -34,7 +33,6 @@ def run_through(
     """Go through the steps of a `Jaxpr` in their order, and return its results.
 
     **Arguments:**
-
     - `constants`, `inputs`: the values of its constants and of its arguments.
     - `literal`: makes a value of a number in the program, given as JAX's `Literal`.
     - `step`: makes the results of one step from its operands.

@@ -6,7 +6,6 @@ from jaxtyping import Array, Int, Key, UInt32
 
 IMPLEMENTATION = "threefry2x32"
 """The generator is named so that a user's JAX settings do not change results."""
-
 ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 """Bits by which the rounds of the generator rotate, of every other four."""
 

@@ -1,6 +1,6 @@
 """Late binding: names that are imported when they are first used.
 
-    plot_replay = lazy_import("verifai_jax.plotting.replay", "plot_replay")
+    plot_replay = lazy_import("verifai_jax.reports.plotting.replay", "plot_replay")
     plot_replay(replay, path)                           # the module is imported now, not before
 
 A result lies below the pictures and analyses of it. Its methods reach them through `lazy_import`,
@@ -16,8 +16,8 @@ from typing import Any
 
 
 def lazy_import(module: str, name: str) -> Any:
-    """Import `module` now and return what it calls `name`."""
-    return getattr(importlib.import_module(module), name)
+    """Import `module` now and return what it calls `name`, which may be a module within it."""
+    return getattr(__import__(module, fromlist=[name]), name)
 
 
 def attach(
@@ -29,7 +29,6 @@ def attach(
     they are read from its source, so that each stands there once.
 
     **Arguments:**
-
     - `package`: the name of the package, which is being imported.
     - `others`: names that it has already.
     """

@@ -20,7 +20,6 @@ from jaxtyping import Array, Float
 
 CAPACITY = 256
 """Numbers of a program that are lifted; further ones stay constants."""
-
 T = TypeVar("T")
 
 
@@ -84,7 +83,6 @@ def lifted(owner: object, **values: np.ndarray) -> tuple[Any, ...]:
     """Return these numbers: as an argument of the program that is traced, or as they are.
 
     **Arguments:**
-
     - `owner`: the owner of the numbers, which they are known by, with their names.
     - `values`: arrays of the precision of the program.
     """

@@ -27,9 +27,7 @@ class CSVLogger:
     """A CSV file with a row a call: the step, then the values; a cell without a value is empty.
 
     **Arguments:**
-
     - `path`: the path of the file; one that is there is continued.
-
     **Raises:** `ValueError` for a file that is there and has no column `step`.
     """
 
@@ -50,22 +48,19 @@ class CSVLogger:
         row = {STEP: step, **values}
         columns = [*self._columns, *(name for name in row if name not in self._columns)]
         if columns != self._columns:
-            self._widen(columns)
+            # Write the file anew with more columns.
+            rows: list[dict[str, str]] = []
+            if self._columns:
+                with self.path.open(newline="") as file:
+                    rows = list(csv.DictReader(file))
+            with replacing(self.path) as partial, partial.open("w", newline="") as file:
+                writer = csv.DictWriter(file, columns)
+                writer.writeheader()
+                writer.writerows(rows)
+            self._columns = columns
         line = io.StringIO()
         csv.DictWriter(line, self._columns).writerow(row)
         append(self.path, line.getvalue().encode())
-
-    def _widen(self, columns: list[str]) -> None:
-        """Write the file anew with more columns."""
-        rows: list[dict[str, str]] = []
-        if self._columns:
-            with self.path.open(newline="") as file:
-                rows = list(csv.DictReader(file))
-        with replacing(self.path) as partial, partial.open("w", newline="") as file:
-            writer = csv.DictWriter(file, columns)
-            writer.writeheader()
-            writer.writerows(rows)
-        self._columns = columns
 
 
 class TensorBoardLogger:
@@ -76,7 +71,6 @@ class TensorBoardLogger:
     tensorflow/core/util/event.proto).
 
     **Arguments:**
-
     - `folder`: the folder of the event file; each logger begins a file of its own in it.
     - `prefix`: before the names of values, such as `"falsify/"`.
     """

@@ -52,10 +52,8 @@ def library_file(name: str, program: Callable[[], Program]) -> Path:
     """Return the file of the library of this name, compiled where there is none.
 
     **Arguments:**
-
     - `name`: which depends on all that the library depends on.
     - `program`: makes the source and the compiler's flags, if they are needed.
-
     **Raises:** `Unavailable` where it cannot be compiled or kept.
     """
     try:

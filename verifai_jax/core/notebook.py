@@ -16,7 +16,6 @@ from verifai_jax.core.text import printable
 
 if TYPE_CHECKING:
     import pandas as pd
-
 T = TypeVar("T")
 MAX_ROWS = 10
 """Rows of a table that are shown."""

@@ -59,7 +59,6 @@ def pad_rows(rows: Any, count: int | None = None) -> np.ndarray:
     """Return rows followed by copies of the last one.
 
     **Arguments:**
-
     - `rows`: an array `[n, ...]`; an empty one stays as it is.
     - `count`: rows of the result, at least `n`; the next power of two when left out.
     """

@@ -29,15 +29,12 @@ from verifai_jax.core.text import printable
 if TYPE_CHECKING:
     from rich.progress import Progress, Task, TaskID
     from rich.text import Text
-
 P = ParamSpec("P")
 R = TypeVar("R")
-
 EVERY = 60.0
 """Seconds between two lines where nothing is drawn."""
 MOMENT = 2.0
 """Seconds after which work is worth going on with: what takes less is as soon done anew."""
-
 _ongoing: ContextVar["ProgressBar | None"] = ContextVar("ongoing", default=None)
 """The bar of the verb that was called; the others within it show themselves there."""
 
@@ -95,7 +92,6 @@ class ProgressBar:
     """One line, for one stage of a computation at a time; a context manager around all of them.
 
     **Arguments:**
-
     - `show`: whether to show it; None decides by where the error stream goes, False shows nothing.
     """
 
@@ -257,7 +253,6 @@ def shows_progress(
     is done.
 
     **Arguments:**
-
     - `doing`: a word for the verb, before the name of its first argument: "comparing".
     - `unit`: name of what is counted.
     - `of_budget`: whether its option `budget` is the total, and not that of a part.
@@ -311,7 +306,6 @@ class SimulationProgress:
     """The bar of a run: simulations per second, least robustness, counterexamples, time left.
 
     **Arguments:**
-
     - `name`: text in front of the bar.
     - `budget`: simulations in all.
     - `show`: whether to draw; None decides by where the error stream goes.
@@ -359,7 +353,6 @@ def goes_on_with(command: str, kept: Callable[[], bool]) -> Iterator[None]:
     """Say after a moment which command resumes the work, since a killed process cannot say it.
 
     **Arguments:**
-
     - `kept`: whether there is anything to go on with by now.
     """
     over = threading.Event()

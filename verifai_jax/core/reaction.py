@@ -31,7 +31,6 @@ class Reaction:
 
     # JAX rebuilds the class with placeholders and with batches, which have other shapes.
     __no_type_check__ = True
-
     parameters: Float[Array | np.ndarray, " size"]
     inputs: tuple[tuple[str, float, float], ...] = field(metadata={"static": True})
     hidden: int = field(metadata={"static": True})

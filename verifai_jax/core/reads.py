@@ -29,7 +29,6 @@ _CODE = (".py", ".pyc", ".so", ".pyd", ".pth")
 """Endings of files that are imported; those have records of their own."""
 _OPENS = ("open", "sqlite3.connect", "ctypes.dlopen")
 """Events of Python by which a file is opened."""
-
 _read: dict[str, set[str]] = {}
 _loaded: dict[str, set[str]] = {}
 _watching = False
@@ -49,7 +48,6 @@ def files_read_by(module: str) -> set[str]:
     """Return the files that a module has read so far.
 
     **Arguments:**
-
     - `module`: path of its file.
     """
     return _read.get(module, set())
@@ -59,7 +57,6 @@ def modules_loaded_by(module: str) -> set[str]:
     """Return the files of modules that a module was the first to import, by whatever name.
 
     **Arguments:**
-
     - `module`: path of its file.
     """
     return _loaded.get(module, set())

@@ -29,10 +29,8 @@ from verifai_jax.core.fingerprint import identity
 
 MAX_BYTES = 64 * 2**20
 """Size of a program that is kept at most."""
-
 SEAL = 32
 """Bytes of the checksum in front of a program."""
-
 _SETTINGS = (
     "jax_enable_x64",
     "jax_default_matmul_precision",
@@ -49,11 +47,9 @@ def remembered_as(kind: str, *values: object) -> str | None:
     """Return the name under which a program is kept, a hash of all that it depends on.
 
     **Arguments:**
-
     - `kind`: of the program, for people who look into the folder.
     - `values`: everything that determines the program, besides this package and JAX; see
       `identity`.
-
     **Returns:** the name; None if a value has no identity, or nothing is kept on disk.
     """
     if cache_folder() is None or None in values:
@@ -77,13 +73,11 @@ def lower_or_recall(
     It is the same program, to the last bit, whether it was traced here or by an earlier process.
 
     **Arguments:**
-
     - `name`: the name of `remembered_as`; None for a program that is not kept.
     - `function`: the function of pytrees; is traced where there is no file.
     - `arguments`: their shapes and types.
     - `form`: the structure of what it returns; left out for tuples, lists and dictionaries of
       arrays.
-
     **Raises:** what tracing raises.
     """
     if name is None:

@@ -54,12 +54,9 @@ def load_at_revision(target: str, kind: type[Kind]) -> Iterator[Kind]:
     """Load the object that a target names, at its revision if it has one.
 
     **Arguments:**
-
     - `target`: `FILE.py:NAME`, or `FILE.py:NAME@REVISION` with any name of a commit that git knows.
     - `kind`: class of the object.
-
     **Returns:** a context with the object; the files of the revision are removed at its end.
-
     **Raises:** `TargetError` for an unknown revision, outside of a repository, and as
     `load_target`.
     """

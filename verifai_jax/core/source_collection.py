@@ -71,7 +71,6 @@ def sources_of(*things: object, made: Sequence[Maker] = (), first: int = 0) -> S
     """Return what some objects are made of, as it is imported, and as data lie on the disk.
 
     **Arguments:**
-
     - `things`: such as a problem; their functions, classes and files count.
     - `made`: where they were made, as `made_here` returned it there.
     - `first`: the row of a table from which on that holds.
@@ -238,6 +237,8 @@ def _search_path(top: str, program: str) -> list[Path]:
     if module is not None:
         folders = [Path(path).parent for path in getattr(module, "__path__", ())]
         file = getattr(module, "__file__", None)
+        if file is not None and not is_user_file(file):
+            return []  # An installed package, of which no file is looked for.
         return folders or ([] if file is None else [Path(file).parent])
     spec = importlib.machinery.PathFinder.find_spec(top)
     if spec is None:

@@ -119,7 +119,6 @@ def files_of_model(model: Path) -> list[Path]:
     """Return the files that a model in XML refers to: includes, meshes, textures, height fields.
 
     **Arguments:**
-
     - `model`: the file; one that is not a model refers to none.
     """
     found: dict[Path, None] = {}

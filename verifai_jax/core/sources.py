@@ -136,7 +136,6 @@ class Sources:
         modules that were imported by then.
 
         **Arguments:**
-
         - `begun`: seconds since the epoch.
         """
         files = {file.name: file for file in self.files}
@@ -180,7 +179,6 @@ class Sources:
         """Return the files that are others by now.
 
         **Arguments:**
-
         - `now`: what the problem is made of now; what lies on the disk counts when left out, and
           for files that the problem of now does not have.
         """

@@ -21,7 +21,6 @@ class Stopwatch:
     """Seconds by the name of what they were spent on.
 
     **Arguments:**
-
     - `name`: what they are spent on until `on` says otherwise.
     - `began`: when it began, as `time.perf_counter` had it; now by default.
     - `earlier`: seconds by name that are spent already, as by an earlier part of a run.

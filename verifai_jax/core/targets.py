@@ -42,13 +42,10 @@ def definitions(location: str, *kinds: type[Kind]) -> dict[str, Kind]:
     """Return the objects of some classes that a file or module defines.
 
     **Arguments:**
-
     - `location`: file (`specs/cartpole.py`) or module (`specs.cartpole`); it is run.
     - `kinds`: classes to look for.
-
     **Returns:** the objects in the order of their definition, by their names; by their variables,
     where several have one name.
-
     **Raises:** `TargetError` where there is no such file or module, or it cannot be run;
     `NothingDefined` where it defines no such object.
     """
@@ -89,13 +86,9 @@ def load_target(target: str, kind: type[Kind]) -> Kind:
     """Load the object that a target names.
 
     **Arguments:**
-
     - `target`: `FILE.py:NAME` or `MODULE:NAME`, with the name of the object or of its variable;
       the name may be left out where the file defines one object of this kind.
     - `kind`: class of the object.
-
-    **Returns:** the object.
-
     **Raises:** `TargetError` where there is no such file or module, or no single object to take;
     `UnknownNameError` for a name that the file does not define, with those that it does.
     """
@@ -129,14 +122,10 @@ def target_of_project(target: object, folder: Path, *, kind: str, remedy: str) -
     `runs` or `sweeps`, and any with the files of a run or a sweep.
 
     **Arguments:**
-
     - `target`: the target that the folder records, of any type.
     - `folder`: folder that records it.
     - `kind`: noun of the object, such as `"problem"`, for the message.
     - `remedy`: words on how to name the target by hand, for the message.
-
-    **Returns:** the target.
-
     **Raises:** `TargetError` for any other target.
     """
     if isinstance(target, str):

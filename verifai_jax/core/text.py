@@ -65,7 +65,6 @@ def format_seconds(seconds: float, digits: int = 6) -> str:
     1970, stay in seconds.
 
     **Arguments:**
-
     - `seconds`: instant or duration.
     - `digits`: the digits of a duration below ten minutes.
     """
@@ -93,7 +92,6 @@ def format_features(features: Mapping[str, object], labels: Mapping[str, str] | 
     items that do not exist, such as `cars[3].x`, are left out.
 
     **Arguments:**
-
     - `features`: values by column.
     - `labels`: names for people by column, where they differ.
     """
@@ -155,8 +153,6 @@ def printable(text: str, maximum: int | None = None) -> str:
     Line breaks and tabs stay.
 
     **Arguments:**
-
-    - `text`: the text.
     - `maximum`: characters that are kept, of its begin and its end; all when left out.
     """
     text = text if maximum is None else shorten(text, maximum)
@@ -171,7 +167,6 @@ def storable(text: object, maximum: int = 2000) -> str:
     A lone surrogate, which UTF-8 cannot hold, becomes its escape: `\ud800`.
 
     **Arguments:**
-
     - `text`: the text; anything else is written by `str`.
     - `maximum`: characters that are kept, of its beginning and its end.
     """

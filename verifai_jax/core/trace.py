@@ -29,14 +29,11 @@ from verifai_jax.core.text import format_seconds
 
 if TYPE_CHECKING:
     import pandas as pd
-
 Samples: TypeAlias = (
     Real[Array | np.ndarray | jax.ShapeDtypeStruct, "time *k"]
     | Bool[Array | np.ndarray | jax.ShapeDtypeStruct, "time *k"]
 )
 """A signal or its form, one row a sample; truth values count as +1 and -1."""
-
-
 Leaf: TypeAlias = Array | np.ndarray | jax.ShapeDtypeStruct | np.integer | int | None
 """A part of a trace."""
 
@@ -55,7 +52,6 @@ class Trace(InNotebook):
     """Signals of one simulation, sampled on one clock.
 
     **Arguments:**
-
     - `signals`: name -> array `[time]` or `[time, k]`; all with the same `time`.
     - `dt`: sampling period in seconds. Exactly one of `dt` and `times` is given.
     - `times`: `[time]` strictly increasing sample times in seconds.
@@ -90,7 +86,6 @@ class Trace(InNotebook):
     _internal = frozenset((
         "between", "between_until", "finite", "held", "hold", "stride",
     ))  # fmt: skip
-
     signals: Mapping[str, Samples]
     dt: float | None = None
     times: Real[Array | np.ndarray, " time"] | None = None
@@ -174,11 +169,9 @@ class Trace(InNotebook):
         out. `verifai_jax.mtl.read` can also choose columns and resample.
 
         **Arguments:**
-
         - `time`: the column of sample times in seconds, or the name of the index; dates and
           durations become seconds since the first.
         - `dt`: the sampling period in seconds, instead of a column of times.
-
         **Raises:** `ValueError` for a frame without rows, numbers or sample times, and for times
         that do not increase.
         """
@@ -321,11 +314,8 @@ def check_code(name: str, value: Any, wanted: str) -> int | None:
     """Check that a value of a trace is a whole number, or an array of whole numbers.
 
     **Arguments:**
-
     - `name`, `wanted`: what it is and what it must be, for the message.
-
     **Returns:** the number where it is known and a single one, else None.
-
     **Raises:** `ValueError` for texts, fractions, truth values and lists.
     """
     if value is None:

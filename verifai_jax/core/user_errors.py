@@ -38,13 +38,11 @@ MAX_TRACEBACK = 100_000
 """The same for a message that begins with a traceback and ends with the error."""
 MAX_NAMES = 12
 """Names that a message lists."""
-
 ONCE_FOR_ALL = "JAX traces the code once for all simulations, so its values are not known yet"
 AS_PYTHON = "; or run the system as plain Python, without gradients, by vj.blackbox"
 AS_NATIVE = (
     '; or run it with backend="native", which calls a controller in Python, without gradients'
 )
-
 TRACING: tuple[tuple[type[Exception], str], ...] = (
     (
         jax.errors.TracerBoolConversionError,
@@ -80,13 +78,10 @@ TRACING: tuple[tuple[type[Exception], str], ...] = (
 )
 """Errors of JAX about values that it traces, each with what to do; the special before the general.
 """
-
-
 WRITES = (
     f"it writes a value into an array of NumPy, and {ONCE_FOR_ALL}. Use jnp in place of np, and "
     "array = array.at[i].set(value)"
 )
-
 TRACING_BY_WORDS = {
     "Shapes must be 1D sequences of concrete": (
         f"it makes an array of a length that is a value, and {ONCE_FOR_ALL}. Take the greatest "
@@ -147,11 +142,9 @@ def check_called_with(
     """Check that a function of a user takes the positional arguments that it will be called with.
 
     **Arguments:**
-
     - `role`: what the function is, for the message: "dynamics".
     - `function`: what was given; None if nothing was.
     - `arguments`: names of the arguments.
-
     **Raises:** `ValueError`, with what it takes and where it is defined.
     """
     if function is None:
@@ -174,7 +167,6 @@ def source_line(traceback: object) -> str | None:
     """Return the user's line at which JAX recorded an operation; None if it is not known.
 
     **Arguments:**
-
     - `traceback`: the traceback of the operation, as JAX keeps it: frames from the innermost one
       on.
     """
@@ -190,7 +182,6 @@ def explain_user_error(
     """Write what failed in a user's code, at which line, and the remedy, in one line.
 
     **Arguments:**
-
     - `error`: as the code raised it.
     - `features`: that the code was called with, to tell a misspelt one from another missing key.
     - `system`: whether the code belongs to a system, which could also run as a black box.

@@ -25,10 +25,8 @@ from verifai_jax.core.text import format_seconds
 HOLDS = ("linear", "constant", "pchip", "pulse")
 """Courses between control points: lines, the value of the one before, a monotone cubic through
 them, or the value of the one before for a while and then 0."""
-
 HELD = ("constant", "pulse")
 """Courses that jump: within a step of an integrator they keep the value of its beginning."""
-
 Features = TypeVar("Features")
 
 
@@ -38,7 +36,6 @@ class Waveform:
     """Control points at equal distances or given times, and the course between them.
 
     **Arguments:**
-
     - `knots`: `[knots, ...]`. With `"linear"` and `"pchip"` the first is the value at time 0 and
       the last that at the end; with `"constant"` each is held for an equal part of the duration,
       its beginning included; with `"pulse"` for the first `width` seconds of that part, and the
@@ -52,11 +49,9 @@ class Waveform:
 
     # JAX rebuilds the class with placeholders and with batches, which have other shapes.
     __no_type_check__ = True
-
     knots: Float[Array | np.ndarray, "knots *shape"]
     hold: str = field(default="linear", metadata={"static": True})
     duration: float | None = field(default=None, metadata={"static": True})
-
     times: tuple[float, ...] | None = field(default=None, metadata={"static": True})
     width: float | None = field(default=None, metadata={"static": True})
 
@@ -201,7 +196,6 @@ class WaveformWithinStep(Waveform):
     """
 
     __no_type_check__ = True
-
     begin: Any = 0.0
     now: Any = 0.0
 
@@ -331,11 +325,7 @@ def control_times(
 
 
 def acting_spans(
-    count: int,
-    hold: str,
-    times: Sequence[float] | None,
-    width: float | None,
-    duration: float,
+    count: int, hold: str, times: Sequence[float] | None, width: float | None, duration: float
 ) -> list[tuple[float, float]]:
     """Return the begin and the end of the time in which each control point acts, in seconds.
 

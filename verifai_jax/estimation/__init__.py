@@ -17,5 +17,4 @@ if TYPE_CHECKING:
     from verifai_jax.estimation.sequence_result import SequenceEstimate as SequenceEstimate
     from verifai_jax.statistics.binomial import simulations_until as simulations_until
     from verifai_jax.statistics.binomial import upper_bound as upper_bound
-
 __getattr__, __dir__, __all__ = attach(__name__)

@@ -19,15 +19,7 @@ from verifai_jax.core.checks import check_fraction, check_options
 from verifai_jax.core.errors import suggests_options, unknown_name
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import SimulationProgress, shows_progress
-from verifai_jax.estimation.answers import (
-    Answer,
-    Cheap,
-    Plan,
-    bound_from_pilot,
-    chains_for,
-    estimate_by_monte_carlo,
-    estimate_by_splitting,
-)
+from verifai_jax.estimation import answers
 from verifai_jax.estimation.double_precision import DoublePrecisionEvaluator
 from verifai_jax.estimation.methods import (
     SHARE_OF_LEVEL,
@@ -51,10 +43,8 @@ if TYPE_CHECKING:
     from verifai_jax.core.executors import Executor
     from verifai_jax.verification import Verification
     from verifai_jax.verification.rest import Rest
-
 GRADIENTS_FROM = 3
 """Continuous coordinates from which the searches for failing regions take gradients."""
-
 CHEAP_BATCH = 4096
 """Simulations of a cheap model at once."""
 WITHIN = 1.5
@@ -93,7 +83,6 @@ def estimate(
     the constraint holds; a system's own randomness counts as well.
 
     **Arguments:**
-
     - `problem`: the system with its feature space and formulas.
     - `method`: `"monte_carlo"`, `"importance"`, `"splitting"` or `"surrogate"`; the first samples
       choose when left out.
@@ -118,11 +107,9 @@ def estimate(
       `"slow"` then, and end at `within=1.5` where nothing else is said.
     - `proved`: what `verify` found of this problem, or the file of it. Where it showed that no
       point fails, or that all do, nothing is estimated, and all simulations are of the rest.
-
     **Returns:** the estimate with its interval and a guaranteed bound. Ctrl-C gives the estimate
     from the finished simulations. A simulation without a verdict (not finite, raised, out of time)
     is no failure in the estimate, and counts as one at the upper ends of interval and bound.
-
     **Raises:** before anything compiles, `TypeError` for something that is no `Problem`, and
     `ValueError` for options out of range, unknown names, a problem whose parts do not fit, a
     constraint that refuses every sample, or a verification of another problem.
@@ -145,7 +132,7 @@ def estimate(
     in_precision(precision)
     problem.space.check_where()
     share = SHARE_OF_REPLICATE if method == "splitting" else SHARE_OF_LEVEL
-    chains = chains_for(budget, share)
+    chains = answers.chains_for(budget, share)
     batch = min(chains if batch is None else batch, budget)
     choice = resolved(problem, batch=batch, budget=budget, precision=precision, wanted=backend)
     choice.problem.check()
@@ -175,7 +162,7 @@ def estimate(
             rest=rest,
         )
         slow = simulations_are == "slow" or cheap is not None
-        plan = Plan(confidence, chains, simulated.clamped, within)
+        plan = answers.Plan(confidence, chains, simulated.clamped, within)
         if cheap is not None:
             plan = replace(
                 plan, within=within or WITHIN, cheap=_robustness_of(cheap, precision, seed)
@@ -192,7 +179,7 @@ def estimate(
         except KeyboardInterrupt:
             # Interrupted while a proposal is fitted: the pilot samples still count.
             limit_state.ended = "interrupted"
-            answer = bound_from_pilot(limit_state, plan)
+            answer = answers.bound_from_pilot(limit_state, plan)
     seconds = time.perf_counter() - started
     found = _result(
         problem, choice.backend, answer, limit_state, plan, seed, precision, p0, seconds
@@ -204,9 +191,9 @@ def estimate(
 
 _METHODS = {
     None: estimate_automatically,
-    "monte_carlo": estimate_by_monte_carlo,
+    "monte_carlo": answers.estimate_by_monte_carlo,
     "importance": estimate_by_importance_sampling,
-    "splitting": estimate_by_splitting,
+    "splitting": answers.estimate_by_splitting,
     "surrogate": estimate_by_surrogate,
 }
 
@@ -214,9 +201,9 @@ _METHODS = {
 def _result(
     problem: Problem,
     backend: str | None,
-    answer: Answer,
+    answer: answers.Answer,
     limit_state: LimitState,
-    plan: Plan,
+    plan: answers.Plan,
     seed: int,
     precision: str,
     p0: float | None,
@@ -279,7 +266,7 @@ def _result(
     )
 
 
-def _robustness_of(cheap: Problem, precision: str, seed: int) -> Cheap:
+def _robustness_of(cheap: Problem, precision: str, seed: int) -> answers.Cheap:
     cheap = resolved(cheap, batch=CHEAP_BATCH, budget=FITTING, precision=precision).problem
     cheap.check()
     simulate = DoublePrecisionEvaluator(cheap, CHEAP_BATCH, precision, seed)
@@ -304,8 +291,10 @@ def _constraint(problem: Problem, rest: "Rest | None") -> Callable[[np.ndarray],
     return accepted
 
 
-def _nothing_left(limit_state: LimitState, rng: np.random.Generator, plan: Plan) -> Answer:
-    return Answer(Counts(0, 0, 0), 0.0, 0.0, 0.0)
+def _nothing_left(
+    limit_state: LimitState, rng: np.random.Generator, plan: answers.Plan
+) -> answers.Answer:
+    return answers.Answer(Counts(0, 0, 0), 0.0, 0.0, 0.0)
 
 
 def _with_decided(found: Estimate, rest: "Rest", limit_state: LimitState, seed: int) -> Estimate:

@@ -28,7 +28,6 @@ from verifai_jax.statistics.binomial import exact_interval
 
 Handover = Mapping[str, str]
 """Features of a part, with the signals, or features, of the part before that they come from."""
-
 TRIES = 32
 """Draws of a part's own features until its constraint accepts them together with a beginning."""
 CONFIRMED = 16
@@ -64,7 +63,6 @@ def sequence(
     are simulated again for it, and parts in between are simulated.
 
     **Arguments:**
-
     - `parts`: problems, or runs with `search="uniform"`, in their order.
     - `handover`: for a feature of a part, the signal of the part before whose last value it begins
       with (`"x"`, or `"position[1]"`), or the feature of that part that it keeps. One for all
@@ -75,9 +73,7 @@ def sequence(
     - `batch`: simulations at once.
     - `precision`: `"float32"` or `"float64"`.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Returns:** a `SequenceEstimate`.
-
     **Raises:** before anything is simulated, `ValueError` for fewer than two parts, for a run whose
     rows are no samples of the prior and for numbers out of range; `UnknownNameError` for features
     and signals that do not exist.

@@ -14,16 +14,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from verifai_jax.estimation import fitting
 from verifai_jax.estimation.components import Component, Gaussian, Marginals, Prior, log_ratios
 from verifai_jax.estimation.exploration import Exploration
-from verifai_jax.estimation.fitting import (
-    WIDER,
-    fit_across,
-    fit_diagonal,
-    fit_gaussian,
-    fit_marginals,
-    weigh_together,
-)
 from verifai_jax.estimation.mixture import Mixture
 
 ONE = 0.25
@@ -40,7 +33,6 @@ DIRECTION = 0.3
 """Part of the greatest singular value of the normals from which a direction counts."""
 MIN_WEIGHT = 0.02
 """Least weight of a chain or a centre, in parts of the greatest."""
-
 Around: TypeAlias = tuple[Gaussian, Gaussian, *tuple[Gaussian | Marginals, ...]]
 """Components fitted to the failures of a region: the second without correlations."""
 
@@ -125,15 +117,15 @@ class Anchors:
         part, each = np.full(len(points), 1 / len(points)), min(1.0, worth / len(points))
         if samples is not None:
             # Of the greatest, since these densities may be tiny.
-            part = weigh_together(len(points), worth, samples.weight / samples.weight.max())
+            part = fitting.weigh_together(len(points), worth, samples.weight / samples.weight.max())
             points, part, each = np.concatenate([points, samples.z]), part / part.sum(), 1.0
-        gaussian = fit_gaussian(points, part)
+        gaussian = fitting.fit_gaussian(points, part)
         directions = self._directions[number]
         return (
-            Gaussian(gaussian.mean, gaussian.axes, WIDER * gaussian.stds),
-            fit_diagonal(points, part, each),
-            fit_marginals(points, part, worth=each),
-            *(() if directions is None else (fit_across(points, part, directions, each),)),
+            Gaussian(gaussian.mean, gaussian.axes, fitting.WIDER * gaussian.stds),
+            fitting.fit_diagonal(points, part, each),
+            fitting.fit_marginals(points, part, worth=each),
+            *(() if directions is None else (fitting.fit_across(points, part, directions, each),)),
         )
 
 

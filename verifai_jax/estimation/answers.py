@@ -10,16 +10,11 @@ from jaxtyping import Bool, Float
 from verifai_jax.core.text import format_percent
 from verifai_jax.estimation import importance, monte_carlo
 from verifai_jax.estimation.importance import STEADY
-from verifai_jax.estimation.initial_proposal import (
-    Agreement,
-)
+from verifai_jax.estimation.initial_proposal import Agreement
 from verifai_jax.estimation.intervals import log_interval
 from verifai_jax.estimation.monte_carlo import Counts
 from verifai_jax.estimation.normal_space import LimitState
-from verifai_jax.estimation.splitting import (
-    SplittingRun,
-    run_splitting,
-)
+from verifai_jax.estimation.splitting import SplittingRun, run_splitting
 
 WORST_TAIL = 0.7
 """Tail index beyond which weighted samples are not relied on (Vehtari et al., 2024)."""
@@ -29,7 +24,6 @@ CHAIN = 10
 """States of a chain: each level is about a tenth as probable as the previous one."""
 UNDERSTATED = 1.6
 """Factor on the relative error of a run: chains start from those of the previous level."""
-
 Cheap: TypeAlias = Callable[[Float[np.ndarray, "n d"]], Float[np.ndarray, " n"]]
 """From points of the unit cube to the robustness of a cheap model."""
 
@@ -102,9 +96,7 @@ def monte_carlo_answer(counts: Counts, plan: Plan) -> Answer:
         answer.low, answer.high = counts.interval(plan.confidence)
         answer.method = "monte_carlo"
         answer.effective = float(counts.failures)
-        answer.relative_error = float(
-            np.sqrt((1 - answer.probability) / max(counts.failures, 1)),
-        )
+        answer.relative_error = float(np.sqrt((1 - answer.probability) / max(counts.failures, 1)))
     else:
         answer.high = counts.upper_bound(plan.confidence)
         answer.notes.append(
@@ -176,11 +168,7 @@ def importance_answer(
 
 
 def check_by_splitting(
-    answer: Answer,
-    run: SplittingRun,
-    reached: float,
-    interval: tuple[float, float],
-    plan: Plan,
+    answer: Answer, run: SplittingRun, reached: float, interval: tuple[float, float], plan: Plan
 ) -> None:
     """Compare an answer with splitting, as far as splitting reached the same failures."""
     assert answer.probability is not None

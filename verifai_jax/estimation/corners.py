@@ -36,12 +36,10 @@ def approach_corner(
     the next plane.
 
     **Arguments:**
-
     - `limit_state`: one with gradients.
     - `z`: failures.
     - `planes`: planes of a failure, at most.
     - `halvings`: halvings of each way.
-
     **Returns:** failures, none farther from the origin than its start, and the unit normals of the
     planes of each.
     """
@@ -75,9 +73,7 @@ def cost_of_corner(planes: int = PLANES, halvings: int = HALVINGS) -> int:
     return planes * (halvings + 3)
 
 
-def _nearest(
-    planes: list[tuple[Float[np.ndarray, " d"], float]],
-) -> Float[np.ndarray, " d"] | None:
+def _nearest(planes: list[tuple[Float[np.ndarray, " d"], float]]) -> Float[np.ndarray, " d"] | None:
     """Return the point nearest to the origin on the inner side of all planes; None without one."""
     from scipy.optimize import nnls
 

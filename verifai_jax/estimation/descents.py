@@ -106,7 +106,6 @@ def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulat
     """Descend from as many starts as the simulations allow, a few more at most.
 
     **Returns:** the failures; empty if no descent found one.
-
     **Raises:** `Ended` where time is over.
     """
     begin = limit_state.simulations

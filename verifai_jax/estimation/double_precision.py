@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from verifai_jax.core.executors import Executor
     from verifai_jax.evaluation.host_engine import HostEngine
     from verifai_jax.evaluation.unfinished import Part
-
 EXACT = 2**24
 """Greatest integer up to which all integers are float32 numbers."""
 TEMPERATURE = 1e-3
@@ -39,8 +38,6 @@ BEYOND = (2.0**-27, 2.0**-32)
 """Two probabilities at which a distribution with an outermost value has the same value."""
 LINEAR = (0.05, 0.1, 0.3)
 """Probabilities whose values lie in a line for a uniform feature, and for no symmetric other."""
-
-
 FLATTENED: Slot[str, Problem] = Slot("flattened features")
 """The problem over plain numbers, by precision."""
 
@@ -84,7 +81,6 @@ class DoublePrecisionEvaluator:
     linear functions.
 
     **Arguments:**
-
     - `problem`: a checked one, on the backend that it is to run on.
     - `batch`: simulations at once.
     - `precision`: the precision of the simulations, `"float32"` or `"float64"`.

@@ -92,11 +92,8 @@ def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int)
     """Search for failures, by descents and by chains among what they find.
 
     **Arguments:**
-
     - `simulations`: number of them, about.
-
     **Returns:** the failures; empty if no descent found one.
-
     **Raises:** `Ended` where time is over.
     """
     begin = limit_state.simulations

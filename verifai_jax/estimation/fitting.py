@@ -52,11 +52,9 @@ def weigh_together(
     """Weigh states of chains and weighted samples of the same failures, each for its worth.
 
     **Arguments:**
-
     - `states`: number of states, which are alike and so worth less than they count.
     - `worth`: independent points that all of them are worth.
     - `weight`: the weight of the samples.
-
     **Returns:** weights of the states, then of the samples; the more the samples are worth, the
     less the states count.
     """
@@ -221,7 +219,6 @@ def fit_marginals(
     """Fit the density of each coordinate by kernels, reflected at the ends, in fine steps.
 
     **Arguments:**
-
     - `wider`: width of the kernels over that of Silverman's rule (Density estimation, 1986,
       equation 3.31).
     """

@@ -36,7 +36,6 @@ class Surrogate:
     multiple zero.
 
     **Arguments:**
-
     - `dim`: number of coordinates.
     - `cheap`: the robustness of the cheap model at points of the unit cube; none when left out.
     """

@@ -171,7 +171,6 @@ def fit_proposal(
     """Fit a proposal to failures, and improve it by samples of itself.
 
     **Arguments:**
-
     - `points`: failures `[n, d]`, distributed about as the prior's.
     - `chain_ids`: the splitting chain `[n]` that each failure comes from.
     - `simulations`: number of simulations left; each stage takes a share of them.
@@ -258,7 +257,6 @@ def sample_proposal(
     """Simulate fresh samples of a frozen proposal.
 
     **Arguments:**
-
     - `simulations`: number of them, about; fewer where time ends.
     - `clamped`: True at coordinates `[d]` whose domain ends in an outermost value.
     """

@@ -84,7 +84,6 @@ def compare_explorations(
     failures leads to what it found; the second is simulated, within what is left of the budget.
 
     **Arguments:**
-
     - `z`: failures `[n, d]`, drawn from the final proposal.
     - `x`: their weights `[n]`, prior over proposal density.
     - `proposals`: one of each exploration.

@@ -31,11 +31,7 @@ from verifai_jax.estimation.answers import (
 from verifai_jax.estimation.components import Prior
 from verifai_jax.estimation.exploration import Exploration, explore
 from verifai_jax.estimation.importance import DEFENSIVE, FittedProposal
-from verifai_jax.estimation.initial_proposal import (
-    compare_explorations,
-    mix,
-    proposal_from,
-)
+from verifai_jax.estimation.initial_proposal import compare_explorations, mix, proposal_from
 from verifai_jax.estimation.mixture import Mixture, fit_mixture
 from verifai_jax.estimation.monte_carlo import Counts
 from verifai_jax.estimation.moved_priors import SURE, moved_priors, share_failing_again, share_out

@@ -19,15 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from verifai_jax.estimation import fitting
 from verifai_jax.estimation.components import Component, Gaussian, Prior, log_ratios
-from verifai_jax.estimation.fitting import (
-    effective_size,
-    fit_common_marginal,
-    fit_copula,
-    fit_gaussian_mixture,
-    fit_marginals,
-    fit_shell,
-)
 
 MODES = (1, 2, 4, 8)
 """Numbers of clusters to try."""
@@ -109,7 +102,6 @@ def fit_mixture(
     """Fit a mixture to weighted failures.
 
     **Arguments:**
-
     - `z`: failures `[n, d]` in normal space.
     - `weight`: parts `[n]` of the failures' distribution that they stand for.
     - `chain_ids`: the chain `[n]` of each; points of one chain stay in one half.
@@ -118,11 +110,11 @@ def fit_mixture(
     d = z.shape[1]
     weight = weight / weight.sum()
     half = (rng.permutation(int(chain_ids.max()) + 1) % 2)[chain_ids].astype(bool)
-    if min(effective_size(weight[half]), effective_size(weight[~half])) < 4:
+    if min(fitting.effective_size(weight[half]), fitting.effective_size(weight[~half])) < 4:
         half = rng.random(len(z)) < 0.5
     # States of one chain are alike: a chain is worth two points rather than all of its states.
-    of_chains = effective_size(np.bincount(chain_ids, weight))
-    alike_points = min(1.0, 2 * of_chains / effective_size(weight))
+    of_chains = fitting.effective_size(np.bincount(chain_ids, weight))
+    alike_points = min(1.0, 2 * of_chains / fitting.effective_size(weight))
     components: list[Component] = []
     crossed: list[float] = []
     for fit in (half, ~half):
@@ -150,12 +142,10 @@ def optimal_shares(
     The multiplicative steps have the minima as fixed points.
 
     **Arguments:**
-
     - `table`: densities of the components over the prior's, at failures; without the defensive
       part, which is 1.
     - `weight`: weights of the failures, of sum one.
     - `defensive`: share of the defensive part.
-
     **Returns:** shares of the components, of sum one.
     """
     k = table.shape[1]
@@ -181,13 +171,16 @@ def fit_components(
     """Fit components of all kinds to points, each of which is worth `worth` independent ones."""
     d = z.shape[1]
     components: list[Component] = []
-    size = effective_size(weight) * worth
+    size = fitting.effective_size(weight) * worth
     if d > 1:
-        components += [fit_shell(z, weight, worth), fit_common_marginal(z, weight, worth)]
+        components += [
+            fitting.fit_shell(z, weight, worth),
+            fitting.fit_common_marginal(z, weight, worth),
+        ]
     for modes in MODES:
         if modes > 1 and size < 6 * modes:
             break
-        shares, gaussians, memberships = fit_gaussian_mixture(z, weight, modes, rng, worth)
+        shares, gaussians, memberships = fitting.fit_gaussian_mixture(z, weight, modes, rng, worth)
         for share, gaussian, member in zip(shares, gaussians, memberships.T, strict=True):
             # Points too few for any component make one all the same, for there has to be one.
             if share * size < 3 and components:
@@ -198,8 +191,8 @@ def fit_components(
             if modes <= 2:
                 own = member / member.sum()
                 for wider in (1.0, 2.0):
-                    steps = fit_marginals(z, own, wider, worth)
-                    linked = fit_copula(z, own, steps, worth)
+                    steps = fitting.fit_marginals(z, own, wider, worth)
+                    linked = fitting.fit_copula(z, own, steps, worth)
                     components.append(steps if linked is None else linked)
     return components
 

@@ -112,10 +112,8 @@ def share_out(
     """Sample a mixture of moved priors in stages, and give more to the moves that are best.
 
     **Arguments:**
-
     - `moves`: the mixture, in which all have equal parts.
     - `simulations`: number of simulations left; each stage takes a share of them.
-
     **Returns:** the proposal, with the promise of all stages together.
     """
     size = max(1, int(SHARE_OF_STAGE * simulations))

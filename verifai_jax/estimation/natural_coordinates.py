@@ -30,8 +30,6 @@ def natural_slopes(
     """Return derivatives by natural coordinates from those by coordinates of normal space.
 
     **Arguments:**
-
-    - `z`: the points.
     - `gradient`: at these points.
     - `uniform`: True at coordinates of a uniform feature.
     """

@@ -18,7 +18,6 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 if TYPE_CHECKING:
     from verifai_jax.verification.rest import Rest
-
 Evaluate: TypeAlias = Callable[
     [Float[np.ndarray, "n d"]],
     tuple[Shaped[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]],
@@ -34,7 +33,6 @@ Differentiate: TypeAlias = Callable[
     ],
 ]
 """The same, and the gradient `[n, d]` of the robustness by the coordinates of the unit cube."""
-
 MAX_DRAWN = 4_000_000
 """Points drawn from the prior in search of accepted ones, at most, for each one wanted."""
 _CONSTRAINT_BATCH = 4096
@@ -89,7 +87,6 @@ class LimitState:
     """Scores of points of standard normal space, within a budget of simulations.
 
     **Arguments:**
-
     - `evaluate`: from points `u [n, d]` of the unit cube to `(rho, failing, proper)`, each `[n]`.
     - `dim`: number of unit coordinates.
     - `budget`: simulations in all; a method has to plan with `left`.
@@ -302,7 +299,6 @@ class Begun:
     """Simulations on their way; `result` waits for them, once, in the order in which they began.
 
     **Arguments:**
-
     - `limit_state`: which counts them when they are waited for.
     - `z`: their points.
     """
@@ -379,7 +375,6 @@ def farthest_first(
     """Choose points that are far from one another.
 
     **Arguments:**
-
     - `first`: the point that is chosen first.
     - `gaps_from`: the distances `[n]` of all points from one.
     - `maximum`: number of points, at most.

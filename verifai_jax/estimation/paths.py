@@ -48,12 +48,9 @@ def halve(
     """Follow straight ways as far as they fail, by halving.
 
     **Arguments:**
-
     - `begin`: failures.
     - `end`: points that are taken not to fail; they are not simulated.
-
     **Returns:** the last failure found on each way, and a point just beyond it.
-
     **Raises:** `Ended` where time is over.
     """
     low, high = np.zeros((len(begin), 1)), np.ones((len(begin), 1))

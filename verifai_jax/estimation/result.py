@@ -10,19 +10,16 @@ result.plot("estimate.png")
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from verifai_jax.core.checks import check_fraction
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.lazy import lazy_import
+from verifai_jax.core.figure import Drawn, Reported
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent, format_probability
 from verifai_jax.statistics.binomial import simulations_until
 
 if TYPE_CHECKING:
     pass
-
 METHODS = {
     "monte_carlo": "Monte Carlo",
     "importance": "importance sampling",
@@ -34,7 +31,7 @@ WEIGHTED = ("importance", "splitting", "surrogate")
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate(Drawn, InNotebook):
+class Estimate(Drawn, Reported, InNotebook):
     """A failure probability, as `estimate` returns it.
 
     - `name`: name of the problem.
@@ -67,7 +64,6 @@ class Estimate(Drawn, InNotebook):
 
     _picture = "estimate", "plot_estimate"
     """The interval, the splitting levels and the weights, as far as there are any."""
-
     name: str
     probability: float | None
     low: float
@@ -112,13 +108,10 @@ class Estimate(Drawn, InNotebook):
         """Count further samples of the prior that show a probability below `p0` if none fails.
 
         **Arguments:**
-
         - `p0`: failure probability to be shown, between 0 and 1.
         - `confidence`: the confidence of the bound; that of the estimate when left out.
-
         **Returns:** the number of samples in addition to those that `upper_bound` rests on; 0 if
         these show it already.
-
         **Raises:** `ValueError` unless `0 < p0 < 1`.
         """
         check_fraction("p0", p0)
@@ -196,15 +189,3 @@ class Estimate(Drawn, InNotebook):
         if self.probability is not None and self.high < p0:
             return f"shown, unless the method has missed a part of the failures; {prior}"
         return f"open; {prior}"
-
-    def report(self, path: str | Path, **options: Any) -> Path:
-        """Write the evidence report on the estimate as HTML, and its claims as JSON.
-
-        **Arguments:**
-
-        - `path`: the path of the HTML file.
-        - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`, `errors`.
-
-        **Returns:** the path.
-        """
-        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)

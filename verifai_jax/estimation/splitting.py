@@ -81,13 +81,11 @@ def run_splitting(
     """Run multilevel splitting once.
 
     **Arguments:**
-
     - `per_level`: states of a level: `chains` times the length of a chain.
     - `chains`: chains of a level; they start at the lowest points of the previous level.
     - `first`: samples of the prior to begin with, and their score, failing and proper; drawn when
       left out.
     - `reserve`: simulations that are to be left over.
-
     **Returns:** the run; `stopped` says why it reached no failure.
     """
     run = SplittingRun()

@@ -18,13 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from verifai_jax.core.text import format_percent
 from verifai_jax.estimation import importance
-from verifai_jax.estimation.answers import (
-    WORST_TAIL,
-    Answer,
-    Plan,
-    bound_answer,
-    bound_from_pilot,
-)
+from verifai_jax.estimation.answers import WORST_TAIL, Answer, Plan, bound_answer, bound_from_pilot
 from verifai_jax.estimation.components import Prior
 from verifai_jax.estimation.control_variate import Control, ControlledMean
 from verifai_jax.estimation.fitting import effective_size

@@ -35,12 +35,10 @@ def walk_among_failures(
     """Walk among the failures.
 
     **Arguments:**
-
     - `z`: the failure where each chain begins.
     - `deciding`: the coordinates of each that have to be near what they are for it to fail.
     - `groups`: the group of each chain, from 0.
     - `steps`: simulations of a chain.
-
     **Returns:** the states of the second half, and the state of each chain nearest to the origin.
     """
     whole = deciding.all(axis=1)

@@ -10,15 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax.core.text import listed
-from verifai_jax.evaluation.confirmations import (
-    FINER,
-    NOT_CLAIMED,
-    RAISED,
-    SINGLE,
-    Confirmations,
-    describe_check,
-    engines_of,
-)
+from verifai_jax.evaluation import confirmations
 from verifai_jax.evaluation.verdicts import Verdicts
 
 AMPLIFIED = 4.0
@@ -27,7 +19,7 @@ roundings into any of its outcomes, and two or three programs may agree by chanc
 
 
 def decide(
-    found: Confirmations,
+    found: confirmations.Confirmations,
     replayed: Mapping[str, Verdicts],
     run: Float[np.ndarray, " n"] | None,
     *,
@@ -35,13 +27,11 @@ def decide(
     may_refute: bool,
     by_far: bool,
     came_again: bool,
-) -> Confirmations:
+) -> confirmations.Confirmations:
     """Decide about rows from their replays.
 
     **Arguments:**
-
     - `found`: the rows, all of verdict `raised`; completed in place.
-    - `replayed`: the verdicts of each check.
     - `run`: robustness of the rows in the run, if that is known.
     - `untraceable`: what raised when a check was traced; empty if nothing did.
     - `may_refute`: whether a check simulates more finely than the run.
@@ -52,12 +42,12 @@ def decide(
     rho = {name: verdicts.lowest for name, verdicts in replayed.items()}
     found.rho.update(rho)
     base = next((name for name in ("float64", "again") if name in replayed), "")
-    engines = engines_of(replayed)
+    engines = confirmations.engines_of(replayed)
     finest = next((n for n in ("quarter_step", base, *engines) if n in replayed), "")
     step = rounding = np.zeros(len(found))
     if "half_step" in replayed:
         step = _moved(rho["half_step"], rho["quarter_step"])
-    for name in (SINGLE, "nudged"):
+    for name in (confirmations.SINGLE, "nudged"):
         if name in replayed:
             rounding = np.maximum(rounding, _moved(rho[name], rho[finest]))
     if run is not None and base:
@@ -66,11 +56,13 @@ def decide(
     if not replayed:
         found.why[:] = untraceable
         return found
-    deciding = [name for name in (*FINER, SINGLE) if name in replayed] or [base]
+    deciding = [
+        name for name in (*confirmations.FINER, confirmations.SINGLE) if name in replayed
+    ] or [base]
     deciding = [name for name in (*deciding, *engines) if name in replayed]
     failing = {name: verdicts.violated for name, verdicts in replayed.items()}
     holding = {name: v.proper & ~v.violated for name, v in replayed.items()}
-    raised = {name: np.isin(v.status, RAISED) for name, v in replayed.items()}
+    raised = {name: np.isin(v.status, confirmations.RAISED) for name, v in replayed.items()}
     # Of a host system that is simulated once more, and fails each time, that it fails says all.
     clear = (not by_far) | (np.abs(rho[finest]) >= np.maximum(step, AMPLIFIED * rounding))
     fails = np.all(list(failing.values()), axis=0)
@@ -92,7 +84,7 @@ def decide(
 
 
 def hold_to_run(
-    found: Confirmations,
+    found: confirmations.Confirmations,
     replayed: Mapping[str, Verdicts],
     rows: Mapping[str, np.ndarray],
     only_repeats: bool,
@@ -105,7 +97,7 @@ def hold_to_run(
     fails = np.all([verdicts.violated for verdicts in replayed.values()], axis=0)
     still = (rows["verdict"] == "confirmed") & fails & only_repeats
     found.verdict[still], found.why[still] = "confirmed", ""
-    refused = np.isin(rows["verdict"], NOT_CLAIMED)
+    refused = np.isin(rows["verdict"], confirmations.NOT_CLAIMED)
     refused &= np.isin(found.verdict, ("confirmed", "raised"))
     for i in np.flatnonzero(refused).tolist():
         found.verdict[i] = "fragile"
@@ -118,7 +110,6 @@ def lowest_failing(again: Verdicts, more: Verdicts, at: np.ndarray) -> Verdicts:
     """Return the repetitions, those rows replaced that a further one shows to fail less.
 
     **Arguments:**
-
     - `again`: of all rows.
     - `more`: a further repetition of the rows `at`.
     """
@@ -137,16 +128,11 @@ def lowest_failing(again: Verdicts, more: Verdicts, at: np.ndarray) -> Verdicts:
 
 
 def describe_disagreement(
-    i: int,
-    found: Mapping[str, Verdicts],
-    rho: float,
-    band: float,
-    as_run: float | None = None,
+    i: int, found: Mapping[str, Verdicts], rho: float, band: float, as_run: float | None = None
 ) -> str:
     """Say why a row is not confirmed.
 
     **Arguments:**
-
     - `i`: index of the row.
     - `found`: the replays of all rows, by check.
     - `rho`: robustness of the row in the finest replay.
@@ -155,7 +141,7 @@ def describe_disagreement(
     """
     lost = [name for name in found if not found[name].proper[i]]
     if lost:
-        raised = [name for name in lost if found[name].status[i] in RAISED]
+        raised = [name for name in lost if found[name].status[i] in confirmations.RAISED]
         if raised:
             messages = [m[i] for name in raised if (m := found[name].messages)]
             message = next(filter(None, messages), "out of time")
@@ -175,7 +161,7 @@ def describe_disagreement(
 
 
 def _and(names: Sequence[str]) -> str:
-    return listed(list(map(describe_check, names)))
+    return listed(list(map(confirmations.describe_check, names)))
 
 
 def _moved(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

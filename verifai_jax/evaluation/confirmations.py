@@ -21,7 +21,6 @@ from verifai_jax.core.trace import Status
 
 if TYPE_CHECKING:
     import pandas as pd
-
 VERDICTS = ("confirmed", "refuted", "fragile", "raised", "unexamined")
 """Verdicts of closer replays; see `Confirmations`."""
 UNDECIDED = ("fragile", "raised", "unexamined")
@@ -69,10 +68,8 @@ def describe_checks(checks: Collection[str], *, of_step: bool = True) -> str:
     """Describe the checks that a confirmed row has passed.
 
     **Arguments:**
-
     - `checks`: their names, as in `Confirmations.checks`.
     - `of_step`: whether to say why there was none at a finer step.
-
     **Returns:** the end of a sentence, such as `in double precision and at a half and a quarter of
     the step`; empty without a check.
     """
@@ -108,7 +105,6 @@ class Confirmation(InNotebook):
     """The verdict of finer replays on one counterexample.
 
     **Fields:**
-
     - `name`: the name of the problem.
     - `row`: its number in the table; None for features without one.
     - `verdict`: `"confirmed"`, `"refuted"`, `"fragile"` or `"raised"`.
@@ -164,7 +160,6 @@ class Confirmations(InNotebook):
     """The verdicts of finer replays on `n` counterexamples.
 
     **Fields:**
-
     - `name`: the name of the problem.
     - `numbers`: `[n]`, of the rows in the table.
     - `run_rho`: `[n]`, the robustness as the run computed it; NaN if it is unknown.
@@ -194,7 +189,6 @@ class Confirmations(InNotebook):
     """
 
     _internal = frozenset(("put", "refuse", "blank"))
-
     name: str
     numbers: Int[np.ndarray, " n"]
     run_rho: Float[np.ndarray, " n"]

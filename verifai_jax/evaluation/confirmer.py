@@ -50,7 +50,6 @@ from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     from verifai_jax.core.executors import Executor
-
 ROWS = 256
 """Rows that are examined in any case, ..."""
 COST = 4096
@@ -80,7 +79,6 @@ is compiled for it."""
 CHECKPOINT = "confirmer"
 """Entry of a checkpoint: rows examined, how far replays moved one, the worst row, whether one came
 again otherwise, and whether one did not fail again."""
-
 Check: TypeAlias = tuple[Replays | HostReplays, int]
 """One kind of replay: in the precision of these replays, with a so many times smaller step."""
 
@@ -89,7 +87,6 @@ class Confirmer:
     """Checks rows of a run's table; what it compiles is kept with the problem.
 
     **Arguments:**
-
     - `problem`: on the backend that it ran on.
     - `precision`: the precision of the run.
     - `seed`: the seed of the run; a simulation gets the random key that it had.
@@ -149,21 +146,16 @@ class Confirmer:
             self._plan()
 
     def __call__(
-        self,
-        rows: Mapping[str, Any],
-        numbers: Sequence[int] | np.ndarray,
-        limit: int | None = None,
+        self, rows: Mapping[str, Any], numbers: Sequence[int] | np.ndarray, limit: int | None = None
     ) -> Confirmations:
         """Check these rows of the table.
 
         **Arguments:**
-
         - `rows`: columns `[n]` by name, as the table has them: those of the features, and `rho`.
         - `numbers`: `[n]`, of the rows, which decide on their random keys.
         - `limit`: rows that are examined in all calls together; no limit when left out. Of more,
           the worst row and those nearest to zero are. A worse row than all before, together with
           some others, is examined beyond the limit, which is 1024 at least where the system wavers.
-
         **Raises:** as `FeatureSpace.from_row`, for columns that are no rows of this problem.
         """
         numbers = np.asarray(numbers, int)
@@ -203,10 +195,8 @@ class Confirmer:
         """Check the violating ones of a run's new rows, as many as `limit` says.
 
         **Arguments:**
-
         - `columns`: the columns of all new rows, as the table will have them.
         - `first`: number of the first one in the run.
-
         **Returns:** which of the new rows violate the property, and what came of these.
         """
         violating = np.flatnonzero(columns["violated"])
@@ -314,9 +304,7 @@ class Confirmer:
         return 1 if self.problem.black_box else 1 + WITH_WORST
 
     def _examine(
-        self,
-        rows: Mapping[str, np.ndarray],
-        numbers: Int[np.ndarray, " n"],
+        self, rows: Mapping[str, np.ndarray], numbers: Int[np.ndarray, " n"]
     ) -> Confirmations:
         """Replay rows by all checks, decide, and note how far the replays have moved them."""
         run = rows.get("rho")

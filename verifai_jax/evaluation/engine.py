@@ -45,7 +45,6 @@ class Engine:
     """Evaluates batches of one problem; see the module's docstring.
 
     **Arguments:**
-
     - `problem`: a checked `Problem`.
     - `batch`: rows of a call at most; fewer are padded.
     - `gradient`: whether `evaluate` also differentiates the smooth robustness.
@@ -130,7 +129,6 @@ class Engine:
         """Simulate `n <= batch` rows and decide which violate the property.
 
         **Arguments:**
-
         - `rows`: `[n, ...]`, points of the unit cube or whatever the engine's inputs are.
         - `key`: the run's key; row `first + i` is simulated with `simulation_key(key, first + i)`.
           With `own_keys` the keys `[n]` of the simulations.

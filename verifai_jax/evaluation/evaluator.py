@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from verifai_jax.evaluation.journal import Journal
     from verifai_jax.evaluation.native_engine import NativeEngine
     from verifai_jax.evaluation.unfinished import Part
-
-
 NOT_NATIVE = (
     "simulated without native code, which is made of systems that JAX traces, in single precision "
     "and in this process"
@@ -45,7 +43,6 @@ class Evaluator:
     """Simulates and evaluates points of a problem's unit cube; `simulations` counts them.
 
     **Arguments:**
-
     - `problem`: a checked one, on the backend it is to run on.
     - `batch`: simulations at once; a call with fewer points is padded.
     - `gradient`: whether the smooth robustness is differentiated too.
@@ -173,13 +170,11 @@ class Evaluator:
         """Simulate and evaluate these points.
 
         **Arguments:**
-
         - `u`: points of the unit cube, or rows of given features.
         - `temperature`: the temperature of the smooth robustness that is differentiated, one for
           all or one each.
         - `first`: number of the first simulation; numbers go on from those before when left out.
         - `padded_to`, `keep_traces`, `journals`: as of `HostEngine.evaluate`, for a black box.
-
         **Raises:** `AlwaysRaises` where it was asked for.
         """
         start = self.simulations if first is None else first

@@ -18,17 +18,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
 
+from verifai_jax.core import executors
 from verifai_jax.core.devices import describe_processor
-from verifai_jax.core.executors import (
-    Executor,
-    Future,
-    WorkerError,
-    check_executor,
-    count_workers,
-    gather,
-    seconds_per_block,
-    ship,
-)
 from verifai_jax.core.programs import Slot, power_of_two
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.host_engine import HostEngine
@@ -54,7 +45,6 @@ MAX_DROPPED = 100
 ever for one that mixes up its answers."""
 MAX_AHEAD = 1 << 22
 """Rows at most that are on their way at a time: a bound on the memory that they take."""
-
 SHIPMENTS: Slot[tuple[str, str | None], Any] = Slot("shipments")
 """The problem as it is sent, by kind of executor and target."""
 
@@ -63,7 +53,6 @@ class ExecutorEngine:
     """Evaluates any number of rows on the workers of an executor; see the module's docstring.
 
     **Arguments:**
-
     - `problem`: a checked one, on the backend it is to run on.
     - `batch`: rows of a batch on one machine, which says how many lanes go together.
     - `executor`: with `submit`.
@@ -71,7 +60,6 @@ class ExecutorEngine:
     - `given`: whether points are rows of given features, as of `CubePoints`.
     - `journal`: the journal of rows in flight, for a problem on the host.
     - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
-
     **Raises:** `TypeError` for anything that is not an executor; `ValueError` for one that cannot
     work here, or that cannot send the problem.
     """
@@ -80,7 +68,7 @@ class ExecutorEngine:
         self,
         problem: Problem,
         batch: int,
-        executor: Executor,
+        executor: executors.Executor,
         *,
         gradient: bool = False,
         clauses: bool = False,
@@ -90,14 +78,14 @@ class ExecutorEngine:
         guidance: Guidance = NOTHING,
         given: bool = False,
     ) -> None:
-        check_executor(executor)
+        executors.check_executor(executor)
         self.problem, self.executor, self.precision = problem, executor, precision
         self.compile_seconds = 0.0
         self._journal = journal if problem.black_box else None
         self._shipment = problem.programs.get(
             SHIPMENTS,
             (type(executor).__module__ + type(executor).__name__, target),
-            lambda: ship(problem, executor, target, identity),
+            lambda: executors.ship(problem, executor, target, identity),
         )
         form = problem.space.feature_form
         self._features: Any = jax.tree.structure(form)
@@ -129,14 +117,14 @@ class ExecutorEngine:
         """Rows of a block that takes about `seconds_per_block`."""
         if self._seconds is None:
             return self.unit * (1 if self.problem.black_box else AT_FIRST)
-        wanted = seconds_per_block(self.executor)
+        wanted = executors.seconds_per_block(self.executor)
         rows = int(min(wanted / max(self._seconds, 1e-9), MAX_AHEAD // 8))
         return max(self.unit, rows - rows % self.unit)
 
     @property
     def ahead(self) -> int:
         """Rows on their way that keep all workers busy."""
-        return min(MAX_AHEAD, IN_FLIGHT * count_workers(self.executor) * self.block)
+        return min(MAX_AHEAD, IN_FLIGHT * executors.count_workers(self.executor) * self.block)
 
     def begin_compiling(self) -> None:
         """Do nothing: the workers compile, with their first block."""
@@ -167,7 +155,7 @@ class ExecutorEngine:
         pending.send()
         return pending
 
-    def send(self, *arguments: Any) -> Future:
+    def send(self, *arguments: Any) -> executors.Future:
         """Send one block to a worker: words of the key, first number, points, temperatures.
 
         **Raises:** `ValueError` where it cannot be sent.
@@ -191,7 +179,7 @@ class ExecutorEngine:
             return True
         self._dropped += 1
         if self._dropped > MAX_DROPPED:
-            raise WorkerError(
+            raise executors.WorkerError(
                 f"{self._dropped} answers of the executor belonged to other calls than the one "
                 "whose future they came by; what was finished before is kept: resume with another "
                 "executor"
@@ -200,7 +188,7 @@ class ExecutorEngine:
 
     def step(self, count: int) -> int:
         """Return the rows of the next block of so many: all workers have one, for not too long."""
-        share = -(-count // count_workers(self.executor))
+        share = -(-count // executors.count_workers(self.executor))
         rows = min(self.block, max(share, self.block // 8))
         return -(-rows // self.unit) * self.unit
 
@@ -263,7 +251,6 @@ class Pending:
     from how long the first have taken.
 
     **Arguments:**
-
     - `engine`: that sends them.
     - `u`: their points.
     - `key`, `first`: as of `ExecutorEngine.submit`.
@@ -283,13 +270,13 @@ class Pending:
         runs = engine.runs(u, first)
         self._known = [(begin, end) for begin, end, known in runs if known]
         self._unsent = deque((begin, end) for begin, end, known in runs if not known)
-        self._sent: list[tuple[int, int, Future]] = []
+        self._sent: list[tuple[int, int, executors.Future]] = []
         self._ended = 0
         self._verdicts: Verdicts | None = None
 
-    def send(self) -> list[Future]:
+    def send(self) -> list[executors.Future]:
         """Send blocks until each worker has a few, and return those that are new."""
-        maximum = self._ended + IN_FLIGHT * count_workers(self._engine.executor)
+        maximum = self._ended + IN_FLIGHT * executors.count_workers(self._engine.executor)
         already = len(self._sent)
         while self._unsent and len(self._sent) < maximum:
             begin, end = self._unsent.popleft()
@@ -324,7 +311,7 @@ class Pending:
                     return
                 found[begin] = self._engine.receive(result, u, first)
 
-            gather([future for _, _, future in self._sent], ended, self.send)
+            executors.gather([future for _, _, future in self._sent], ended, self.send)
             self._verdicts = Verdicts.concatenate([found[begin] for begin in sorted(found)])
         return self._verdicts
 

@@ -29,11 +29,7 @@ from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.host_monitor import MONITORS, HostMonitor
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.remarks import Remarks
-from verifai_jax.evaluation.verdicts import (
-    RowVerdict,
-    Verdicts,
-    violations,
-)
+from verifai_jax.evaluation.verdicts import RowVerdict, Verdicts, violations
 from verifai_jax.mtl.setting import period
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import Outcome, System, outcome_of
@@ -51,7 +47,6 @@ class HostEngine:
     """Evaluates batches of a black-box problem; the counterpart of `engine.Engine`.
 
     **Arguments:**
-
     - `problem`: a checked `Problem`.
     - `precision`: `"float32"` or `"float64"`, of features and monitor.
     - `journal`: where rows are kept as soon as they have a verdict, until their batch is finished.
@@ -115,7 +110,6 @@ class HostEngine:
         """Simulate `n` points of the unit cube and decide which violate the property.
 
         **Arguments:** as of `engine.Engine.evaluate`; nothing is differentiated.
-
         - `padded_to`: a power of two; features are computed of so many rows together at least, so
           that few rows get theirs from the program that many would.
         - `keep_traces`: as of the engine, for this call.
@@ -136,9 +130,7 @@ class HostEngine:
         """Simulate `n` rows of features, each with the seed of its own, and decide.
 
         **Arguments:**
-
         - `features`: `[n, ...]` each.
-        - `seeds`: the seeds of the simulations.
         - `keys`: that the seeds are made of, which a system needs that simulates batches.
         """
         with in_precision(self.precision):

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from verifai_jax.core.store.log import Log
 from verifai_jax.evaluation.verdicts import RowVerdict
-from verifai_jax.store.log import Log
 
 JOURNAL = "inflight.rows"
 """Name of the journal in a run's folder, a log with an entry a row."""

@@ -29,7 +29,6 @@ def present_part(kept: Any, problem: Problem, *mode: object) -> Any:
     """Return an evaluator's `Part` of the present work; None if nothing is kept.
 
     **Arguments:**
-
     - `kept`: its part of the work before, or None. That of the present work is returned as it is.
     - `problem`, `mode`: as for a new `Part`.
     """

@@ -98,7 +98,6 @@ class Layout(NamedTuple):
         """Spread a function of one row over chunks of lanes and over the devices.
 
         **Arguments:**
-
         - `one_row`: a function of a row, its random key, a temperature, what all rows share, and
           the numbers that its program reads.
         - `own_keys`: whether each row is given its random key, instead of one key of the run and

@@ -28,7 +28,6 @@ from verifai_jax.mtl.tree import Term, postorder
 
 if TYPE_CHECKING:
     from verifai_jax.evaluation.native_program import NativeProgram, Rows, RunKey, Temperature
-
 WORTH = 3e9
 """Operations of a run from which on a native program is worth it by default. XLA's programs do 1.3
 to 4.5e10 a second on two cores (seven problems), and translator and compiler take 1.3 s, once for
@@ -42,7 +41,6 @@ class NativeEngine:
     """Evaluates batches of a problem like the engine that it is given.
 
     **Arguments:**
-
     - `engine`: the engine of XLA, in single precision, over points of the unit cube.
     - `wanted`: `"native"`, or `"auto"` for the rule of the module's docstring.
     - `budget`: simulations of the run.

@@ -20,16 +20,16 @@ from verifai_jax.core.machine_code import Unavailable
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine
-from verifai_jax.evaluation.verdicts import Verdicts, violations
-from verifai_jax.native_code.library import (
+from verifai_jax.evaluation.native_code.library import (
     Library,
     approve,
     is_approved,
     library_name,
     load,
 )
-from verifai_jax.native_code.source import translate
-from verifai_jax.native_code.values import Untranslatable
+from verifai_jax.evaluation.native_code.source import translate
+from verifai_jax.evaluation.native_code.values import Untranslatable
+from verifai_jax.evaluation.verdicts import Verdicts, violations
 
 Rows: TypeAlias = Float[np.ndarray, "n row"]
 RunKey: TypeAlias = Key[Array, ""]

@@ -22,12 +22,10 @@ def engines_for(problem: Problem, engines: Engines) -> dict[str, Problem]:
     """Return the problem in other engines, by the names of their checks.
 
     **Arguments:**
-
     - `problem`: on the backend that it ran on.
     - `engines`: another system for the same features and signals, a problem with one, the name of a
       backend of its system, `"all"` for all other backends that are installed; several names, or
       several of these by name.
-
     **Raises:** `ValueError` without such a backend; `UnknownNameError` for other features.
     """
     if engines is None:

@@ -28,7 +28,6 @@ ALIKE = 16
 LONG = 30.0
 """Seconds after which `FEW` simulations that raise the same are enough."""
 FEW = 3
-
 _VARIES = re.compile(r"[-+]?\d[\d.]*(?:e[-+]?\d+)?")
 """What tells messages of one kind apart: the numbers in them."""
 

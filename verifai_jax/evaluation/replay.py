@@ -39,7 +39,6 @@ class Replay(InNotebook):
     """
 
     _internal = frozenset(("changed", "finding"))
-
     problem: Problem
     row: int | None
     features: dict[str, Any]
@@ -117,13 +116,13 @@ class Replay(InNotebook):
         """Draw signals with the bounds of all formulas and the instant marked; returns the figure.
 
         **Arguments:**
-
         - `path`: file that the picture is written to, if given.
         - `signals`: the signals, and features that are Signals, to draw; chosen when left out.
-
         **Raises:** `UnknownNameError` for a signal that does not exist.
         """
-        return lazy_import("verifai_jax.plotting.replay", "plot_replay")(self, path, signals)
+        return lazy_import("verifai_jax.reports.plotting.replay", "plot_replay")(
+            self, path, signals
+        )
 
     def animate(
         self,
@@ -136,17 +135,15 @@ class Replay(InNotebook):
         """Draw the simulation as an animated GIF, which a notebook shows.
 
         **Arguments:**
-
         - `path`: a file that is written too; none when left out.
         - `camera`: the name of a camera of a MuJoCo model; the one that sees best what moves when
           left out.
         - `size`: width and height of a frame in pixels.
         - `fps`: frames a second; chosen when left out.
-
         **Raises:** `ValueError` for a problem without `draw` that has no MuJoCo model and is no
         environment of Gymnasium; `UnknownNameError` for a camera that the model lacks.
         """
-        draw = lazy_import("verifai_jax.plotting.animation", "animate")
+        draw = lazy_import("verifai_jax.reports.plotting.animation", "animate")
         return draw(self, path, camera=camera, size=size, fps=fps)
 
 

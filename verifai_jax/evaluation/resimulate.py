@@ -35,14 +35,16 @@ from verifai_jax.systems.base import System
 
 if TYPE_CHECKING:
     from verifai_jax.core.executors import Executor, Shipment
-
 ONE_BY_ONE = 16
 """Rows up to which they are replayed one by one: that program is compiled much sooner."""
 SEEDS = 32
 """Seeds of a host system's rows that are made in one call, so that one program makes all."""
 LANES = (64, 256)
-"""Rows that a device replays together if there are more: the second number once two calls of the
-first would not do, since a call costs something whatever its size."""
+"""Rows that a device replays together if there are more: the second number for more rows than
+`CALLS` calls of the first would take, since a call costs something whatever its size."""
+CALLS = 6
+"""Calls of the smaller program up to which the larger one is not compiled: half a millisecond each
+for a quadrotor of four states, whose larger program compiles for a third of a second."""
 
 
 class Refiner:
@@ -77,7 +79,6 @@ class Replays:
     """Replays of a problem that JAX traces.
 
     **Arguments:**
-
     - `problem`: on the backend that it ran on.
     - `precision`: the precision of the replays.
     - `key`: the key of the run's simulations, from `run_keys`.
@@ -110,12 +111,10 @@ class Replays:
         """Simulate the rows of these numbers again, with a `factor` times smaller step.
 
         **Arguments:**
-
         - `factor`: by how much the step is smaller; 1 is the system's own step.
         - `each`: features `[n, ...]` of all rows, as `FeatureSpace.features_of` gives them; the
           rows are simulated once with each.
         - `numbers`: the numbers of the rows, which their random keys come from.
-
         **Returns:** the verdicts of the rows, once for each.
         """
         together = self._together(len(numbers), len(each))
@@ -154,7 +153,7 @@ class Replays:
         if count <= ONE_BY_ONE:
             return 1
         some, many = (lanes * len(jax.local_devices()) for lanes in LANES)
-        return many if count * times > 2 * some else some
+        return many if count * times > CALLS * some else some
 
     def _keys(self, numbers: Int[np.ndarray, " n"], together: int) -> Key[Array, " together"]:
         if not self.draws:
@@ -198,7 +197,6 @@ class HostReplays:
     workers share would wait for one process.
 
     **Arguments:**
-
     - `problem`, `precision`, `key`: as of `Replays`.
     - `executor`: with `submit`; this process simulates when left out.
     - `target`: name of the problem, for an executor that cannot send it.
@@ -318,10 +316,8 @@ def finest_replays(
     """Return replays of a problem's rows in the finest precision that it can be traced in.
 
     **Arguments:**
-
     - `run`: precision of the run.
     - `key`, `executor`, `target`: as of `HostReplays`.
-
     **Returns:** the replays, None if they cannot be traced; notes on what is left out; what raised
     when it was traced, empty if nothing did.
     """
@@ -363,14 +359,11 @@ def replay_block(
     """Simulate rows again; called by a worker.
 
     **Arguments:**
-
     - `shipment`: with the problem.
     - `how`: backend, precision, by how much the step is smaller, and whether the system is to be
       made anew.
     - `words`: the two words of the key of the run's simulations.
     - `leaves`: the leaves of the features, `[n, ...]` each.
-    - `numbers`: the numbers of the rows.
-
     **Returns:** `rho`, `status`, `violated` and `messages` of the rows.
     """
     from verifai_jax.evaluation.worker import computing

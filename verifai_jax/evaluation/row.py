@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from verifai_jax.core.clauses import CLAUSES
+from verifai_jax.core.clauses import ABSENT, CLAUSES
 from verifai_jax.core.lifting import lifting
 from verifai_jax.core.trace import Trace
 from verifai_jax.evaluation.differentiation import Derivative
@@ -33,7 +33,7 @@ from verifai_jax.evaluation.verdicts import (
     with_status,
 )
 from verifai_jax.mtl import hard, online, robustness, smooth
-from verifai_jax.mtl.clauses import ABSENT, Goals
+from verifai_jax.mtl.clauses import Goals
 from verifai_jax.problem.problem import Problem
 
 
@@ -68,7 +68,6 @@ class CubePoints(Inputs):
     """Points of the unit cube of a problem's feature space.
 
     **Arguments:**
-
     - `problem`: that says the space.
     - `given`: whether rows are those of `given_rows`: points, followed by the real numbers of
       features that somebody gave, which are simulated as they are; NaN for those of the point.
@@ -104,7 +103,6 @@ class TableRows(Inputs):
     """Features as a table holds them, simulated by a system that depends on a shared number.
 
     **Arguments:**
-
     - `form`: the features of one row, as `jax.ShapeDtypeStruct`s in the engine's precision.
     - `system_at`: the system for the shared number, a `factor` of refinement.
     """
@@ -130,7 +128,6 @@ class WithParameters(Inputs):
     The coordinates are the parameters, followed by the point.
 
     **Arguments:**
-
     - `problem`: its space and formulas.
     - `size`: how many parameters.
     - `system_of`: the system of a vector of parameters.
@@ -307,7 +304,6 @@ class RowFunction(NamedTuple):
 SMALL = 16
 """Numbers that a monitor may hold to be worth carrying: one with windows of samples, which it
 moves at every step, holds more."""
-
 Monitor = Callable[[PyTree, Key[Array, ""]], tuple[Float[Array, " formulas"], Int[Array, ""]]]
 """A function `(features, key) -> robustness, status`."""
 
@@ -324,7 +320,6 @@ def streaming_monitor(problem: Problem) -> Monitor | None:
     except ValueError:
         # It looks ahead without end; or its clock is wrong, which the engine says better.
         return None
-
     form = problem.form()
     # A part of the state is finite where the last state is, which the status says.
     known_finite, count = ((), None) if form is None else (form.finite, form.length)

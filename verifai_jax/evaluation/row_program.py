@@ -39,7 +39,6 @@ class RowProgram:
     """The traced function of one row; see the module's docstring.
 
     **Arguments:**
-
     - `problem`: a checked `Problem`.
     - `inputs`: how rows become features and a system.
     - `precision`: `"float32"` or `"float64"`, of simulation, monitor and gradient.
@@ -170,7 +169,7 @@ class RowProgram:
     @property
     def work(self) -> int:
         """Operations on single numbers in a simulation, with its derivative, about."""
-        from verifai_jax.native_code.work import work_of
+        from verifai_jax.evaluation.native_code.work import work_of
 
         with tracing(self.inputs.purpose), in_precision(self.precision):
             if not self.gradient:

@@ -23,12 +23,12 @@ from jaxtyping import Float, Int
 
 from verifai_jax.core.progress import write_line
 from verifai_jax.core.sources import Sources, list_changes
+from verifai_jax.core.store.cache import Cache, CacheError, locked_cache
+from verifai_jax.core.store.log import Arrays
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.kept_work import PRESENT
 from verifai_jax.evaluation.verdicts import RowVerdict, Verdicts
 from verifai_jax.problem.problem import Problem
-from verifai_jax.store.cache import Cache, CacheError, locked_cache
-from verifai_jax.store.log import Arrays
 
 Form: TypeAlias = jax.tree_util.PyTreeDef  # pyright: ignore[reportInvalidTypeForm]
 KIND = "unfinished"
@@ -57,7 +57,6 @@ class Unfinished:
         """Return the simulations of the next evaluator; a changed model has none yet.
 
         **Arguments:**
-
         - `problem`: the problem of the evaluator.
         - `mode`: what else its verdicts depend on, as text.
         """
@@ -133,7 +132,6 @@ class Part:
         """Return verdicts of these points: those that are kept, or else those of `simulate`.
 
         **Arguments:**
-
         - `numbers`: the numbers of the simulations, which their random keys come from.
         """
         known = self.recall(points, numbers, temperature)
@@ -191,10 +189,8 @@ def keeping(folder: Path, work: Mapping[str, Any]) -> Iterator[Unfinished]:
     """Keep the simulations of all evaluators that are used within, until the work is done.
 
     **Arguments:**
-
     - `folder`: which is made, and removed once the work is done, or if nothing is in it.
     - `work`: the arguments of the call, as plain data.
-
     **Raises:** `FolderInUse` and `ValueError` as `locked_cache`; `CacheError` for a folder of
     other work.
     """

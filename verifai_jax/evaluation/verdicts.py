@@ -127,12 +127,10 @@ def violations(
     """Decide which simulations violate the property.
 
     **Arguments:**
-
     - `rho`: hard robustness; NaN where there is no verdict.
     - `status`: codes of `Status`.
     - `holds`: gives the Boolean semantics of each formula; called only where a robustness of
       exactly zero needs it, because it may have to simulate again.
-
     **Returns:** for each simulation whether it ended properly and breaks a formula.
     """
     proper = status == Status.OK

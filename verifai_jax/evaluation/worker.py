@@ -65,7 +65,6 @@ class BlockMode(NamedTuple):
 ENGINES: Slot[tuple[BlockMode, int], Engine] = Slot("engines of blocks")
 """Engines by mode and number of devices."""
 HOST_ENGINES: Slot[BlockMode, HostEngine] = Slot("host engines of blocks")
-
 # An executor may work in threads of one process. A compiled block keeps all cores busy by itself,
 # and a simulator is not made for two simulations at a time.
 computing = threading.Lock()
@@ -83,14 +82,12 @@ def evaluate_block(
     """Simulate and evaluate the rows `first` to `first + n - 1`; called by a worker.
 
     **Arguments:**
-
     - `shipment`: with the problem.
     - `mode`: how.
     - `key`: words of the run's random key.
     - `first`: number of the first row.
     - `u`: points of the unit cube.
     - `temperature`: the temperature of the smooth robustness, one for all or one each.
-
     **Returns:** arrays by the names of `ARRAYS`; the `leaves` of the features; `messages`; the
     `seconds` without compilation; the `processor`; the engine's `notes`; the `remarks` of the
     simulations; the `question` that this answers.

@@ -19,6 +19,7 @@ from verifai_jax.core.compilation import tracing
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.precision import in_precision, reproducible_settings
 from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.store.locks import write_lock, writing
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification import cheap as cheaply
 from verifai_jax.falsification.derived import as_simulated
@@ -54,7 +55,6 @@ from verifai_jax.falsification.validation import (
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.search.suggested import without_suggestions
-from verifai_jax.store.locks import write_lock, writing
 
 if TYPE_CHECKING:
     import pandas as pd

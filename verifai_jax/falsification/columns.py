@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from jaxtyping import Int, Shaped
 
+from verifai_jax.core.store.files import checksum
 from verifai_jax.core.text import one_line
 from verifai_jax.core.trace import Status
-from verifai_jax.store.files import checksum
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -401,7 +401,7 @@ class Run(InNotebook):
 
         **Raises:** `ValueError` for a run without its problem or without a counterexample.
         """
-        return lazy_import("verifai_jax.counterexamples", "save_counterexamples")(
+        return lazy_import("verifai_jax.analysis.counterexamples", "save_counterexamples")(
             self, folder, **options
         )
 
@@ -411,7 +411,7 @@ class Run(InNotebook):
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the feature space with safe and failing samples; returns the figure."""
-        return lazy_import("verifai_jax.plotting.scatter", "plot_features")(self, path)
+        return lazy_import("verifai_jax.reports.plotting.scatter", "plot_features")(self, path)
 
     def report(self, path: str | Path, **options: Any) -> Path:
         """Write the evidence report on the run: one HTML file, and its claims as JSON next to it.

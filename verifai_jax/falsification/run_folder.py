@@ -22,6 +22,10 @@ from jaxtyping import ArrayLike
 
 from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.sources import Sources
+from verifai_jax.core.store import files
+from verifai_jax.core.store.files import DamagedError
+from verifai_jax.core.store.locks import write_lock
+from verifai_jax.core.store.log import Log, write_log
 from verifai_jax.core.text import one_line
 from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.run import Run
@@ -29,10 +33,6 @@ from verifai_jax.falsification.segments import FAILURES, SEGMENTS, list_segments
 from verifai_jax.falsification.table import FINISHED, ErrorTable
 from verifai_jax.falsification.tail import TAIL
 from verifai_jax.problem.problem import Problem
-from verifai_jax.store import files
-from verifai_jax.store.files import DamagedError
-from verifai_jax.store.locks import write_lock
-from verifai_jax.store.log import Log, write_log
 
 RECORD = "run.json"
 """Name of the file with everything about a run but its table and its checkpoint."""
@@ -145,7 +145,9 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
 def as_made(run: Run) -> Run:
     """Return a run as the verb that made it does: one of `fuzz` has its coverage."""
     return (
-        run if run.derived is None else lazy_import("verifai_jax.fuzzing.run", "as_fuzz_run")(run)
+        run
+        if run.derived is None
+        else lazy_import("verifai_jax.falsification.fuzzing.run", "as_fuzz_run")(run)
     )
 
 

@@ -21,6 +21,7 @@ from verifai_jax.core.compilation import tracing
 from verifai_jax.core.progress import SimulationProgress, write_line
 from verifai_jax.core.sources import Sources
 from verifai_jax.core.stopwatch import Stopwatch
+from verifai_jax.core.store.locks import writing
 from verifai_jax.core.text import one_line
 from verifai_jax.core.user_errors import explain_user_error, format_user_error
 from verifai_jax.evaluation.backends import Choice
@@ -33,7 +34,6 @@ from verifai_jax.falsification.summary import first_message
 from verifai_jax.falsification.validation import space_as_data
 from verifai_jax.problem.model_digest import digest_of_model
 from verifai_jax.search import Search
-from verifai_jax.store.locks import writing
 
 if TYPE_CHECKING:
     from verifai_jax.statistics.stopping import StoppingRule

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Int
 
+from verifai_jax.core.store.files import DamagedError, checksum, write_complete
 from verifai_jax.core.text import format_error, printable
 from verifai_jax.falsification.columns import ROW, Columns, column_to_arrow
-from verifai_jax.store.files import DamagedError, checksum, write_complete
 
 if TYPE_CHECKING:
     import pandas as pd

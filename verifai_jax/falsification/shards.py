@@ -29,6 +29,9 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import reproducible_settings
 from verifai_jax.core.progress import SimulationProgress
 from verifai_jax.core.sources import Sources, list_changes
+from verifai_jax.core.store.files import DamagedError
+from verifai_jax.core.store.locks import LOCK, write_lock, writing
+from verifai_jax.core.store.log import Log
 from verifai_jax.core.text import one_line
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.evaluator import Evaluator
@@ -46,9 +49,6 @@ from verifai_jax.falsification.validation import (
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.search.proposals import Proposals
-from verifai_jax.store.files import DamagedError
-from verifai_jax.store.locks import LOCK, write_lock, writing
-from verifai_jax.store.log import Log
 
 SHARD = "shard.rows"
 """Name of the log in the folder of a part: which run and which part of it, and blocks of rows."""

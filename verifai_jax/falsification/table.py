@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from verifai_jax.core.store.files import write_complete
+from verifai_jax.core.store.log import Log, write_log
 from verifai_jax.falsification import segments
 from verifai_jax.falsification.columns import (
     Batch,
@@ -38,8 +40,6 @@ from verifai_jax.falsification.segments import (
 )
 from verifai_jax.falsification.table_view import TableView
 from verifai_jax.falsification.tail import TAIL, read_tail, tail_entry
-from verifai_jax.store.files import write_complete
-from verifai_jax.store.log import Log, write_log
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from verifai_jax.core.notebook import InNotebook, frame_html
+from verifai_jax.core.store.files import record_checksum
 from verifai_jax.falsification import segments
 from verifai_jax.falsification.columns import (
     ROW,
@@ -30,10 +31,13 @@ from verifai_jax.falsification.columns import (
 )
 from verifai_jax.falsification.counts import Counts, claimed_rows, count, violating_rows
 from verifai_jax.falsification.segments import Segment, standing_out
-from verifai_jax.store.files import record_checksum
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+FEW = 64
+"""Batches in memory up to which they are read one by one: to make one batch of them copies each."""
 
 
 class TableView(InNotebook):
@@ -248,7 +252,8 @@ class TableView(InNotebook):
 
     def _memory(self) -> Iterator[tuple[Int[np.ndarray, " n"], Columns]]:
         """Yield numbers and columns of the rows in memory, in blocks."""
-        self._join()
+        if len(self._batches) > FEW:
+            self._join()
         maximum = segments.SEGMENT_ROWS
         for first, batch in self._batches:
             for begin in range(first, first + length(batch), maximum):

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from verifai_jax.core.store.log import Arrays, Log
 from verifai_jax.falsification.segments import MAX_ROWS
-from verifai_jax.store.log import Arrays, Log
 
 if TYPE_CHECKING:
     import pyarrow as pa

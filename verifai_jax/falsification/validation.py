@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from verifai_jax import search as searches
 from verifai_jax.core.errors import check_names, unknown_name
+from verifai_jax.core.store.locks import LOCK, write_lock
 from verifai_jax.core.text import format_error, one_line
 from verifai_jax.evaluation.engine import WANTED, Wanted
 from verifai_jax.falsification.run import Run
@@ -20,7 +21,6 @@ from verifai_jax.problem.dependence import has_gradient, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.search.contract import check_contract
-from verifai_jax.store.locks import LOCK, write_lock
 from verifai_jax.systems.base import System
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from verifai_jax.statistics.stopping import StoppingRule
 
 
-MAX_AT_ONCE = 32_768
+MAX_AT_ONCE = 131_072
 """Simulations of a round at most, by default; more are no faster."""
 
 

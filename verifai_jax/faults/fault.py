@@ -6,9 +6,8 @@ Each number is fixed, or a domain, which makes it a feature of the problem.
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple, TypeAlias
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar, NamedTuple, TypeAlias, dataclass_transform
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,13 +17,12 @@ from verifai_jax.core.checks import check_count, check_name, is_number
 from verifai_jax.features import Categorical, Domain, Struct
 
 Number: TypeAlias = float | Domain
-Ranges: TypeAlias = Mapping[str, tuple[float, float]]
 Vector: TypeAlias = Float[Array | np.ndarray, " n"]
 
 
-def within(**ranges: tuple[float, float]) -> Ranges:
-    """Return the ends between which numbers have to lie, by their names."""
-    return MappingProxyType(ranges)
+def number(low: float = -math.inf, high: float = math.inf, **default: float) -> Any:
+    """Return the field of a number of a fault, which has to lie between two ends."""
+    return field(metadata={"ends": (low, high)}, **default)
 
 
 class Moment(NamedTuple):
@@ -74,14 +72,15 @@ class FaultFeatures(Struct):
         return dict(self._nominal)  # pyright: ignore[reportAttributeAccessIssue]
 
 
+@dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(field, number))
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """A fault of one channel; its kinds derive from it.
+    """A fault of one channel; its kinds derive from it, as frozen dataclasses.
 
     **Arguments:**
 
     - `channel`: `"observation"`, `"action"`, one entry of them, `"observation[2]"`, or the name of
-      a sensor, a signal, a joint, an actuator or a part of the state.
+      a sensor, signal, joint, actuator or part of the state.
     - `onset`: seconds from the beginning of the simulation until the fault; below 0 it has begun
       before.
     - `duration`: seconds until the channel recovers; None for never.
@@ -94,8 +93,6 @@ class Fault:
     """The number that says how bad it is."""
     off: ClassVar[float] = 0.0
     """The severity at which there is no fault."""
-    ranges: ClassVar[Ranges] = MappingProxyType({})
-    """The numbers of this kind, each with the ends between which it has to lie."""
     choices: ClassVar[bool] = True
     """Whether a channel of whole numbers can have it."""
     draws: ClassVar[bool] = False
@@ -108,6 +105,11 @@ class Fault:
     duration: Number | None = None
     name: str | None = None
 
+    def __init_subclass__(cls, **traits: Any) -> None:
+        for name, value in traits.items():
+            setattr(cls, name, value)
+        dataclass(frozen=True, kw_only=True)(cls)
+
     def __post_init__(self) -> None:
         kind = type(self).__name__
         if not isinstance(self.channel, str) or not self.channel.strip():
@@ -117,20 +119,17 @@ class Fault:
             object.__setattr__(self, "name", f"{stem}_{_words(kind)}")
         check_name("the name of a fault", self.name)
         for name, (low, high) in self.all_ranges.items():
-            value = getattr(self, name)
+            value, wanted = getattr(self, name), None
             if value is None and name == "duration":
                 continue
             if not is_number(value) and not (isinstance(value, Domain) and value.size == 1):
-                raise ValueError(
-                    f"{name} of {kind} must be a number, or a domain of one number such as "
-                    f"vj.Box(0, 1); got {value!r}"
-                )
-            first, last = ends(value)
-            if not (math.isfinite(first) and math.isfinite(last)):
-                raise ValueError(f"{name} of {kind} must be finite; got {value!r}")
-            if first < low or last > high:
-                within = f"at least {low:zg}" if high == math.inf else f"from {low:zg} to {high:zg}"
-                raise ValueError(f"{name} of {kind} must be {within}; got {value!r}")
+                wanted = "a number, or a domain of one number such as vj.Box(0, 1)"
+            elif not all(map(math.isfinite, ends(value))):
+                wanted = "finite"
+            elif ends(value)[0] < low or ends(value)[1] > high:
+                wanted = f"at least {low:zg}" if high == math.inf else f"from {low:zg} to {high:zg}"
+            if wanted is not None:
+                raise ValueError(f"{name} of {kind} must be {wanted}; got {value!r}")
 
     @property
     def label(self) -> str:
@@ -141,8 +140,8 @@ class Fault:
     @property
     def all_ranges(self) -> dict[str, tuple[float, float]]:
         """All numbers by name, each with the ends between which it has to lie."""
-        times = {"onset": (-math.inf, math.inf), "duration": (0.0, math.inf)}
-        return {**self.ranges, **times}
+        own = {each.name: each.metadata["ends"] for each in fields(self) if each.metadata}
+        return {**own, "onset": (-math.inf, math.inf), "duration": (0.0, math.inf)}
 
     @property
     def numbers(self) -> dict[str, Number]:
@@ -158,17 +157,14 @@ class Fault:
     @property
     def grade(self) -> str:
         """The number that varies and says how bad the fault is."""
-        return next(
-            n for n in (self.severity, "duration", "onset", *self.domains) if n in self.domains
-        )
+        ordered = (self.severity, "duration", "onset", *self.domains)
+        return next(name for name in ordered if name in self.domains)
 
     @property
     def feature(self) -> FaultFeatures | None:
         """The feature that the fault is; None for one of which nothing varies."""
-        if not self.domains:
-            return None
         nominal = {name: self.weakest(name) for name in self.domains}
-        return FaultFeatures(self.domains, nominal, self)
+        return FaultFeatures(self.domains, nominal, self) if nominal else None
 
     def weakest(self, name: str) -> PyTree:
         """Return the value of a number at which the fault is least: latest, shortest, weakest."""

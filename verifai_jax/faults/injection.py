@@ -14,7 +14,7 @@ from jaxtyping import Array, Key, PyTree
 
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.faults.chance import uniform
-from verifai_jax.faults.fault import AtMost, Fault, Moment, Vector
+from verifai_jax.faults.fault import AtMost, Fault, Moment
 from verifai_jax.faults.kinds import WrongChannel
 from verifai_jax.faults.smoothing import blend
 from verifai_jax.features import FeatureSpace
@@ -88,15 +88,12 @@ class Injected(Link):
         return None
 
     def begin(self, value: PyTree, now: Instant, key: Key[Array, ""] | int | None) -> PyTree:
-        if now.xp is np:
-            zero = np.zeros(self.entries.count)
-        else:
-            zero = jnp.zeros_like(self.entries.take(value, jnp))
-        memory = self.fault.memory(zero, now.period)
+        host, number = now.xp is np, zlib.crc32(self.fault.label.encode())
+        good = np.zeros(self.entries.count) if host else self.entries.take(value, jnp)
+        memory = self.fault.memory(now.xp.zeros_like(good), now.period)
         if not self.draws:
             return memory
-        number = zlib.crc32(self.fault.label.encode())
-        if now.xp is np:
+        if host:
             return np.array([int(key or 0), number], np.uint32), memory
         key = jax.random.key(0) if key is None else key
         return jax.random.key_data(jax.random.fold_in(key, number))[-2:], memory
@@ -107,12 +104,12 @@ class Injected(Link):
         other = None if self.other is None else self.other.take(value, xp)
         leaves, form = jax.tree.flatten(value)
         parts = [xp.asarray(leaves[i]) for i, _ in self.entries.parts]
-        passing = (parts, memory), now.time, now.ended, possible, number, seed, other
-        if xp is np:
-            parts, memory = self._faulty(now, *passing)
-        else:
+        given = now.time, now.ended, possible, number, seed, other
+        passing, change = (parts, memory), partial(self._faulty, now)
+        if xp is not np:
             needed = jnp.asarray(possible & self._severe(number))
-            parts, memory = changed_if_needed(partial(self._faulty, now), needed, *passing)
+            change = partial(changed_if_needed, change, needed)
+        parts, memory = change(passing, given)
         for (i, _), part in zip(self.entries.parts, parts, strict=True):
             leaves[i] = part
         return jax.tree.unflatten(form, leaves), memory if seed is None else (seed, memory)
@@ -124,18 +121,10 @@ class Injected(Link):
         return reduce(operator.and_, (number[name] != off[name] for name in named), np.bool_(True))
 
     def _faulty(
-        self,
-        now: Instant,
-        passing: tuple[list[Any], PyTree],
-        time: Any,
-        ended: Any,
-        possible: Any,
-        number: Mapping[str, Any],
-        seed: Any,
-        other: Vector | None,
+        self, now: Instant, passing: tuple[list[Any], PyTree], given: tuple[Any, ...]
     ) -> tuple[list[Any], PyTree]:
         """Return the parts of a value as the fault makes them, and what it remembers then."""
-        xp, (parts, memory) = now.xp, passing
+        xp, (parts, memory), (time, ended, possible, number, seed, other) = now.xp, passing, given
         within = self.entries._replace(
             parts=tuple((i, index) for i, (_, index) in enumerate(self.entries.parts))
         )

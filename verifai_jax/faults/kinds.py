@@ -1,59 +1,47 @@
 """The sixteen kinds of faults."""
 
 import math
-from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from dataclasses import field
+from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import PyTree
 
 from verifai_jax.faults.chance import normal
-from verifai_jax.faults.fault import Fault, Moment, Number, Ranges, Vector, ends, within
+from verifai_jax.faults.fault import Fault, Moment, Number, Vector, ends, number
 from verifai_jax.faults.smoothing import straight
 from verifai_jax.systems.delays import entry, line_of, moved_up
 
-POSITIVE = (0.0, math.inf)
-ANY = (-math.inf, math.inf)
 
-
-@dataclass(frozen=True, kw_only=True)
 class Dropout(Fault):
     """The channel reads `value` instead of what it should: a sensor that is disconnected."""
 
-    ranges: ClassVar[Ranges] = within(value=ANY)
-    value: Number = 0.0
+    value: Number = number(default=0.0)
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         return at.xp.full_like(good, 1) * at.number["value"], memory
 
 
-@dataclass(frozen=True, kw_only=True)
 class Stuck(Dropout):
     """The channel is stuck at `value`, such as a valve that is open."""
 
-    value: Number  # pyright: ignore[reportGeneralTypeIssues]
+    value: Number = number()
 
 
-@dataclass(frozen=True, kw_only=True)
-class Freeze(Fault):
+class Freeze(Fault, holds=True):
     """The channel repeats its last value before the onset."""
-
-    holds = True
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         held = at.xp.where(at.live & ~at.first, memory, good)
         return held, held
 
 
-@dataclass(frozen=True, kw_only=True)
-class HeldAction(Fault):
+class HeldAction(Fault, severity="hold", holds=True):
     """The channel changes only every `hold` seconds, and is held between."""
 
-    severity, holds = "hold", True
-    ranges: ClassVar[Ranges] = within(hold=POSITIVE)
     channel: str = field(default="action", kw_only=False)
-    hold: Number
+    hold: Number = number(0)
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         steps = at.xp.maximum(1, at.xp.round(at.number["hold"] / at.period))
@@ -63,18 +51,15 @@ class HeldAction(Fault):
         return held, held
 
 
-@dataclass(frozen=True, kw_only=True)
-class Delay(Fault):
+class Delay(Fault, severity="seconds"):
     """The channel is `seconds` late, in whole periods.
 
     It swings by `swing` seconds up and down once in `cycle` seconds.
     """
 
-    severity = "seconds"
-    ranges: ClassVar[Ranges] = within(seconds=POSITIVE, swing=POSITIVE, cycle=(1e-9, math.inf))
-    seconds: Number
-    swing: Number = 0.0
-    cycle: Number = 1.0
+    seconds: Number = number(0)
+    swing: Number = number(0, default=0.0)
+    cycle: Number = number(1e-9, default=1.0)
 
     def memory(self, zero: Vector, period: float) -> PyTree:
         return _line(zero, (ends(self.seconds)[1] + ends(self.swing)[1]) / period)
@@ -85,13 +70,10 @@ class Delay(Fault):
         return _late(good, memory, number["seconds"] + number["swing"] * turn, at)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ClockJitter(Fault):
+class ClockJitter(Fault, severity="jitter", draws=True):
     """Each value is late by a random time up to `jitter` seconds, in whole periods."""
 
-    severity, draws = "jitter", True
-    ranges: ClassVar[Ranges] = within(jitter=POSITIVE)
-    jitter: Number
+    jitter: Number = number(0)
 
     def memory(self, zero: Vector, period: float) -> PyTree:
         return _line(zero, ends(self.jitter)[1] / period)
@@ -100,13 +82,10 @@ class ClockJitter(Fault):
         return _late(good, memory, at.uniform(1)[0] * at.number["jitter"], at)
 
 
-@dataclass(frozen=True, kw_only=True)
-class PacketLoss(Fault):
+class PacketLoss(Fault, severity="loss", draws=True, holds=True):
     """Each value is lost with probability `loss`; the last one that arrived is used instead."""
 
-    severity, draws, holds = "loss", True, True
-    ranges: ClassVar[Ranges] = within(loss=(0.0, 1.0))
-    loss: Number
+    loss: Number = number(0, 1)
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         lost = at.live & (at.uniform(1)[0] < at.number["loss"]) & ~at.first
@@ -119,51 +98,39 @@ class PacketLoss(Fault):
         return straight(held, expected - constant), held
 
 
-@dataclass(frozen=True, kw_only=True)
-class Bias(Fault):
+class Bias(Fault, severity="offset", choices=False):
     """A constant `offset` is added."""
 
-    severity, choices = "offset", False
-    ranges: ClassVar[Ranges] = within(offset=ANY)
-    offset: Number
+    offset: Number = number()
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         return good + at.number["offset"], memory
 
 
-@dataclass(frozen=True, kw_only=True)
-class Drift(Fault):
+class Drift(Fault, severity="rate", choices=False):
     """An offset is added that grows by `rate` in each second since the onset."""
 
-    severity, choices = "rate", False
-    ranges: ClassVar[Ranges] = within(rate=ANY)
-    rate: Number
+    rate: Number = number()
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         return good + at.number["rate"] * at.since, memory
 
 
-@dataclass(frozen=True, kw_only=True)
-class Noise(Fault):
+class Noise(Fault, severity="std", choices=False, draws=True):
     """Normal noise with standard deviation `std` is added, independent at each instant."""
 
-    severity, choices, draws = "std", False, True
-    ranges: ClassVar[Ranges] = within(std=POSITIVE)
-    std: Number
+    std: Number = number(0)
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         noise = normal(at.uniform(len(good)), at.xp)
         return good + at.number["std"] * noise, memory
 
 
-@dataclass(frozen=True, kw_only=True)
-class Spikes(Fault):
+class Spikes(Fault, severity="height", choices=False, draws=True):
     """Single values are off by `height`, up or down, `rate` times a second on average."""
 
-    severity, choices, draws = "height", False, True
-    ranges: ClassVar[Ranges] = within(height=POSITIVE, rate=POSITIVE)
-    height: Number
-    rate: Number = 1.0
+    height: Number = number(0)
+    rate: Number = number(0, default=1.0)
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         chance = at.uniform(2 * len(good))
@@ -172,13 +139,10 @@ class Spikes(Fault):
         return at.xp.where(hit, good + sign * at.number["height"], good), memory
 
 
-@dataclass(frozen=True, kw_only=True)
-class Quantisation(Fault):
+class Quantisation(Fault, severity="step", choices=False):
     """Values are rounded to multiples of `step`."""
 
-    severity, choices = "step", False
-    ranges: ClassVar[Ranges] = within(step=POSITIVE)
-    step: Number
+    step: Number = number(0)
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         step = at.xp.where(at.number["step"] > 0, at.number["step"], 1.0)
@@ -191,42 +155,32 @@ class Quantisation(Fault):
         return straight(rounded, good + left * step), memory
 
 
-@dataclass(frozen=True, kw_only=True)
-class Saturation(Fault):
+class Saturation(Fault, severity="limit", off=math.inf, choices=False):
     """Values are limited to between `-limit` and `limit`."""
 
-    severity, off, choices = "limit", math.inf, False
-    ranges: ClassVar[Ranges] = within(limit=POSITIVE)
-    limit: Number
+    limit: Number = number(0)
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         return at.xp.clip(good, -at.number["limit"], at.number["limit"]), memory
 
 
-@dataclass(frozen=True, kw_only=True)
-class LossOfAuthority(Fault):
+class LossOfAuthority(Fault, severity="loss", choices=False):
     """The share `loss` of the channel has no effect, of an actuator above all."""
 
-    severity, choices = "loss", False
-    ranges: ClassVar[Ranges] = within(loss=(0.0, 1.0))
     channel: str = field(default="action", kw_only=False)
-    loss: Number
+    loss: Number = number(0, 1)
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         return good * (1 - at.number["loss"]), memory
 
 
-@dataclass(frozen=True, kw_only=True)
-class SignFlip(Fault):
+class SignFlip(Fault, choices=False):
     """The channel has the wrong sign."""
-
-    choices = False
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         return -good, memory
 
 
-@dataclass(frozen=True, kw_only=True)
 class WrongChannel(Fault):
     """The channel has the values of the channel `source`, as with two wires exchanged."""
 

@@ -14,16 +14,12 @@ from verifai_jax.core.user_errors import explain_user_error
 SAMPLES = 65_536
 """Greatest number of samples of the prior: if it accepts none of them, at most 0.005 % of the prior
 is allowed (95 % confidence)."""
-
 BLOCK = 4096
 """Samples of the prior at a time, so that one shape compiles."""
-
 ENOUGH = 1000
 """Accepted samples after which the rate is known well enough: to about 3 % of itself."""
-
 ON_HOST = 16
 """Samples at a time of a constraint that Python decides, which may take 40 ms for each."""
-
 PATIENCE, LIMIT = 1.0, 60.0
 """Seconds after which one accepted sample of such a constraint is enough, and after which none ends
 the measurement."""
@@ -41,13 +37,8 @@ def acceptance_rate(
     A constraint that Python decides is asked for a second, or until it has accepted one sample.
 
     **Arguments:**
-
     - `where`: the constraint as a function of one point of the unit cube.
     - `accepts`: the same for many points, compiled.
-    - `names`: the names of the features, for messages.
-    - `dim`: number of unit coordinates.
-    - `seed`: the seed of the samples.
-
     **Raises:** `ValueError` for a constraint that raises, does not return one truth value, or
     accepts none of the samples.
     """

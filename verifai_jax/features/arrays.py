@@ -24,16 +24,13 @@ class Array(Domain):
     arrays of a `Struct`. With `length=(1, 3)` the number varies too, see `VariableArray`.
 
     **Arguments:**
-
     - `domain`: the domain of each value.
     - `length`: their number, or a pair with the smallest and the greatest number.
-
     **Raises:** `ValueError` for a length that is not a positive integer, or a pair that is not
     `0 <= shortest <= longest` with `longest >= 1`; `TypeError` for something that is not a domain.
     """
 
     arguments = ("domain", "length")
-
     domain: Domain
     length: int
 

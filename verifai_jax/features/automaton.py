@@ -41,7 +41,6 @@ class Automaton(Domain):
     inverse cumulative distribution, so every point of the cube is a legal sequence.
 
     **Arguments:**
-
     - `start`: the state before the first event.
     - `events`: `(state, name)` -> what happens: a dictionary with
 
@@ -371,7 +370,6 @@ class Automaton(Domain):
         return self._written.from_columns(row, name)
 
     def facts(self, name: str) -> Facts:
-        """Return what is known of the events' columns: kinds, and bounds over all their kinds."""
         found = {f"{name}.length": {**integer_facts(0, self.max_events), "length": True}}
         for item in indexed(name, self.max_events):
             # An absent event is a choice of its own.

@@ -77,18 +77,15 @@ class Box(_Between):
     the greatest value of `Box(0, 61.2)` is then 61.199997, since 61.2 itself would be rounded up.
 
     **Arguments:**
-
     - `low`, `high`: the ends, two finite numbers or two sequences of one length; `low < high`.
     - `closed`: which ends may be values: `"both"`, `"left"` (the range is half-open, without
       `high`), `"right"` or `"neither"`. Next to an end that is left out come the nearest numbers
       of the precision.
-
     **Raises:** `ValueError` for ends that are reversed, equal (use `Constant`), not finite,
     farther apart or nearer than float32 can hold, or of different lengths; for an unknown `closed`.
     """
 
     arguments = ("low", "high")
-
     low: float | Sequence[float] | np.ndarray
     high: float | Sequence[float] | np.ndarray
     closed: str = "both"
@@ -228,15 +225,12 @@ class DiscreteBox(_Between):
     `int32`, or an array of them with shape `[entries]`.
 
     **Arguments:**
-
     - `low`, `high`: the ends, two integers or two sequences of one length; `low <= high`.
-
     **Raises:** `ValueError` for ends that are no integers, reversed, of different lengths, beyond
     32 bits, or with more than 2^20 values between them.
     """
 
     arguments = ("low", "high")
-
     low: int | Sequence[int] | np.ndarray
     high: int | Sequence[int] | np.ndarray
 

@@ -49,10 +49,8 @@ class Categorical(Domain):
     number.
 
     **Arguments:**
-
     - `choices`: numbers, texts or other objects, one by one.
     - `weights`: their probabilities; equally likely when left out.
-
     **Raises:** `ValueError` for no choices, the same choice twice, or weights that are not one
     positive number a choice with the sum one.
     """
@@ -117,7 +115,6 @@ class Categorical(Domain):
 
     @cached_property
     def numeric(self) -> bool:
-        """True if a value is the choice itself rather than its index in `choices`."""
         return self._dtype.kind != "O"
 
     @cached_property
@@ -325,14 +322,11 @@ class Constant(Domain):
     in a `Categorical` with one choice.
 
     **Arguments:**
-
     - `value`: the only one, such as `9.8`, `[0, 1]`, `"dry"`.
-
     **Raises:** `ValueError` for a number that is not finite, or a value of another kind.
     """
 
     arguments = ("value",)
-
     value: float | bool | str | PyTree
 
     def __post_init__(self) -> None:

@@ -1,9 +1,9 @@
 """Several domains under names (`Struct`)."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import groupby
+from itertools import accumulate, groupby
 
 import jax
 import jax.numpy as jnp
@@ -23,9 +23,7 @@ class Struct(Domain):
     A value is a dictionary with these names.
 
     **Arguments:**
-
     - `fields`: name -> `Domain`, in the order in which coordinates and columns come.
-
     **Raises:** `ValueError` for no fields, or a name that is empty or no text; `TypeError` for a
     field that is not a domain.
     """
@@ -61,33 +59,21 @@ class Struct(Domain):
 
     @property
     def lengths(self) -> tuple[int, ...]:
-        indices, start = [], 0
-        for _, domain in self.fields:
-            indices += [start + i for i in domain.lengths]
-            start += domain.size
-        return tuple(indices)
+        return tuple(start + i for start, domain in self._placed for i in domain.lengths)
 
     @cached_property
     def signals(self) -> tuple[tuple[int, ...], ...]:
-        indices, start = [], 0
-        for _, domain in self.fields:
-            indices += [tuple(start + i for i in signal) for signal in domain.signals]
-            start += domain.size
-        return tuple(indices)
+        return tuple(
+            tuple(start + i for i in signal)
+            for start, domain in self._placed
+            for signal in domain.signals
+        )
 
     def coordinates(self, name: str) -> tuple[str, ...]:
-        return tuple(
-            label
-            for field, domain in self.fields
-            for label in domain.coordinates(dotted(name, field))
-        )
+        return self._texts(name, lambda domain, field: domain.coordinates(field))
 
     def labels(self, name: str, duration: float | None = None) -> tuple[str, ...]:
-        return tuple(
-            label
-            for field, domain in self.fields
-            for label in domain.labels(dotted(name, field), duration)
-        )
+        return self._texts(name, lambda domain, field: domain.labels(field, duration))
 
     def __getitem__(self, name: str) -> Domain:
         check_names("feature", [name], self.names)
@@ -132,11 +118,7 @@ class Struct(Domain):
             domain.check(value[field], dotted(name, field))
 
     def columns(self, name: str) -> tuple[str, ...]:
-        return tuple(
-            column
-            for field, domain in self.fields
-            for column in domain.columns(dotted(name, field))
-        )
+        return self._texts(name, lambda domain, field: domain.columns(field))
 
     def to_columns(self, values: Mapping[str, PyTree], name: str) -> dict[str, np.ndarray]:
         columns: dict[str, np.ndarray] = {}
@@ -151,12 +133,11 @@ class Struct(Domain):
 
     @property
     def sequences(self) -> tuple[tuple[int, int, int, int], ...]:
-        indices, start = [], 0
-        for _, domain in self.fields:
-            for length, first, width, count in domain.sequences:
-                indices.append((start + length, start + first, width, count))
-            start += domain.size
-        return tuple(indices)
+        return tuple(
+            (start + length, start + first, width, count)
+            for start, domain in self._placed
+            for length, first, width, count in domain.sequences
+        )
 
     @property
     def items(self) -> int:
@@ -165,26 +146,20 @@ class Struct(Domain):
     def without(
         self, u: Float[jax.Array, " size"], drop: Bool[jax.Array, " items"]
     ) -> Float[jax.Array, " size"]:
-        parts, start, first = [u[:0]], 0, 0
-        for _, domain in self.fields:
+        parts, first = [u[:0]], 0
+        for start, domain in self._placed:
             own, gone = u[start : start + domain.size], drop[first : first + domain.items]
             parts.append(domain.without(own, gone))
-            start, first = start + domain.size, first + domain.items
+            first += domain.items
         return jnp.concatenate(parts)
 
     def settled(self, u: Float[jax.Array, " size"]) -> Float[jax.Array, " size"]:
-        parts, start = [u[:0]], 0
-        for _, domain in self.fields:
-            parts.append(domain.settled(u[start : start + domain.size]))
-            start += domain.size
-        return jnp.concatenate(parts)
+        parts = [d.settled(u[start : start + d.size]) for start, d in self._placed]
+        return jnp.concatenate([u[:0], *parts])
 
     def used(self, u: Float[jax.Array, " size"]) -> Bool[jax.Array, " size"]:
-        parts, start = [jnp.ones(0, bool)], 0
-        for _, domain in self.fields:
-            parts.append(domain.used(u[start : start + domain.size]))
-            start += domain.size
-        return jnp.concatenate(parts)
+        parts = [d.used(u[start : start + d.size]) for start, d in self._placed]
+        return jnp.concatenate([jnp.ones(0, bool), *parts])
 
     @property
     def coverage_id_count(self) -> int:
@@ -216,6 +191,16 @@ class Struct(Domain):
             else:
                 runs += [((name,), domain) for name, domain in zip(names, domains, strict=True)]
         return tuple(runs)
+
+    @cached_property
+    def _placed(self) -> tuple[tuple[int, Domain], ...]:
+        """The first coordinate of each field, and its domain."""
+        domains = [domain for _, domain in self.fields]
+        return tuple(zip(accumulate((d.size for d in domains), initial=0), domains, strict=False))
+
+    def _texts(self, name: str, of: Callable[[Domain, str], tuple[str, ...]]) -> tuple[str, ...]:
+        """Return texts of all fields, each by its domain and its full name."""
+        return tuple(text for field, part in self.parts(name) for text in of(part, field))
 
     def _dotted_names(self, name: str) -> list[str]:
         return [dotted(name, field) for field, _ in self.fields]

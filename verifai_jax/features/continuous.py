@@ -6,7 +6,7 @@ that float32 tells from 0 and 1, so that no quantile is taken where a distributi
 
 import abc
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +38,7 @@ from verifai_jax.features.ends import (
     replace_where,
     round_inwards,
 )
+from verifai_jax.features.english import number
 
 OUTERMOST = 2.0**-26
 """The probability beyond the outermost points: what float32 rounds away when taken from 1."""
@@ -49,6 +50,13 @@ HIGHEST = 1 - 2.0**-24
 
 class Continuous(Domain):
     """A real number whose unit coordinate is its cumulative probability."""
+
+    _english: ClassVar[str] = ""
+    """Its name in English with its arguments by their names, if these say all."""
+
+    def words(self) -> str:
+        arguments = {name: number(getattr(self, name)) for name in self.arguments or ()}
+        return self._english.format(**arguments) or super().words()
 
     @property
     @abc.abstractmethod
@@ -72,9 +80,7 @@ class Continuous(Domain):
         """Return the natural logarithm of the probability density, in double precision.
 
         **Arguments:**
-
         - `value`: numbers of double precision; minus infinity comes for those beyond the support.
-
         **Raises:** `NotImplementedError` for a distribution that does not say it.
         """
         raise NotImplementedError(f"{self!r} has no density")
@@ -174,6 +180,17 @@ class Continuous(Domain):
     @property
     def tailed(self) -> tuple[bool, ...]:
         return (True,)
+
+
+class Bounded(Continuous):
+    """A real number between two ends, `low` and `high`."""
+
+    low: float
+    high: float
+
+    @property
+    def support(self) -> tuple[float, float]:
+        return (self.low, self.high)
 
 
 def _bounds_text(low: float, high: float, closed: str) -> str:

@@ -28,11 +28,9 @@ class Distribution(Continuous):
     or a limit that no value has, is never simulated.
 
     **Arguments:**
-
     - `inverse_cdf`: probability -> value, increasing.
     - `cdf`: value -> probability.
     - `name`: for people and JSON.
-
     **Raises:** `ValueError` for functions that raise, return no number, do not increase, are not
     finite inside, or are not each other's inverse.
     """
@@ -73,7 +71,6 @@ class Distribution(Continuous):
                 f"cdf of {self!r} must be the inverse of inverse_cdf; inverse_cdf({u[worst]:z.3g}) "
                 f"is {values[worst]:z.3g} and cdf({values[worst]:z.3g}) is {back[worst]:z.3g}"
             )
-
         ends = np.array([0, 1], np.float32)
         slopes = self._sampled("inverse_cdf", jax.grad(self.inverse_cdf), ends)
         bounded = np.all(np.isfinite(self._sampled("inverse_cdf", self.inverse_cdf, ends)))

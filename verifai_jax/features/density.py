@@ -36,10 +36,8 @@ def log_density(space: FeatureSpace, rows: Mapping[str, Any]) -> Float[np.ndarra
     nothing, and the share that the constraint accepts, by which it would be divided, is left out.
 
     **Arguments:**
-
     - `space`: the space of the features.
     - `rows`: columns `[n]` by name; columns of no feature are ignored.
-
     **Raises:** `ValueError` for a row outside the space, and for a domain without a density, such
     as an automaton or one of the user's own.
     """
@@ -57,11 +55,8 @@ def tails(space: FeatureSpace, rows: Mapping[str, Any]) -> dict[str, np.ndarray]
     Boxes, integers and choices, whose values are as probable as their weights say, have none.
 
     **Arguments:**
-
     - `space`, `rows`: as of `log_density`.
-
     **Returns:** probabilities `[n]` by the names of columns; NaN for an absent item.
-
     **Raises:** `ValueError` for a row outside the space.
     """
     check_columns(space, rows, held=False)

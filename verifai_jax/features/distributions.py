@@ -15,19 +15,9 @@ import numpy as np
 from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Array, Float
 
-from verifai_jax.features.continuous import (
-    OUTERMOST,
-    Continuous,
-    at_least,
-    check_ends,
-    check_numbers,
-    check_scale,
-    normal_score,
-    scipy_special,
-)
+from verifai_jax.features import continuous
 from verifai_jax.features.domain import MIN_REAL, Tuning, short
 from verifai_jax.features.ends import replace_where
-from verifai_jax.features.english import number
 
 CENTRAL = 4.0
 """Standard deviations from the mean within which float32 coordinates are closely spaced."""
@@ -39,29 +29,27 @@ outermost probability of a coordinate, 2^-26, it is still a normal number of flo
 
 
 @dataclass(frozen=True, repr=False)
-class Normal(Continuous):
+class Normal(continuous.Continuous):
     """A normal distribution: `Normal(mean, std)`.
 
     A float32 coordinate reaches 5.5 standard deviations to either side, beyond which lies a
     probability of 3e-8; the coordinates 0 and 1 stand for these outermost values.
 
     **Arguments:**
-
     - `mean`: the mean of the distribution.
     - `std`: its standard deviation, positive.
-
     **Raises:** `ValueError` for parameters that are not finite, a standard deviation that is not
     positive, or values that do not fit into float32.
     """
 
     arguments = ("mean", "std")
-
+    _english = "normal with mean {mean} and standard deviation {std}"
     mean: float
     std: float
 
     def __post_init__(self) -> None:
-        check_numbers(self, "mean", "std")
-        check_scale(self, self.mean, self.std)
+        continuous.check_numbers(self, "mean", "std")
+        continuous.check_scale(self, self.mean, self.std)
 
     @property
     def support(self) -> tuple[float, float]:
@@ -71,7 +59,7 @@ class Normal(Continuous):
         return abs(value - self.mean) <= CENTRAL * self.std
 
     def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
-        return self.mean + self.std * normal_score(u)
+        return self.mean + self.std * continuous.normal_score(u)
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
         return ndtr((value - self.mean) / self.std)
@@ -81,20 +69,16 @@ class Normal(Continuous):
         return -(z**2) / 2 - HALF_LOG_2PI - math.log(self.std)
 
     def tail(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        return 2 * scipy_special().ndtr(
+        return 2 * continuous.scipy_special().ndtr(
             -np.abs((np.asarray(value, np.float64) - self.mean) / self.std)
         )
 
-    def words(self) -> str:
-        return f"normal with mean {number(self.mean)} and standard deviation {number(self.std)}"
-
 
 @dataclass(frozen=True, repr=False)
-class TruncatedNormal(Continuous):
+class TruncatedNormal(continuous.Bounded):
     """A normal distribution given that the value lies in `[low, high]`.
 
     **Arguments:**
-
     - `mean`, `std`: of the distribution before it is cut off.
     - `low`, `high`: the ends; `low < high`.
 
@@ -107,16 +91,16 @@ class TruncatedNormal(Continuous):
     """
 
     arguments = ("mean", "std", "low", "high")
-
+    _english = "normal with mean {mean} and standard deviation {std}, cut off at {low} and {high}"
     mean: float
     std: float
     low: float
     high: float
 
     def __post_init__(self) -> None:
-        check_numbers(self, "mean", "std", "low", "high")
-        check_scale(self, self.mean, self.std)
-        check_ends(self, self.low, self.high)
+        continuous.check_numbers(self, "mean", "std", "low", "high")
+        continuous.check_scale(self, self.mean, self.std)
+        continuous.check_ends(self, self.low, self.high)
         if self.high - self.low < 0.05 * self.std:
             raise ValueError(
                 "low and high are less than 0.05 standard deviations apart, where the "
@@ -128,10 +112,6 @@ class TruncatedNormal(Continuous):
                 f"only {self._inside:z.1g} of the normal distribution lies between low and high, "
                 f"which float32 cannot resolve (at least {DEEPEST:zg} is needed); got {self!r}"
             )
-
-    @property
-    def support(self) -> tuple[float, float]:
-        return (self.low, self.high)
 
     @property
     def _mirrored(self) -> bool:
@@ -160,8 +140,8 @@ class TruncatedNormal(Continuous):
     def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
         below, _, _, above = self._tails
         left, right = (1 - u, u) if self._mirrored else (u, 1 - u)
-        p = below + self._inside * at_least(left, OUTERMOST)
-        q = above + self._inside * at_least(right, OUTERMOST)
+        p = below + self._inside * continuous.at_least(left, continuous.OUTERMOST)
+        q = above + self._inside * continuous.at_least(right, continuous.OUTERMOST)
         lower = p < 0.5
         z = ndtri(jnp.where(lower, p, q))
         x = self.mean + self.std * jnp.where(lower ^ self._mirrored, z, -z)
@@ -186,44 +166,32 @@ class TruncatedNormal(Continuous):
         whole = Normal(self.mean, self.std).log_density(value) - math.log(self._inside)
         return np.where(self.contains(value), whole, -np.inf)
 
-    def words(self) -> str:
-        return (
-            f"normal with mean {number(self.mean)} and standard deviation {number(self.std)}, cut "
-            f"off at {number(self.low)} and {number(self.high)}"
-        )
-
     @property
     def tuning(self) -> Tuning:
         return Tuning("other", self.low, self.high)
 
 
 @dataclass(frozen=True, repr=False)
-class LogUniform(Continuous):
+class LogUniform(continuous.Bounded):
     """Positive numbers whose logarithm is uniform: learning rates, masses, stiffnesses.
 
     **Arguments:**
-
     - `low`, `high`: the ends; `0 < low < high`.
-
     **Raises:** `ValueError` for ends that are not finite, not positive, reversed or equal.
     """
 
     arguments = ("low", "high")
-
+    _english = "log-uniform between {low} and {high}"
     low: float
     high: float
 
     def __post_init__(self) -> None:
-        check_numbers(self, "low", "high")
+        continuous.check_numbers(self, "low", "high")
         if self.low <= 0:
             raise ValueError(f"low of a LogUniform must be positive; got {self!r}")
         if self.low < MIN_REAL:
             raise ValueError(f"low of a LogUniform must be at least {MIN_REAL:zg}; got {self!r}")
-        check_ends(self, self.low, self.high)
-
-    @property
-    def support(self) -> tuple[float, float]:
-        return (self.low, self.high)
+        continuous.check_ends(self, self.low, self.high)
 
     @property
     def _width(self) -> float:
@@ -250,9 +218,6 @@ class LogUniform(Continuous):
         inside = self.contains(value)
         density = -np.log(np.where(inside, value, 1.0)) - math.log(self._width)
         return np.where(inside, density, -np.inf)
-
-    def words(self) -> str:
-        return f"log-uniform between {number(self.low)} and {number(self.high)}"
 
     @property
     def tailed(self) -> tuple[bool, ...]:

@@ -33,10 +33,8 @@ MIN_REAL = float(np.finfo(np.float32).tiny)
 """Smallest normal float32 number: XLA treats smaller ones as zero."""
 MAX_REAL = float(np.finfo(np.float32).max)
 """Largest float32 number."""
-
 Numbers: TypeAlias = float | Sequence | np.generic | np.ndarray | jax.Array
 """A number or an array of them, as a person, a table or a system writes it."""
-
 Value = TypeVar("Value")
 
 
@@ -83,7 +81,6 @@ class Domain(ForUsers, abc.ABC):
         "refine", "refined", "rounded", "sequences", "settled", "signals", "spans", "tail",
         "tailed", "to_columns", "tuning", "uniform", "used", "weights", "without", "words",
     ))  # fmt: skip
-
     arguments: ClassVar[tuple[str, ...] | None] = None
     """Attributes from which it can be rebuilt; None for a domain defined by a user."""
 
@@ -121,10 +118,8 @@ class Domain(ForUsers, abc.ABC):
         """Check that a concrete value lies in the domain.
 
         **Arguments:**
-
         - `value`: as `from_unit` gives it, or as a person writes it.
         - `name`: the name of the feature, for the message.
-
         **Raises:** `ValueError` for a value outside the domain, or of another kind.
         """
 
@@ -219,7 +214,6 @@ class Domain(ForUsers, abc.ABC):
         """Return the domains of a value's parts, with the names of their columns.
 
         **Arguments:**
-
         - `name`: the name of the feature.
         """
         return ()
@@ -278,7 +272,6 @@ class Domain(ForUsers, abc.ABC):
         None.
 
         **Arguments:**
-
         - `duration`: the duration of the simulation in seconds.
         """
         return None
@@ -297,7 +290,6 @@ class Domain(ForUsers, abc.ABC):
         """Return the names of the unit coordinates for people: control points by their time.
 
         **Arguments:**
-
         - `name`: the name of the feature.
         - `duration`: the duration of a simulation in seconds, for signals that have none of their
           own.

@@ -21,10 +21,8 @@ from verifai_jax.core.errors import unknown_name
 
 CLOSED = ("both", "left", "right", "neither")
 """Which ends of an interval belong to it, as in pandas."""
-
 End: TypeAlias = float | tuple[float, ...]
 """An end of an interval, or of several; infinite for an open range."""
-
 Reals = TypeVar("Reals", jax.Array, np.ndarray)
 """Real numbers, of JAX or of NumPy."""
 
@@ -46,9 +44,7 @@ def ends_within(
     They are zero or normal numbers: XLA takes a subnormal one for zero.
 
     **Arguments:**
-
     - `low`, `high`: the ends.
-    - `dtype`: the data type of the precision.
     - `closed`: which ends belong to the intervals, one of `CLOSED`.
     """
     ends = _ends(low, high, np.dtype(dtype), closed)
@@ -86,19 +82,13 @@ def is_inside(
     return np.asarray(((numbers >= first) & (numbers <= last)) | at_low | at_high)
 
 
-def round_inwards(
-    value: Reals,
-    low: End,
-    high: End,
-    closed: str = "both",
-) -> Reals:
+def round_inwards(value: Reals, low: End, high: End, closed: str = "both") -> Reals:
     """Return numbers with those on an end that rounding moved outwards moved to the last number
     inside.
 
     Others stay as they are, those that are farther outside too.
 
     **Arguments:**
-
     - `value`: numbers in single or double precision.
     - `low`, `high`, `closed`: as in `ends_within`.
     """

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from verifai_jax.features.continuous import (
     OUTERMOST,
     REACH,
+    Bounded,
     Continuous,
     check_ends,
     check_logs,
@@ -66,15 +67,12 @@ class LogNormal(Positive):
     Coordinates reach 5.54 standard deviations of the logarithm to either side.
 
     **Arguments:**
-
     - `mean`, `std`: of the logarithm; the median is `exp(mean)`.
-
     **Raises:** `ValueError` for parameters that are not finite, a standard deviation that is not
     positive, or values that do not fit into float32.
     """
 
     arguments = ("mean", "std")
-
     mean: float
     std: float
 
@@ -113,16 +111,14 @@ class Weibull(Positive):
     The probability of more than `x` is `exp(-(x / scale) ** shape)`.
 
     **Arguments:**
-
     - `shape`: positive; below 1 the density is infinite at zero.
     - `scale`: positive, in the unit of the value.
-
     **Raises:** `ValueError` for parameters that are not finite and positive, or values that do not
     fit into float32.
     """
 
     arguments = ("shape", "scale")
-
+    _english = "Weibull with shape {shape} and scale {scale}"
     shape: float
     scale: float
 
@@ -145,24 +141,19 @@ class Weibull(Positive):
             density = math.log(self.shape) - math.log(self.scale) + (self.shape - 1) * log
             return _at_positive(value, density - np.exp(self.shape * log))
 
-    def words(self) -> str:
-        return f"Weibull with shape {number(self.shape)} and scale {number(self.scale)}"
-
 
 @dataclass(frozen=True, repr=False)
 class Exponential(Positive):
     """Positive numbers such as waits between independent events: `Exponential(mean)`.
 
     **Arguments:**
-
     - `mean`: positive; one over the rate.
-
     **Raises:** `ValueError` for a mean that is not finite and positive, or values that do not fit
     into float32.
     """
 
     arguments = ("mean",)
-
+    _english = "exponential with mean {mean}"
     mean: float
 
     def __post_init__(self) -> None:
@@ -180,26 +171,21 @@ class Exponential(Positive):
         value, x = _positive(value)
         return _at_positive(value, -x / self.mean - math.log(self.mean))
 
-    def words(self) -> str:
-        return f"exponential with mean {number(self.mean)}"
-
 
 @dataclass(frozen=True, repr=False)
-class Triangular(Continuous):
+class Triangular(Bounded):
     """Numbers between two ends with one most likely value: `Triangular(low, mode, high)`.
 
     The coordinates 0 and 1 stand for a probability of 2^-26, since the density is zero at the ends,
     but for one that is the mode.
 
     **Arguments:**
-
     - `low`, `mode`, `high`: `low <= mode <= high` and `low < high`.
-
     **Raises:** `ValueError` for numbers that are not finite or not in this order.
     """
 
     arguments = ("low", "mode", "high")
-
+    _english = "triangular between {low} and {high}, most likely {mode}"
     low: float
     mode: float
     high: float
@@ -209,10 +195,6 @@ class Triangular(Continuous):
         check_ends(self, self.low, self.high)
         if not self.low <= self.mode <= self.high:
             raise ValueError(f"the mode must lie between low and high; got {self!r}")
-
-    @property
-    def support(self) -> tuple[float, float]:
-        return (self.low, self.high)
 
     @property
     def _rising(self) -> float:
@@ -244,9 +226,3 @@ class Triangular(Continuous):
         height = np.where(value < self.mode, up, down) * 2 / (self.high - self.low)
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self.contains(value), np.log(height), -np.inf)
-
-    def words(self) -> str:
-        return (
-            f"triangular between {number(self.low)} and {number(self.high)}, most likely "
-            f"{number(self.mode)}"
-        )

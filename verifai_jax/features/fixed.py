@@ -17,11 +17,9 @@ class Fixed(Domain):
     """A domain at one of its values: it keeps its table columns and has no coordinates.
 
     **Arguments:**
-
     - `domain`: the domain of the feature.
     - `value`: in the domain, as a person writes it.
     - `name`: the name of the feature, for messages.
-
     **Raises:** `ValueError` for a value outside the domain.
     """
 

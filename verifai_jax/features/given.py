@@ -28,10 +28,8 @@ from verifai_jax.features.space import FeatureSpace
 
 if TYPE_CHECKING:
     import pandas as pd
-
 Rows: TypeAlias = "pd.DataFrame | pd.Series | Iterable[Any] | Mapping[str, Any]"
 """Features of simulations: the feature columns of a table, a row of one, or dictionaries."""
-
 TABLE_COLUMNS = ("row", "rho", "violated", "status", "verdict", "suggested", "message")
 """Columns of a table other than its features, which a dictionary made of a row may hold."""
 
@@ -42,14 +40,10 @@ def given_features(space: FeatureSpace, rows: Rows, precision: str = "float32") 
     Everything is checked as it was written, in double precision, before it is converted.
 
     **Arguments:**
-
-    - `space`: the space of the features.
     - `rows`: a DataFrame with the columns of a table, a row of one, or dictionaries (one or
       several) that hold features by name or by the columns of a table.
     - `precision`: `"float32"` or `"float64"`, of their real numbers.
-
     **Returns:** the features, stacked along a leading axis `[n, ...]`.
-
     **Raises:** `ValueError` that names the first row and feature which is missing, unknown, outside
     its domain or refused by the constraint; `TypeError` for rows of another form.
     """
@@ -80,10 +74,7 @@ def given_rows(space: FeatureSpace, features: Mapping[str, Any]) -> Float[np.nda
     """Return rows that an engine simulates with exactly these features.
 
     **Arguments:**
-
-    - `space`: the space of the features.
     - `features`: `[n, ...]`, as `given_features` gives them.
-
     **Returns:** the points of the unit cube nearest to the features, and after each the real
     numbers among its features; see `FeatureSpace.unflatten_given`.
     """
@@ -103,11 +94,8 @@ def check_columns(
     """Check rows of a table `[n]`, and return their features in double precision.
 
     **Arguments:**
-
-    - `space`: the space of the features.
     - `columns`: by name; others than those of features are ignored.
     - `held`: whether features that the space holds at one value are checked too.
-
     **Raises:** as `given_features`.
     """
     for name in space.columns:

@@ -31,7 +31,6 @@ from verifai_jax.features.signal import Signal
 from verifai_jax.features.space import FeatureSpace
 
 Points = Float[np.ndarray, "n d"]
-
 SLIGHT = 0.02
 """Departure of the ends of a box from its middle: what breaks ties between values as likely."""
 REACH, NODES = 5.4, 2161
@@ -44,9 +43,7 @@ class Improbability:
     """The departures of points from the likeliest one, coordinate by coordinate.
 
     **Arguments:**
-
     - `space`: the space of the features.
-
     **Raises:** `NoDensityError` for a domain whose values have no density, such as an automaton.
     """
 

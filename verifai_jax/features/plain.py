@@ -71,10 +71,8 @@ def from_plain(
     """Build the domain that `to_plain` described.
 
     **Arguments:**
-
     - `data`: as `to_plain` gives it.
     - `distributions`: those with functions, by name.
-
     **Raises:** `ValueError` for an unknown kind, a distribution that is not given, missing parts,
     or what the domain itself refuses.
     """

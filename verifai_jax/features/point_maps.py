@@ -22,7 +22,6 @@ class PointMaps:
     """Points `[dim]` of the unit cube to features by name, and back; programs are compiled once.
 
     **Arguments:**
-
     - `root`: the domains by name, as one domain.
     - `where`: the constraint between features, or None.
     """
@@ -79,7 +78,6 @@ class PointMaps:
         """Return the names of the coordinates for people: `{"wind[3]": "wind at 1.5 s", ...}`.
 
         **Arguments:**
-
         - `duration`: the duration of a simulation in seconds, for signals that have none of their
           own; without it their control points keep their numbers.
         """
@@ -116,11 +114,8 @@ class PointMaps:
         Pure JAX; `jax.vmap` it for batches.
 
         **Arguments:**
-
         - `u`: the point, `[dim]` with entries in `[0, 1]`.
-
         **Returns:** the features by name, as a system sees them.
-
         **Raises:** `ValueError` for a point of another shape.
         """
         u = as_real(u)
@@ -138,9 +133,7 @@ class PointMaps:
         checked.
 
         **Arguments:**
-
         - `features`: by name; constant, fixed ones and events may be left out.
-
         **Returns:** the point, `[dim]`.
         """
         return self.root.to_unit(self.root.coerce(self.completed(features)))
@@ -172,7 +165,6 @@ class PointMaps:
         """Return features with given real numbers, others as `unflatten` gives them. Pure JAX.
 
         **Arguments:**
-
         - `u`: the point of the unit cube nearest to the features.
         - `values`: their real numbers, one after another; where one is NaN, that of the point.
         """

@@ -27,11 +27,9 @@ def features_of_rows(
     """Return the features `[n, ...]` that rows of a table hold, in this precision.
 
     **Arguments:**
-
     - `domains`: the domains of the features, by name.
     - `rows`: columns `[n]` by name; others than those of features are ignored.
     - `precision`: `"float32"` or `"float64"`, of real numbers.
-
     **Raises:** as `space.from_row`.
     """
     names = [column for name, domain in domains.items() for column in domain.columns(name)]

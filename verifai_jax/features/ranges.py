@@ -19,7 +19,6 @@ ROUNDINGS = 8
 """Roundings by which the map from coordinates to a feature may fail to rise."""
 TOGETHER = 512
 """Points that are converted at once: one program serves any number."""
-
 Corners = Float[np.ndarray, "n dim"]
 
 
@@ -29,7 +28,6 @@ class FeatureRanges:
     - `edges`: where the cells of each coordinate begin and end; None for a continuous one.
 
     **Arguments:**
-
     - `space`: the feature space.
     - `precision`: the precision of features, `"float32"` or `"float64"`.
     """

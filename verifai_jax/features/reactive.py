@@ -26,19 +26,16 @@ class Reactive(Domain):
     how to react, where a `Signal` can only say when.
 
     **Arguments:**
-
     - `inputs`: signal -> `(low, high)`, the range that it usually has, which is scaled to -1 to 1;
       or names of signals that are of that size anyway.
     - `hidden`: hidden units of a network with hyperbolic tangents; 0 for an affine function.
     - `bounds`: the bounds of the output.
     - `scale`: weights and biases are uniform from `-scale` to `scale`.
-
     **Raises:** `ValueError` for no inputs, ranges or bounds that are none, a negative number of
     hidden units, or a scale that is not positive.
     """
 
     arguments = ("inputs", "hidden", "bounds", "scale")
-
     inputs: tuple[tuple[str, float, float], ...]
     hidden: int
     bounds: tuple[float, float]

@@ -32,7 +32,6 @@ from verifai_jax.features.domain import Domain, Row, as_numbers, indexed, on_dev
 DEFAULT_KNOTS = 16
 """Control points of a signal that says nothing else: enough for a few swings, and few enough to be
 searched."""
-
 Course = tuple[str, float | None, tuple[float, ...] | None, float | None]
 """Hold, duration, times and width."""
 
@@ -47,7 +46,6 @@ class Signal(Domain):
     A value is a `Waveform`, which a system calls with a time in seconds: `features["wind"](time)`.
 
     **Arguments:**
-
     - `domain`: the domain of each control point: a `Box`, of numbers or vectors, or a distribution.
     - `knots`: number of control points, at equal distances; with `times` it is theirs.
     - `hold`: `"linear"` joins them by lines, the first at time 0 and the last at the end;
@@ -58,14 +56,12 @@ class Signal(Domain):
     - `times`: the times of the control points in seconds, increasing. The first and the last value
       hold before and after them.
     - `width`: the width of a pulse in seconds; half the shortest distance of two when left out.
-
     **Raises:** `ValueError` for a domain that is not continuous, an unknown `hold`, too few knots
     (1 for constant and pulse, 2 for linear and pchip), a duration or width that is not positive,
     and times that do not increase, lie after the duration or are not as many as the knots.
     """
 
     arguments = ("domain", "knots", "hold", "duration")
-
     domain: Domain
     knots: int = DEFAULT_KNOTS
     hold: str = "linear"
@@ -180,12 +176,6 @@ class Signal(Domain):
         return tuple(f"{part} {time}" for time in times for part in parts)
 
     def spans(self, duration: float) -> list[tuple[float, float]]:
-        """Return from when to when each control point changes the function, in seconds.
-
-        **Arguments:**
-
-        - `duration`: the duration of the simulation in seconds; that of the signal comes first.
-        """
         length = self.duration or duration
         return acting_spans(self.knots, self.hold, self.times, self.width, length)
 
@@ -223,7 +213,6 @@ class Signal(Domain):
         return replace(self, knots=count - factor + 1 if self.hold == "linear" else count)
 
     def refine(self, value: Waveform, factor: int) -> Waveform:
-        """Convert a value to one of `refined(factor)`: the same function of time."""
         return value.refined(factor)
 
     def waveform(self, knots: Float[Array | np.ndarray, "*knots"]) -> Waveform:

@@ -49,11 +49,9 @@ class FeatureSpace(PointMaps, ForUsers):
       trace.
 
     **Arguments:**
-
     - `domains`: name -> `Domain`, in the order in which coordinates and columns come.
     - `where`: a constraint between features, a JAX function from features to one truth value. The
       prior is then that of the domains given that it holds, and only such points are simulated.
-
     **Raises:** `ValueError` for no features, bad names, or names that give one column twice;
     `TypeError` for a value that is not a domain, or a `where` that is not a function.
     """
@@ -68,9 +66,7 @@ class FeatureSpace(PointMaps, ForUsers):
     ))  # fmt: skip
 
     def __init__(
-        self,
-        domains: Mapping[str, Domain],
-        where: Callable[[Any], Bool[Array, ""]] | None = None,
+        self, domains: Mapping[str, Domain], where: Callable[[Any], Bool[Array, ""]] | None = None
     ) -> None:
         super().__init__(Struct(domains), where)
         if where is not None and not callable(where):
@@ -97,10 +93,8 @@ class FeatureSpace(PointMaps, ForUsers):
         """Convert columns `[n]` of a table to features `[n, ...]`: `from_row` of each row, stacked.
 
         **Arguments:**
-
         - `rows`: columns `[n]` by name; others than those of features are ignored.
         - `precision`: `"float32"` or `"float64"`, of their real numbers.
-
         **Raises:** as `from_row`.
         """
         return features_of_rows(self.domains, rows, precision)
@@ -113,12 +107,9 @@ class FeatureSpace(PointMaps, ForUsers):
         """Check features that a person wrote and convert them to those that a system sees.
 
         **Arguments:**
-
         - `features`: numbers, lists, choices, dictionaries by name; constant, fixed ones and events
           may be left out.
-
         **Returns:** the features as `unflatten` gives them.
-
         **Raises:** as `check`.
         """
         self.check(features)
@@ -130,11 +121,8 @@ class FeatureSpace(PointMaps, ForUsers):
         Their names and shapes are checked, and their values are not: JAX may trace them.
 
         **Arguments:**
-
         - `features`: as in `coerce`.
-
         **Returns:** the features as `unflatten` gives them.
-
         **Raises:** `ValueError` that names the first feature which is unknown, is missing or has
         another shape.
         """
@@ -178,9 +166,7 @@ class FeatureSpace(PointMaps, ForUsers):
         times.
 
         **Arguments:**
-
         - `seed`: the seed of the samples.
-
         **Raises:** `ValueError` for a constraint that raises, does not return one truth value, or
         accepts none of 65 536 samples, or of those that Python can decide in a minute.
         """
@@ -195,12 +181,9 @@ class FeatureSpace(PointMaps, ForUsers):
         """Draw features from the prior; for people.
 
         **Arguments:**
-
         - `key`: a random key of JAX.
         - `count`: number of samples.
-
         **Returns:** the features by name, stacked along a leading axis `[count, ...]`.
-
         **Raises:** as `check_where`; `ValueError` for a count that is not a positive integer.
         """
         self.check_where()
@@ -225,11 +208,9 @@ class FeatureSpace(PointMaps, ForUsers):
         middle of its domain. A metric; pure JAX on the values that `unflatten` gives.
 
         **Arguments:**
-
         - `one`, `other`: features as `unflatten` gives them, or as a person writes them (numbers,
           lists, choices, dictionaries by name; constant, fixed ones and events may be left out), or
           rows of a table.
-
         **Raises:** `ValueError` that names the first feature which is missing, unknown or outside
         its domain, for values that a person wrote.
         """
@@ -245,9 +226,7 @@ class FeatureSpace(PointMaps, ForUsers):
         """Return the space with these features held at a value; they keep their table columns.
 
         **Arguments:**
-
         - `values`: by name, as a person writes them.
-
         **Raises:** `ValueError` for an unknown feature, or a value outside its domain.
         """
         check_names("feature", values, self.domains)
@@ -261,10 +240,8 @@ class FeatureSpace(PointMaps, ForUsers):
         """Return the space with these features varied alone, the others held at `nominal`.
 
         **Arguments:**
-
         - `features`: names of those that vary.
         - `nominal`: values of the others, by name, as a person writes them.
-
         **Raises:** `ValueError` for no or an unknown feature, or one without a nominal value.
         """
         if not features:
@@ -291,9 +268,7 @@ class FeatureSpace(PointMaps, ForUsers):
         See `Signal.refined`; the finer features are the same functions of time.
 
         **Arguments:**
-
         - `factor`: control points of the finer signals for one of the coarse ones.
-
         **Raises:** `ValueError` for a factor that is not a positive integer.
         """
         positive = isinstance(factor, int | np.integer) and not isinstance(factor, bool)
@@ -320,11 +295,9 @@ class FeatureSpace(PointMaps, ForUsers):
         """Build the space that `to_json` described; code is given, never read.
 
         **Arguments:**
-
         - `data`: as `to_json` gives it.
         - `where`: the constraint, if the space has one.
         - `distributions`: those with functions of their own, by name.
-
         **Raises:** `ValueError` for data that describes no space, or code that is missing.
         """
         if not isinstance(data, Mapping) or "features" not in data:

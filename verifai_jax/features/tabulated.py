@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 
 from verifai_jax.features.continuous import (
     REACH,
+    Bounded,
     Continuous,
     check_ends,
     check_logs,
@@ -91,16 +92,14 @@ class Gamma(Positive):
     """Positive numbers such as sums of waits: `Gamma(shape, scale)`, with mean `shape * scale`.
 
     **Arguments:**
-
     - `shape`: at least 0.05; below 1 the density is infinite at zero.
     - `scale`: positive, in the unit of the value; one over the rate.
-
     **Raises:** `ValueError` for parameters that are not finite and positive, a shape below 0.05, or
     values that do not fit into float32.
     """
 
     arguments = ("shape", "scale")
-
+    _english = "gamma with shape {shape} and scale {scale}"
     shape: float
     scale: float
 
@@ -155,25 +154,20 @@ class Gamma(Positive):
         sides = scipy_special().gammainc(self.shape, x), scipy_special().gammaincc(self.shape, x)
         return 2 * np.minimum(*sides)
 
-    def words(self) -> str:
-        return f"gamma with shape {number(self.shape)} and scale {number(self.scale)}"
-
 
 @dataclass(frozen=True, repr=False)
-class Beta(Continuous):
+class Beta(Bounded):
     """Shares, or numbers between two ends: `Beta(a, b)`, `Beta(a, b, low, high)`.
 
     **Arguments:**
-
     - `a`, `b`: at least 0.05 each; the mean is `low + (high - low) * a / (a + b)`.
     - `low`, `high`: the ends, which are no values themselves.
-
     **Raises:** `ValueError` for parameters that are not finite, `a` or `b` below 0.05, or ends that
     are reversed or equal.
     """
 
     arguments = ("a", "b", "low", "high")
-
+    _english = "beta with a = {a} and b = {b} between {low} and {high}"
     a: float
     b: float
     low: float = 0.0
@@ -185,10 +179,6 @@ class Beta(Continuous):
             if getattr(self, name) < 0.05:
                 raise ValueError(f"{name} of a Beta must be at least 0.05; got {self!r}")
         check_ends(self, self.low, self.high)
-
-    @property
-    def support(self) -> tuple[float, float]:
-        return (self.low, self.high)
 
     @property
     def closed(self) -> str:
@@ -251,12 +241,6 @@ class Beta(Continuous):
             scipy_special().betainc(self.a, self.b, x), scipy_special().betaincc(self.a, self.b, x)
         )
 
-    def words(self) -> str:
-        return (
-            f"beta with a = {number(self.a)} and b = {number(self.b)} between "
-            f"{number(self.low)} and {number(self.high)}"
-        )
-
     def __repr__(self) -> str:
         ends = "" if self.support == (0, 1) else f", {short(self.low)}, {short(self.high)}"
         return f"Beta({short(self.a)}, {short(self.b)}{ends})"
@@ -272,15 +256,12 @@ class Empirical(Continuous):
     occur.
 
     **Arguments:**
-
     - `data`: finite numbers, at least two different ones.
-
     **Raises:** `ValueError` for fewer, for more than 65 536 different ones, or for what is no
     finite number.
     """
 
     arguments = ("values", "ranks", "count")
-
     values: tuple[float, ...]
     ranks: tuple[float, ...]
     count: int

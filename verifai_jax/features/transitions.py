@@ -21,10 +21,8 @@ from verifai_jax.features.domain import Domain
 MAX_NODES = 50_000
 """Greatest number of states of an automaton, each with the pasts that guards tell apart: its tables
 have a row for each and a column for each transition."""
-
 NEARLY = 0.82
 """Similarity of two names from which one is taken for the other, misspelt: one letter in six."""
-
 MIN_SHARE = 2.0**-20
 """Least probability of a transition: a narrower interval is no distinct one in float32."""
 

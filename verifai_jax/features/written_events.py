@@ -257,7 +257,6 @@ OPTIONS = ("to", "wait", "weight", "after", "at_most", "guard")
 """Entries of an event that are no parameters."""
 TAKEN = ("kind", "kinds", "wait", "waits", "time", "times", "length")
 """Names that a parameter cannot have, because a table or a value uses them."""
-
 Guard = Callable[[Past], bool]
 """A function that says whether an event may happen after a past."""
 
@@ -266,10 +265,8 @@ def read_event(entry: object, event: object) -> Transition:
     """Return the transition that one entry of an automaton's `events` describes.
 
     **Arguments:**
-
     - `entry`: its key, `(state, name)`.
     - `event`: its dictionary; see `Automaton`.
-
     **Raises:** `ValueError` or `TypeError`, which name the event and what is wrong with it.
     """
     if not (

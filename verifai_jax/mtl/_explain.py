@@ -143,22 +143,16 @@ def heading(f: Formula) -> str:
 
 
 def explain(
-    formula: Formula | str,
-    trace: Trace,
-    k: int = 5,
-    end: End = "hold",
-    tau: float | None = None,
+    formula: Formula | str, trace: Trace, k: int = 5, end: End = "hold", tau: float | None = None
 ) -> Explanation:
     """Find the predicate, instant and path that decide a formula on one trace.
 
     **Arguments:**
-
     - `formula`, `trace`, `end`: as for `robustness`; the trace is concrete, not under `jit`.
     - `k`: how many critical instants to report at most: the peaks, over time, of each predicate's
       influence.
     - `tau`: temperature at which influence is measured; a tenth of the predicates' spread when
       left out.
-
     **Raises:** as `robustness`, and `ValueError` for a NaN among the samples that matter.
     """
     check_trace(trace)
@@ -239,18 +233,18 @@ class _Tree:
     def node(self, f: Formula, i: int, decides: bool) -> Node:
         """Return the node of `f` at sample `i`: one object, wherever it stands."""
         if (f, i, decides) not in self._nodes:
-            self._nodes[f, i, decides] = self._node(f, i, decides)
+            walk = self.walk
+            operands = walk.operands(f, i)
+            deciding = walk.deciding(f, i, operands) if decides else None
+            children = tuple(
+                self.node(part, j, decides and k == deciding)
+                for k, (part, j) in enumerate(operands)
+            )
+            series = walk.values_of(f)[: walk.length : walk.stride]
+            self._nodes[f, i, decides] = Node(
+                f, self.time(i), walk.at(f, i), decides, children, series
+            )
         return self._nodes[f, i, decides]
-
-    def _node(self, f: Formula, i: int, decides: bool) -> Node:
-        walk = self.walk
-        operands = walk.operands(f, i)
-        deciding = walk.deciding(f, i, operands) if decides else None
-        children = tuple(
-            self.node(part, j, decides and k == deciding) for k, (part, j) in enumerate(operands)
-        )
-        series = walk.values_of(f)[: walk.length : walk.stride]
-        return Node(f, self.time(i), walk.at(f, i), decides, children, series)
 
 
 def _critical(

@@ -82,7 +82,6 @@ class Online:
         NaN before the first sample.
 
         **Arguments:**
-
         - `count`: number of samples that came, where it is known while JAX traces; a program then
           does nothing for windows that are past.
         """
@@ -98,10 +97,8 @@ def online(formula: Formula | str, dt: float, semantics: Semantics = hard) -> On
     """Make a monitor of `formula` for samples `dt` seconds apart.
 
     **Arguments:**
-
     - `semantics`: `hard`, or `boolean`, by which all values are above zero where the formula holds
       and below where it does not, also where its robustness is exactly zero.
-
     **Raises:** `IntervalError` for an interval that is not a multiple of `dt`; `ValueError` for
     smooth semantics, and for an unbounded future operator within another temporal operator, which
     no bounded memory can follow.
@@ -187,11 +184,9 @@ def advance(
     """Compute the results of one more sample.
 
     **Arguments:**
-
     - `now`: number of the sample.
     - `leaves`: margins of the plan's leaves.
     - `cells`: memory before the step.
-
     **Returns:** the result of each formula, NaN where it has none yet, and the memory after it.
     """
     step = _Step(now, leaves, cells)

@@ -24,10 +24,8 @@ from verifai_jax.mtl.words import NAME, NUMBERS, OPERATORS
 MAX_TOKENS = 10_000
 """Words and symbols that a formula's text may have. Far more than a person writes: a file that
 is given by mistake is refused before it is parsed."""
-
 MAX_OFFERED = 300
 """Characters of a text that an error offers at most; a longer one would be cut when it is shown."""
-
 _TOKEN = re.compile(r'"[^"\n]*"|[\w.]+|\S')
 
 
@@ -39,7 +37,6 @@ def parse(
     """Read a formula from its text.
 
     **Arguments:**
-
     - `text`: see the grammar in the documentation; times are in seconds unless a unit follows.
     - `constants`: numbers by name, also usable as the ends of intervals.
     - `definitions`: sub-formulas by name, as text or formulas; a text may use the names before it.

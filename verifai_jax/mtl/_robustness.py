@@ -40,7 +40,6 @@ def robustness(
     """Compute how robustly a trace satisfies a formula at time 0: positive, it holds.
 
     **Arguments:**
-
     - `formula`: a `Formula`, or its text.
     - `trace`: signals `[time]` or `[time, k]`, evenly sampled. Batches by `jax.vmap`.
     - `semantics`: `hard` (in the unit of the predicates), `smooth(tau)`, or `boolean` (+1 / -1).
@@ -242,7 +241,6 @@ def _everywhere_backward(
 
 
 _everywhere.defvjp(_everywhere_forward, _everywhere_backward)
-
 # Compiled on their own, so that plain calls on arrays are fast too; inlined within a larger `jit`.
 _root_compiled = jax.jit(_root, static_argnums=0, inline=True)
 _everywhere_compiled = jax.jit(_everywhere, static_argnums=0, inline=True)

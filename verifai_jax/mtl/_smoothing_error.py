@@ -39,7 +39,6 @@ def smoothing_error(
     """Bound the distance of the smooth robustness of such a trace from the hard one.
 
     **Arguments:** as `robustness`; only the trace's length and period matter, not its values.
-
     **Returns:** `above` and `below`, in temperatures: `smooth - tau * above <= hard <= smooth + tau
     * below`.
     """

@@ -152,7 +152,6 @@ static inline double vj_reach(
 
 #endif
 """
-
 MONITOR = r"""
 typedef struct {
   double out[@outputs];
@@ -231,15 +230,12 @@ def export_c(
     `math.h`, `stdbool.h` and `stdint.h` alone.
 
     **Arguments:**
-
     - `dt`: sampling period in seconds.
     - `name`: the name of the type in C, and before the names of its functions.
     - `semantics`: `hard` or `boolean`.
     - `every`: whether each formula is asked at every instant, or at time 0.
     - `sizes`: number of components of each signal whose norm the formulas take.
-
     **Returns:** the text of the header.
-
     **Raises:** as `watch`; `ValueError` for a name that is not an identifier of C.
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):

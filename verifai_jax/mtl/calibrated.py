@@ -87,7 +87,6 @@ class _Follows(abc.ABC, Generic[Said]):
 
     @abc.abstractmethod
     def _said(self, rows: Rows) -> list[Said]: ...
-
     def start(self) -> Callable[[Mapping[str, Any]], Said]:
         """Return what takes one sample of a run after another, and says something of each."""
         return self._columns.follow(lambda row: self._said(row)[0])
@@ -139,7 +138,6 @@ def predictive_monitor(
     """Learn to predict a violation of a requirement within the next seconds.
 
     **Arguments:**
-
     - `formula`: a requirement; of `always f` the robustness of `f` at each instant is foretold.
     - `traces`: runs of one system on one clock.
     - `horizon`: seconds ahead, a multiple of the sampling period.
@@ -148,7 +146,6 @@ def predictive_monitor(
     - `lags`: samples ago that a prediction sees.
     - `model`: a regressor of scikit-learn's kind; a quadratic function if None.
     - `seed`: the seed of the division into runs that teach and runs that calibrate.
-
     **Raises:** `ValueError` for too few runs without violation; `IntervalError` for a horizon that
     is not a multiple of the sampling period.
     """
@@ -224,13 +221,11 @@ def domain_monitor(
     """Learn which samples were tested, to recognise later ones that are unlike them.
 
     **Arguments:**
-
     - `traces`: the tested runs; for inputs without time, traces of one sample.
     - `signals`: names of those that are compared; all if None.
     - `alpha`: probability of an alarm in a run that is like the tested ones.
     - `lags`: samples ago that are compared too.
     - `seed`: the seed of the division into runs that are compared with and runs that calibrate.
-
     **Raises:** `ValueError` for too few runs, and for a NaN.
     """
     from scipy.spatial import KDTree

@@ -93,7 +93,9 @@ def goals_of(formulas: Iterable[Formula]) -> Goals:
     """Return the goals of a conjunction of these formulas."""
     goals: list[tuple[Formula, ...]] = []
     for formula in formulas:
-        goals.extend(_few(_parts(part, ast.Or), ast.Or, CLAUSES) for part in _conjuncts(formula))
+        goals.extend(
+            _few(_parts(part, ast.Or), ast.Or, CLAUSES) for part in _parts(nnf(formula), ast.And)
+        )
     if len(goals) > GOALS:
         rest = [ast.Or(goal) if len(goal) > 1 else next(iter(goal)) for goal in goals[GOALS - 1 :]]
         goals = [*goals[: GOALS - 1], (ast.conjunction(*rest),)]
@@ -114,10 +116,6 @@ def goals_of(formulas: Iterable[Formula]) -> Goals:
 
 def _name(i: int) -> str:
     return f"leaf {i}"
-
-
-def _conjuncts(formula: Formula) -> list[Formula]:
-    return list(_parts(nnf(formula), ast.And))
 
 
 def _parts(formula: Formula, kind: type[ast.And] | type[ast.Or]) -> tuple[Formula, ...]:

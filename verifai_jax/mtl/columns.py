@@ -39,7 +39,6 @@ def numbers_of(source: str, name: str, column: Any) -> np.ndarray:
     """Return the numbers of an Arrow column, an empty cell as NaN.
 
     **Returns:** `[time]`, or `[time, k]` of a column whose cells are lists of `k` numbers.
-
     **Raises:** `ValueError` for a column without numbers, for one with a text among them, which it
     names with its row, and for lists of different lengths.
     """
@@ -126,7 +125,6 @@ def seconds_of(source: str, name: str, column: Any) -> tuple[np.ndarray, Fractio
 
     **Returns:** the times, and the instant that they are counted from, in seconds since 1970; 0
     for numbers that are seconds already.
-
     **Raises:** `ValueError` as `numbers_of`, and for lists of numbers.
     """
     from pyarrow import types

@@ -16,7 +16,6 @@ from verifai_jax.core.errors import require
 Table: TypeAlias = Any
 """An Arrow table, whose package has no types."""
 Decoder: TypeAlias = Callable[[bytes], Any]
-
 EXTRA = "recordings"
 UNIT = b"unit"
 """Key of Arrow's metadata of a field under which its unit stands."""

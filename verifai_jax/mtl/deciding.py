@@ -33,9 +33,7 @@ def deciding_instant(
     """Find the predicate and the instant that decide the least robustness of formulas on one trace.
 
     **Arguments:**
-
     - `formulas`, `trace`, `end`: as for `robustness`; batches by `jax.vmap`.
-
     **Returns:** the number of the predicate among `leaves_of(formulas)`, and of the sample, 0 and 0
     without one, or if the robustness is not finite. If several decide equally, one of them.
     """

@@ -29,7 +29,6 @@ from verifai_jax.mtl.setting import check_trace
 from verifai_jax.mtl.tree import missing_case, postorder
 
 Values = Float[np.ndarray, " n"]
-
 SNAP = 1e-9
 """Share of the shortest distance of samples within which two times are one: sums of decimals are
 off by some units in the last place, and times that differ on purpose by far more."""
@@ -249,10 +248,8 @@ def dense_robustness(formula: Formula | str, trace: Trace, method: Method = "lin
     """Compute the robustness at the first sample, with all that is between the samples.
 
     **Arguments:**
-
     - `trace`: with samples at any times; its last ones are held for ever.
     - `method`: what a signal is between two samples: `"linear"`, or `"hold"` for its last sample.
-
     **Raises:** `ValueError` for a NaN, for operators that count samples, and for expressions such
     as `x * y` or `sin(x)` of signals that are not held, which are not straight between samples.
     """
@@ -268,7 +265,6 @@ def dense_gradient(
     differences is the slope; at a kink it is the mean of both sides.
 
     **Arguments:**
-
     - `formula`: its text, as for `mine`.
     - `values`: the values of all parameters.
     """

@@ -84,22 +84,19 @@ def distinguish(
     """Find a trace that tells two formulas apart.
 
     **Arguments:**
-
     - `one`, `other`: formulas, or their texts.
     - `signals`: a problem, which is simulated by a search for such a trace; or recordings, of which
       the first that tells them apart is taken; signals that move freely when left out.
     - `end`: what comes after the last sample, `"hold"` or `"truncate"`; of a problem it is its own.
     - `dt`, `duration`: of a free trace, in seconds; they follow from the windows when left out.
     - `budget`, `seed`: simulations of the search, and the seed of everything random in it.
-
     **Returns:** the trace, if one was found; that none was found proves nothing.
-
     **Raises:** `FormulaSyntaxError`; `ValueError` for recordings without the signals, and as
     `falsify` does; `ValueError` for windows that need a clock of too many samples.
     """
     one, other = as_formula(one), as_formula(other)
     if isinstance(signals, Simulated):
-        return lazy_import("verifai_jax.requirements", "distinguish_by_search")(
+        return lazy_import("verifai_jax.analysis.requirements", "distinguish_by_search")(
             one, other, signals, budget, seed
         )
     if signals is None:
@@ -139,7 +136,6 @@ def free_difference(
     """Return a trace of free signals that tells two formulas apart; None if none was found.
 
     **Arguments:**
-
     - `like`: recordings whose values the signals may have too.
     """
     free = FreeTraces.of([one, other], like, dt, duration, end)

@@ -52,7 +52,6 @@ def seconds_held(truth: Any, n: int, dt: float, xp: Any) -> Any:
     """Return the seconds of the last `n` samples in which truth values were above zero.
 
     **Arguments:**
-
     - `truth`: `[time, *lanes]`; what is counted is NaN while one of the values is.
     - `xp`: the module of its arrays, NumPy or `jax.numpy`.
     """

@@ -92,14 +92,12 @@ def examples(
     """Find a trace that satisfies a formula, one that barely does, and one that breaks it.
 
     **Arguments:**
-
     - `formula`: a formula, or its text.
     - `like`: recordings in whose range the signals move; near the bounds of the formula when left
       out.
     - `dt`, `duration`: of the traces, in seconds; they follow from the windows when left out.
     - `end`: what comes after the last sample, `"hold"` or `"truncate"`.
     - `seed`: the seed of the search.
-
     **Raises:** `FormulaSyntaxError`; `ValueError` for windows that need a clock of too many
     samples, and for a formula without signals.
     """

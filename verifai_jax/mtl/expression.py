@@ -169,14 +169,12 @@ class Number(Expression):
 
     @property
     def number(self) -> float:
-        """Its value."""
         return self.value
 
     def __neg__(self) -> "Expression":
         return Number(-self.value)
 
     def text(self, outer: int = 0) -> str:
-        """Return the number, in parentheses if it is negative within an operator."""
         text = _NAMED.get(self.value) or number_text(self.value)
         return f"({text})" if self.value < 0 and outer > 0 else text
 
@@ -196,11 +194,9 @@ class Signal(Expression):
 
     @property
     def is_signal(self) -> bool:
-        """True."""
         return True
 
     def signals(self) -> tuple[str, ...]:
-        """Return its name."""
         return (self.name,)
 
     def text(self, outer: int = 0) -> str:
@@ -299,15 +295,12 @@ class Component(Expression):
 
     @property
     def is_signal(self) -> bool:
-        """True."""
         return True
 
     def signals(self) -> tuple[str, ...]:
-        """Return the name of the vector."""
         return self.vector.signals()
 
     def text(self, outer: int = 0) -> str:
-        """Return the vector with its index in brackets."""
         return f"{self.vector}[{self.index}]"
 
 
@@ -340,12 +333,10 @@ class Arithmetic(Expression):
             object.__setattr__(self, "_constant", value)
 
     def signals(self) -> tuple[str, ...]:
-        """Return the names of the signals in it, in order of appearance."""
         leaves = (part for part in postorder(self) if isinstance(part, Signal))
         return tuple(dict.fromkeys(name for leaf in leaves for name in leaf.signals()))
 
     def text(self, outer: int = 0) -> str:
-        """Return the text, in parentheses if its operator binds weaker than `outer`."""
         if self.name not in PRECEDENCE:
             # Deep arguments take one level of Python's stack each, as short as it can be.
             return f"{self.name}({', '.join(map(methodcaller('text'), self.arguments))})"

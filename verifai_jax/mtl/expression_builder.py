@@ -47,7 +47,6 @@ class ExpressionBuilder:
     """Builder of the expressions and comparisons of one text.
 
     **Arguments:**
-
     - `text`: the text of the formula.
     - `constants`, `known`: numbers and formulas by name.
     - `reads`: whether a text is a formula; by default no text is offered in an error.
@@ -83,7 +82,6 @@ class ExpressionBuilder:
         """Return the part of a message that offers texts: only those that can be read.
 
         **Arguments:**
-
         - `before`: what stands before the offers; nothing is said where none can be read.
         - `within`: a formula that contains the text, for a text that is not a formula itself.
         """

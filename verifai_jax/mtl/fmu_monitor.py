@@ -167,14 +167,11 @@ def export_fmu(
     were set before it.
 
     **Arguments:**
-
     - `dt`: sampling period in seconds; steps of communication have to be multiples of it.
     - `file`: the FMU to write.
     - `semantics`, `every`, `sizes`: as in `export_c`.
-
     **Returns:** the path of the file. It has a binary for this machine where there is a compiler,
     and else the source alone, which the importing tool has to compile.
-
     **Raises:** as `export_c`; `ValueError` for a file whose name does not end in `.fmu`, and for a
     formula that is named as a signal is.
     """

@@ -378,7 +378,6 @@ def build(word: str, operands: Iterable[Formula], interval: Interval = EVERYTHIN
     """Return the formula of an operator over operands.
 
     **Arguments:**
-
     - `word`: the name of the operator, a key of `OPERATORS`.
     - `operands`: as many as the operator takes.
     - `interval`: for an operator that takes one.
@@ -413,7 +412,6 @@ def surface(f: Formula) -> tuple[str, tuple[Formula, ...], Interval | None]:
 
 TRUE = Constant(True)
 """The formula that always holds."""
-
 FALSE = Constant(False)
 """The formula that never holds."""
 

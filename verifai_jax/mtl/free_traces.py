@@ -41,7 +41,6 @@ KEPT, GENERATIONS = 32, 12
 """Traces that each generation of a search goes on from, and generations."""
 MAX_SAMPLES = 20_000
 """Samples of a free trace at most: one of more has a clock much finer than its windows."""
-
 Signals = dict[str, Values]
 
 
@@ -73,10 +72,8 @@ class FreeTraces:
         """Return the free traces that formulas can tell apart.
 
         **Arguments:**
-
         - `like`: recordings whose values are levels too.
         - `dt`, `duration`: in seconds; both follow from the windows when left out.
-
         **Raises:** `ValueError` for windows that need a clock of more than 20 000 samples.
         """
         formulas = with_counted(*formulas)
@@ -136,10 +133,8 @@ class FreeTraces:
         """Find the trace of the greatest score by changing parts of the best ones again and again.
 
         **Arguments:**
-
         - `score`: the score of `[lanes]` traces.
         - `enough`: a score that ends the search.
-
         **Returns:** its signals `[time]`, and its score.
         """
         signals = self.drawn(rng)

@@ -9,11 +9,8 @@ from verifai_jax.mtl.words import ANGLES, NAME, OPERATORS, RESERVED, WORDS
 
 UNARY = tuple(word for word, o in OPERATORS.items() if o.side and o.operands == 1)
 """Temporal operators in front of one operand."""
-
 BINARY = tuple(word for word, o in OPERATORS.items() if o.side and o.operands == 2)
 """Temporal operators between two operands."""
-
-
 _MAX_SHOWN = 400
 """Greatest number of characters of a text that an error shows: a few lines of a terminal."""
 _MAX_REASON = 800

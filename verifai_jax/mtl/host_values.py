@@ -28,7 +28,6 @@ from verifai_jax.mtl.tree import missing_case, postorder
 from verifai_jax.mtl.walk import Walk
 
 Values = Float[np.ndarray, "time *lanes"]
-
 FUNCTIONS: dict[str, Callable[..., Values]] = {
     "neg": np.negative,
     "+": np.add,

@@ -18,7 +18,6 @@ from verifai_jax.mtl.requirements import Requirement
 
 if TYPE_CHECKING:
     import pandas as pd
-
 SHARES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
 SHOWN = 10
 """Rows of each kind that the summary lists."""
@@ -105,9 +104,7 @@ class Judgement(InNotebook):
         """Return how the robustness of each requirement is spread over the recordings.
 
         **Arguments:**
-
         - `shares`: the shares of the recordings, from 0 (the least robustness) to 1 (the greatest).
-
         **Returns:** a row for each requirement: how many recordings have a verdict, how many fail,
         how many have none, and a column for each share, by the recording at that rank.
         """
@@ -138,9 +135,7 @@ class Judgement(InNotebook):
         deviation of normal values. At least five recordings are needed.
 
         **Arguments:**
-
         - `distance`: from which on a row is an outlier.
-
         **Returns:** rows of the table with their `distance`, the greatest first.
 
         Source: B. Iglewicz, D. Hoaglin, "How to Detect and Handle Outliers", ASQC 1993.

@@ -71,7 +71,6 @@ def judge(
     judged is a row without a verdict that says why.
 
     **Arguments:**
-
     - `formulas`: one, a sequence, or a dictionary by identifier; `read_requirements` reads a file.
     - `recordings`: paths of files, of folders (all recordings in and below them), traces or data
       frames: one, a sequence, or a dictionary by name; or a problem, which is simulated.
@@ -83,7 +82,6 @@ def judge(
       process pool must not fork.
     - `ended`: called with the index and the rows of each recording as it ends.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Raises:** `ValueError` for no requirement, no recording, `resample_to` without `method`;
     `FileNotFoundError` for a folder or a file that does not exist.
     """

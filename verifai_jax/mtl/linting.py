@@ -38,7 +38,6 @@ always holds, and one that never does, are suspicious: 2.5 lets a limit of 30 m/
 go from 0 to 10, and finds 120 km/h where they go from 0 to 33 m/s, and degrees for radians."""
 STILL = 0.2
 """Share of the value of a signal that never changes, which stands for the width of its range."""
-
 Check = Iterator["Finding"]
 
 
@@ -52,14 +51,12 @@ def lint(
     """Find parts of formulas that may not say what their author means.
 
     **Arguments:**
-
     - `formulas`: one, a sequence, or a dictionary by identifier; `read_requirements` reads a file.
     - `signals`: recordings (traces, files, folders, tables), or a problem, which is simulated 64
       times. What only data tells is left out without any.
     - `units`: the units of signals by name, in addition to those that recordings and names (`speed
       (m/s)`, `speed_kmh`) have.
     - `end`: what comes after the last sample, `"hold"` or `"truncate"`.
-
     **Raises:** `FormulaSyntaxError`; as `read` for what cannot be read.
     """
     requirements = tuple(r for r in requirements_of(formulas) if r.formula is not None)

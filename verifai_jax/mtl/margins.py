@@ -49,9 +49,7 @@ def margins(plan: Plan, sizes: Mapping[str, int]) -> Margins:
     """Return the margins of a plan's leaves, each with its sign; what they share occurs once.
 
     **Arguments:**
-
     - `sizes`: number of components of the signals whose norm is taken.
-
     **Raises:** `ValueError` for a norm of a signal without a size.
     """
     made = _Builder(plan, sizes)

@@ -118,7 +118,6 @@ def mine(
     Thresholds are exact to the last digit of the data, times to the sample.
 
     **Arguments:**
-
     - `text`: a formula with one or two parameters `?name`, for numbers or ends of intervals.
     - `recordings`: traces, files or tables; or a `Problem`, whose tightest values that a search
       does not break are found, which proves nothing.
@@ -128,7 +127,6 @@ def mine(
     - `confidence`: the confidence of the interval for the rate of recordings that break it.
     - `budget`, `seed`: simulations of the search at most, and its seed, for a problem.
     - `progress`: whether to show one line of progress for a problem; see `core.progress`.
-
     **Raises:** `FormulaSyntaxError`; `ValueError` for more than two parameters, one in which the
     formula is not monotone, or one that nothing bounds or that no value satisfies.
     """
@@ -140,7 +138,7 @@ def mine(
         )
     check_fraction("share", share, one=True)
     if isinstance(recordings, Simulated):
-        return lazy_import("verifai_jax.requirements", "mine_by_search")(
+        return lazy_import("verifai_jax.analysis.requirements", "mine_by_search")(
             template, recordings, budget, seed, confidence, progress
         )
     return mine_template(template, tuple(named_traces(recordings).values()), share, end, confidence)

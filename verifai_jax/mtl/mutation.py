@@ -37,7 +37,6 @@ from verifai_jax.mtl.words import OPERATORS
 
 if TYPE_CHECKING:
     import pandas as pd
-
 OTHER_WORDS = {
     "always": "eventually", "eventually": "always", "historically": "once", "once": "historically",
     "until": "weak_until", "weak_until": "until", "and": "or", "or": "and", "implies": "and",
@@ -47,7 +46,6 @@ OTHER_WORDS = {
 REVERSED = {">": "<", ">=": "<=", "<": ">", "<=": ">=", "==": "!=", "!=": "=="}
 MOVED = 0.1
 """Share by which a bound is moved, either way."""
-
 Change: TypeAlias = tuple[str, str, Formula]
 """A kind of change, what was changed into what, and the formula."""
 
@@ -132,22 +130,16 @@ class Mutants(InNotebook):
 
 
 def mutants(
-    formula: Formula | str,
-    signals: Recordings | None = None,
-    *,
-    end: End = "hold",
-    seed: int = 0,
+    formula: Formula | str, signals: Recordings | None = None, *, end: End = "hold", seed: int = 0
 ) -> Mutants:
     """Change a formula in one point at a time, and see which recordings notice.
 
     **Arguments:**
-
     - `formula`: a formula, or its text.
     - `signals`: recordings (traces, files, folders, tables), or a problem, which is simulated 64
       times. Without any all mutants survive, each with an example of a trace that would kill it.
     - `end`: what comes after the last sample, `"hold"` or `"truncate"`.
     - `seed`: the seed of the free traces that are tried.
-
     **Raises:** `FormulaSyntaxError`; as `read`; `ValueError` for a recording without the signals or
     with gaps where they matter.
     """
@@ -184,7 +176,6 @@ def changes(formula: Formula, dt: float = 0.0) -> Iterator[Change]:
     """Yield the formulas that differ from one in a single point.
 
     **Arguments:**
-
     - `dt`: period in seconds by which a window moves, at least.
     """
     if isinstance(formula, ast.Constant):

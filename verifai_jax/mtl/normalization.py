@@ -26,11 +26,9 @@ def normalize(formula: Formula, scales: Mapping[str, float] | Trace) -> Formula:
     """Divide each predicate of a formula by its scale: the same truth, a relative robustness.
 
     **Arguments:**
-
     - `scales`: a typical magnitude for each signal by name; a predicate takes the greatest of its
       signals among its signals; or a trace, from which each predicate takes the range of its margin
       (1 where that is constant).
-
     **Raises:** `UnknownNameError` for a scale of no signal of the formula, `ValueError` for a
     signal without a scale, or a scale that is not positive and finite.
     """

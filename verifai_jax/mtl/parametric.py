@@ -43,7 +43,6 @@ _WORDS = re.compile(r'"[^"\n]*"|[\[\],:]|\?([A-Za-z_]\w*)')
 _START, _END = 1e-300, 1e300
 """Times of parameters while their values are unknown: multiples of these, below and above any that
 a person writes, so that an interval with one of them and another number ends after it starts."""
-
 _CLOSED = {">": ">=", "<": "<=", "!=": "!="}
 _OPEN = {">=": ">", "<=": "<", "==": "=="}
 
@@ -176,9 +175,7 @@ def read_parametric(
     """Read a formula in which `?name` stands for numbers and for ends of intervals.
 
     **Arguments:**
-
     - `constants`, `definitions`: as of `parse`.
-
     **Raises:** `FormulaSyntaxError` as `parse`; `ValueError` for a name that is both a number and a
     time, or a text without a parameter.
     """
@@ -298,11 +295,9 @@ def templates(words: str = "", domain: str | None = None) -> tuple[Template, ...
     """Return the templates that have all of some words, in the order of the library.
 
     **Arguments:**
-
     - `words`: looked for in all that a template says, whatever their case; all templates when left
       out.
     - `domain`: the domain of the templates; every one when left out.
-
     **Raises:** `UnknownNameError` for a domain without templates.
     """
     library = _library()

@@ -71,7 +71,6 @@ class PythonMachine:
         """Return the results `[steps, formulas]` of further steps without changing the state.
 
         **Arguments:**
-
         - `leaf`: the margin of all leaves from now on, or None to hold what they are.
         """
         before = self._now, list(self.out), self._leaves, self._steps

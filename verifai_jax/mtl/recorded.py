@@ -41,7 +41,7 @@ def named_recordings(source: Recordings) -> Iterator[tuple[str, Recording]]:
     folder without a recording.
     """
     if isinstance(source, Simulated):
-        traces = lazy_import("verifai_jax.requirements", "simulated")(source)
+        traces = lazy_import("verifai_jax.analysis.requirements", "simulated")(source)
         yield from ((f"simulation {index}", trace) for index, trace in enumerate(traces, 1))
         return
     if isinstance(source, Mapping):

@@ -31,8 +31,6 @@ from verifai_jax.mtl.resampling import (
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
 ENDINGS = (".csv", ".parquet", ".npz", ".mcap", ".nc", ".zarr", ".h5", ".hdf5")
 """Endings of files that are recordings."""
 
@@ -75,7 +73,6 @@ def read(
     others have a sample. Resampling with `"hold"` then keeps each signal's own last value.
 
     **Arguments:**
-
     - `source`: the path of a `.csv` (first line: names), `.parquet`, `.npz` (an array is a column),
       `.mcap`, `.nc`, `.h5` or `.hdf5` file, of a `.zarr` store, or of the folder of a LeRobot data
       set; a `pandas.DataFrame`, whose index is read as a column if it has a name; several paths.
@@ -90,7 +87,6 @@ def read(
       value; `"interpolate"`, what is on the line between its neighbours; `"drop"`, the instant is
       left out. A gap stays one when left out.
     - `episode`: number of an episode of a LeRobot data set.
-
     **Raises:** `FileNotFoundError`; `MissingExtra` for a kind of file whose package is not
     installed; `ValueError` for another kind of file, no rows, a column that does not exist or holds
     no numbers, a text among numbers, times that do not increase, or `resample_to` without `method`.
@@ -185,10 +181,7 @@ def _columns(path: Path, table: Table) -> tuple[Columns, dict[str, str]]:
 
 
 def _of_clock(
-    source: str,
-    tables: list[tuple[Columns, dict[str, str]]],
-    clock: str,
-    names: Sequence[str],
+    source: str, tables: list[tuple[Columns, dict[str, str]]], clock: str, names: Sequence[str]
 ) -> tuple[Columns, dict[str, str]]:
     """Return the columns of one of several clocks of a table, its times as `time`."""
     columns = {name: column for table, _ in tables for name, column in table.items()}

@@ -124,10 +124,8 @@ def read_requirements(
     `ReqIF.ForeignID` (the id) and `ReqIF.Text`; others are left out.
 
     **Arguments:**
-
     - `constants`, `definitions`: further names; they come before those of the file.
     - `need_formulas`: whether an entry without a formula is refused.
-
     **Raises:** `FileNotFoundError`; `ValueError` that names the entry for one that is not as it
     should be, and for XML with a document type or entities, which are refused unread.
     """
@@ -168,7 +166,6 @@ def write_requirements(requirements: Iterable[Requirement], path: str | Path) ->
     """Write requirements to a CSV or a ReqIF file, which `read_requirements` reads again.
 
     **Returns:** the path.
-
     **Raises:** `ValueError` for another ending, and for what `read_requirements` would refuse.
     """
     path = Path(path)
@@ -253,14 +250,10 @@ def read_reqif(path: Path, fields: Sequence[str]) -> list[dict[str, object]]:
     """Read the objects of a ReqIF file.
 
     **Arguments:**
-
-    - `path`: the path of the file.
     - `fields`: the fields of a requirement; attributes of other names are left out.
-
     **Returns:** a dictionary of texts for each object that has one of the fields. An object without
     an id has its identifier in the file as one. Its `links` are those that it has, and the targets
     of its relations.
-
     **Raises:** `ValueError` for a file that is not ReqIF, or declares a document type.
     """
     root = read_xml(path.read_bytes(), str(path))
@@ -334,10 +327,8 @@ def reqif_document(
     """Write entries as a ReqIF document: an object each, in one specification.
 
     **Arguments:**
-
     - `entries`: texts by field.
     - `fields`: that an object may have.
-    - `title`: the title of the document.
     """
     now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 

@@ -21,7 +21,6 @@ from verifai_jax.mtl.setting import since_first
 
 Method = Literal["hold", "linear"]
 Missing = Literal["hold", "drop", "interpolate"]
-
 MAX_SAMPLES = 100_000_000
 """Samples that a resampled trace may have: a signal of so many takes 800 MB in double precision."""
 
@@ -35,11 +34,9 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
     last value, and a note says so; `"linear"` leaves a gap.
 
     **Arguments:**
-
     - `trace`: with `times` or another period; NumPy or JAX arrays, not under `jit`.
     - `dt`: the new sampling period in seconds.
     - `method`: `"hold"` keeps each value until the next sample; `"linear"` interpolates.
-
     **Raises:** `ValueError` for a period that is not positive or makes more than 100 million
     samples, an unknown method, or sample times that do not increase or are not finite.
     """
@@ -66,7 +63,6 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
     cell = np.searchsorted(clock, elapsed + tolerance, side="right") - 1
     on_clock = np.abs(clock[cell] - elapsed) <= tolerance
     passed = np.flatnonzero(~((index[cell] == np.arange(len(elapsed))) & on_clock))
-
     signals, inner, notes = {}, {}, dict(trace.notes)
     for name, recorded in trace.signals.items():
         values = np.asarray(recorded)
@@ -181,9 +177,7 @@ def joined(
     """Return the instants of several clocks in one order, and columns with gaps at those of others.
 
     **Arguments:**
-
     - `stamps`: times of each clock in seconds, and the instant that they are counted from.
-    - `parts`: the columns of each clock.
     """
     origin = min(start for _, start in stamps)
     clocks = [seconds + float(start - origin) for seconds, start in stamps]

@@ -22,9 +22,7 @@ Bound = Literal["none", "lower", "upper"]
 
 
 @partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["tau"],
-    meta_fields=["kind", "error", "bound"],
+    jax.tree_util.register_dataclass, data_fields=["tau"], meta_fields=["kind", "error", "bound"]
 )
 @dataclass(frozen=True)
 class Semantics:
@@ -32,7 +30,6 @@ class Semantics:
 
     # JAX rebuilds the class with placeholders, which are no numbers.
     __no_type_check__ = True
-
     kind: Kind
     tau: Array | float | None = None
     error: float | None = None
@@ -41,7 +38,6 @@ class Semantics:
 
 #: Quantitative semantics by min and max: positive where the formula holds, negative where not.
 hard = Semantics("hard")
-
 #: +1 where the formula holds, -1 where not, NaN where a signal is NaN. At robustness 0 the
 #: comparison decides: `>=` holds, `>` does not.
 boolean = Semantics("boolean")
@@ -56,14 +52,12 @@ def smooth(
     """Return quantitative semantics by log-sum-exp, differentiable everywhere.
 
     **Arguments:**
-
     - `tau`: temperature, positive, in the unit of the predicates; may be traced. As it tends to 0
       the value tends to the hard one. It is not itself differentiated.
     - `error`: instead of `tau`, the greatest distance from the hard value that is acceptable; the
       temperature follows from the certificate (see `certificate`).
     - `bound`: shift the value by the certificate so that it never exceeds the hard one (`"lower"`),
       never falls below it (`"upper"`), or leave it (`"none"`). The gradient is the same.
-
     **Raises:** `ValueError` unless exactly one of `tau` and `error` is given and positive.
     """
     if (tau is None) == (error is None):
@@ -81,11 +75,9 @@ def compared(comparison: str, left: Any, right: Any, boolean: bool, xp: ModuleTy
     """Compute the value of a comparison between arrays.
 
     **Arguments:**
-
     - `left`, `right`: arrays that broadcast, or numbers.
     - `boolean`: whether the value is +1 where it holds and -1 where not, or else the margin.
     - `xp`: `jax.numpy`, or `numpy` on the host.
-
     **Returns:** the value, NaN where the margin is.
     """
     match comparison:

@@ -21,7 +21,6 @@ from jax import lax
 from jaxtyping import Array, Float, Shaped
 
 NEVER = 1e30  # Stands for infinity in smooth arithmetic, where inf - inf would be NaN.
-
 Series = Float[Array, "time *lanes"]
 Number = Array | float
 Each = Array | np.ndarray  # One entry a sample: NumPy outside of a scan, JAX within.
@@ -231,7 +230,6 @@ windowed_smooth.defvjp(_windowed_smooth_forward, _windowed_smooth_backward)
 
 Residuals = tuple[Array | None, Array | None, Any, Array | float | None]
 """Both arguments of until (None for hard semantics), what to keep of each step, the temperature."""
-
 SmoothResiduals = tuple[Array, Array, Array, Number]
 """The same at a temperature."""
 

@@ -73,10 +73,7 @@ def as_formula(formula: Formula | str) -> Formula:
 
 
 def check_trace(trace: object) -> None:
-    """Refuse anything that is not a trace, and say how to make one of it.
-
-    **Raises:** `TypeError`.
-    """
+    """Refuse anything that is not a trace, and say how to make one of it."""
     if isinstance(trace, Trace):
         return
     if hasattr(trace, "columns"):
@@ -217,7 +214,6 @@ def plain_period(dt: float, error: float) -> float:
     Stamps are rounded, and so 0.1 s comes as 0.09999 s, and a thirtieth as 0.033333334 s.
 
     **Arguments:**
-
     - `error`: seconds by which `dt` may be off.
     """
     error = max(error, 1e-9 * dt)

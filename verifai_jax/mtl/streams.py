@@ -107,11 +107,9 @@ def streams(
     """Lay out the operations of one formula or several; what they have in common occurs once.
 
     **Arguments:**
-
     - `dt`: sampling period in seconds.
     - `semantics`: `hard` or `boolean`.
     - `every`: whether each formula is asked at every instant, or at time 0.
-
     **Raises:** `IntervalError` for an interval that is not a multiple of `dt`; `ValueError` for no
     formula, smooth semantics, a period that is not positive, and what no bounded memory can follow.
     """

@@ -27,7 +27,6 @@ def missing_case(walk: str, node: object) -> MissingCaseError:
     """Return the error for a node that a walk over a formula has no case for.
 
     **Arguments:**
-
     - `walk`: what the walk gives, such as `"the horizon"`.
     - `node`: the node; its own text is not asked for, since that is a walk, too.
     """
@@ -182,10 +181,8 @@ class Tree(Node):
 
     word: ClassVar[str] = ""
     """Its operator, a key of `OPERATORS`; none for a leaf."""
-
     timeless: ClassVar[bool] = False
     """True for a kind of node that itself looks at the instant alone."""
-
     interval: Interval
     """The interval of an operator that takes one."""
 
@@ -207,7 +204,6 @@ class Tree(Node):
         are not subtracted, which keeps the bound simple).
 
         **Arguments:**
-
         - `dt`: sampling period in seconds, by which `next` looks ahead.
         """
         return self._total_reach(dt, "ahead")
@@ -216,7 +212,6 @@ class Tree(Node):
         """Return the seconds of trace before an instant on which its truth there depends.
 
         **Arguments:**
-
         - `dt`: sampling period in seconds, by which `prev` looks back.
         """
         return self._total_reach(dt, "back")
@@ -235,7 +230,6 @@ class Tree(Node):
         Unbounded windows end with the trace and do not count.
 
         **Arguments:**
-
         - `dt`: sampling period in seconds, by which `next` looks ahead.
         - `start`: instant at which the formula is asked, in seconds.
         """
@@ -249,7 +243,6 @@ class Tree(Node):
         seconds.
 
         **Arguments:**
-
         - `dt`: sampling period in seconds, by which `next` and `prev` look.
         """
         spans: dict[Tree, tuple[float, float]] = {self: (0.0, 0.0)}
@@ -297,7 +290,6 @@ class Tree(Node):
         looks.
 
         **Arguments:**
-
         - `dt`: sampling period in seconds, by which `next` and `prev` look.
         """
         if not self.side:

@@ -53,7 +53,6 @@ def unit_of(e: Term, units: Mapping[str, str], faults: list[str]) -> str | None:
     That of `2 * speed` is unknown, too, since the number may stand for seconds.
 
     **Arguments:**
-
     - `faults`: gets a sentence on each two units that are added, and on a sine of degrees.
     """
     match e:

@@ -32,7 +32,6 @@ from verifai_jax.mtl.streams import Plan, streams
 R = TypeVar("R")
 Numbers: TypeAlias = Sequence[float] | np.ndarray | ctypes.Array[ctypes.c_double]
 """One number a formula."""
-
 FLAGS = ("-x", "c", "-std=c99", "-O2", "-ffp-contract=off")
 """Not contracted: a product and a sum in one operation are rounded once, and NumPy rounds twice."""
 LIBRARY = r"""
@@ -138,7 +137,6 @@ class Watch(Generic[R]):
         **Returns:** the robustness at time 0 if all stayed as it is now, or with `every` that at
         the newest instant that is decided, `delays` samples ago; NaN until the first one is
         decided.
-
         **Raises:** `UnknownNameError` for a signal that the sample lacks.
         """
         try:
@@ -155,7 +153,6 @@ class Watch(Generic[R]):
         """Take in many samples, `[time]` (or `[time, k]`) by signal name.
 
         **Returns:** what `step` would, sample by sample; a column a formula if there are several.
-
         **Raises:** `UnknownNameError` for a signal that is missing; `ValueError` for signals of
         several lengths.
         """
@@ -254,15 +251,12 @@ def watch(
     `sin`, `cos`, `exp` and powers.
 
     **Arguments:**
-
     - `semantics`: `hard`, or `boolean`, by which the value is 1 where a formula holds and -1 where
       it does not.
     - `every`: whether each formula is asked at every instant, or at time 0. With it no formula may
       look ahead without end.
     - `sizes`: number of components of each signal whose norm the formulas take.
-
     **Returns:** a monitor; its results are numbers, or dictionaries for several formulas.
-
     **Raises:** `IntervalError` for an interval that is not a multiple of `dt`; `ValueError` for
     smooth semantics, for what looks ahead without end within another temporal operator, and for a
     norm without a size.

@@ -15,15 +15,12 @@ from typing import Literal, NamedTuple
 
 NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
 """Names of signals, constants and definitions that need no quotes."""
-
 FUNCTIONS = {
     "abs": 1, "sqrt": 1, "sin": 1, "cos": 1, "exp": 1, "norm": 1, "min": 2, "max": 2
 }  # fmt: skip
 """Functions of expressions, with the smallest number of their arguments."""
-
 NUMBERS = {"pi": math.pi}
 """Numbers that a text may name without defining them; a signal of that name stands in quotes."""
-
 ANGLES = {"deg": math.pi / 180, "rad": 1.0}
 """Units that may follow a number in an expression, in rad."""
 
@@ -144,14 +141,12 @@ OPERATORS: dict[str, Operator] = {
 }  # fmt: skip
 """Every operator by its word: the one table that parsing, printing, rewriting, horizons, LaTeX and
 English read."""
-
 WORDS: dict[str, tuple[str, ...]] = {
     **{word: operator.words for word, operator in OPERATORS.items()},
     "TRUE": ("TRUE", "True", "true"),
     "FALSE": ("FALSE", "False", "false"),
 }
 """Every word and symbol of the text grammar, by the operator or constant it stands for."""
-
 RESERVED = frozenset(w for words in WORDS.values() for w in words if NAME.fullmatch(w))
 """Words that a signal's name can only be in quotes."""
 
@@ -189,7 +184,6 @@ def operator_text(word: str, interval: str, operands: Sequence[Text]) -> Text:
     """Return the text of an operator over operands.
 
     **Arguments:**
-
     - `word`: operator, a key of `OPERATORS`.
     - `interval`: text of its interval; empty if it has none.
     - `operands`: text of its operands.

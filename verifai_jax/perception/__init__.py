@@ -1,7 +1,7 @@
 """A differentiable camera, and small networks that look through it.
 
-`abstract` falsifies a loop with such a network compositionally. It stands on `vj.falsify`, so it
-lies in the room `compositional`, above this one, and is imported when it is first used.
+`abstract` falsifies a loop with such a network compositionally. It stands on `vj.falsify`, so its
+folder, `compositional`, is imported when it is first used.
 """
 
 from typing import Any
@@ -31,7 +31,6 @@ __all__ = [
     "load_detector", "losses_of", "mujoco_camera", "mujoco_scene", "save_detector", "score",
     "train_detector",
 ]  # fmt: skip
-
 # Given by `__getattr__`.
 Compositional: Any
 abstract: Any
@@ -39,7 +38,7 @@ abstract: Any
 
 def __getattr__(name: str) -> Any:
     if name in ("Compositional", "abstract"):
-        return lazy_import("verifai_jax.compositional", name)
+        return lazy_import("verifai_jax.perception.compositional", name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

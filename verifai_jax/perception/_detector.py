@@ -132,14 +132,12 @@ def detector(
     """Return a detector with random weights (He et al., "Delving deep into rectifiers", 2015).
 
     **Arguments:**
-
     - `key`: the key of the weights.
     - `shape`: height and width of the images.
     - `kinds`: number of kinds of objects to tell apart.
     - `values`: numbers to estimate of an object.
     - `channels`: the channels of the convolutions, each of which halves the image.
     - `hidden`: units of the dense layers.
-
     **Raises:** `ValueError` for images that are smaller than the convolutions make of them.
     """
     height, width = shape

@@ -19,15 +19,10 @@ from jaxtyping import Array, Float, PyTree
 
 Number: TypeAlias = PyTree
 """A number, or an array `[]`, which may be traced."""
-
 Vector: TypeAlias = PyTree
 """Three numbers, or an array `[3]`, which may be traced."""
-
 TINY = 1e-12
-
 Tree = TypeVar("Tree")
-
-
 Description = TypeVar("Description")
 
 
@@ -175,7 +170,6 @@ class Camera:
     """A pinhole camera.
 
     **Arguments:**
-
     - `height`, `width`: pixels of the image.
     - `field_of_view`: horizontal angle of view in rad.
     - `position`: the position of the eye, in m.

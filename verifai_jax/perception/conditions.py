@@ -16,7 +16,6 @@ from verifai_jax.perception.camera import Number, Vector, described, vector
 
 LUMINANCE = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in ITU-R BT.601."""
-
 DROPS = 24
 SPOTS = 12
 
@@ -76,7 +75,6 @@ def taken(
     """Return the image that a sensor behind a lens gives of `image`, in [0, 1].
 
     **Arguments:**
-
     - `image`: colours of the scene.
     - `conditions`: fog apart, which is part of the scene.
     - `key`: the key of what is drawn anew for each frame: noise and rain.

@@ -30,9 +30,7 @@ from verifai_jax.perception.camera import (
 
 Position: TypeAlias = PyTree
 """Two numbers, x and y in m, or an array `[2]`."""
-
 WHITE: Vector = (0.9, 0.9, 0.9)
-
 NEAREST_FALL = 1e-4
 """Rays that fall less than this meet the ground behind everything."""
 

@@ -24,7 +24,6 @@ from verifai_jax.perception.solids import Box, Cylinder, Solid, Sphere
 
 PLANE, SPHERE, CAPSULE, CYLINDER, BOX = 0, 2, 3, 5, 6
 """Values of `mjtGeom`."""
-
 NAMES = {1: "hfield", 4: "ellipsoid", 7: "mesh", 8: "sdf"}
 """Geoms that cannot be drawn."""
 
@@ -40,7 +39,6 @@ class Model(Protocol):
     ngeom: int
 
     def geom(self, number: int) -> object: ...
-
     def camera(self, number: int) -> object: ...
 
 

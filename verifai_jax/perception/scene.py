@@ -62,14 +62,11 @@ class Scene:
         """Return the image that a camera takes.
 
         **Arguments:**
-
         - `camera`: its pose must be above the ground.
         - `conditions`: weather, lens and sensor; None is a clear day and a perfect camera.
         - `key`: the key of what differs from frame to frame (noise, rain).
         - `lens`: the key of what stays (dirt, dead pixels).
-
         **Returns:** red, green and blue in [0, 1].
-
         **Raises:** `ValueError` that names what does not fit.
         """
         conditions = check_scene(self, camera, conditions)
@@ -139,8 +136,7 @@ class Scene:
         below = _below_horizon(rays)
         return [
             jnp.broadcast_to(
-                sky[k] + (in_fog(conditions, k, ground[k] * light, through) - sky[k]) * below,
-                shape,
+                sky[k] + (in_fog(conditions, k, ground[k] * light, through) - sky[k]) * below, shape
             )
             for k in range(3)
         ]

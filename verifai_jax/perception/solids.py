@@ -31,7 +31,6 @@ from verifai_jax.perception.light import Sun
 
 FAR = 1e4
 """Pixels, or metres, beyond everything."""
-
 GREY: Vector = (0.5, 0.5, 0.5)
 
 
@@ -161,7 +160,6 @@ def _boxes(rays: Rays, boxes: Sequence[Box], sun: Sun, shadows: bool) -> Look:
     seen = jnp.stack([eye < -half, eye > half])  # faces that the eye sees: [sign, boxes, axis]
     along = jnp.stack([axes[:, axis] for axis, _, _ in _EDGES])  # [edge, boxes, 3]
     middle = jnp.stack([_edge_middle(centre, axes, half, edge) for edge in _EDGES])
-
     normal = jnp.cross(middle - rays.eye, along)
     outline = _within(rays, _oriented(normal, centre - rays.eye), seen)
     narrow = 2 * (jnp.sum(half, -1) - jnp.max(half, -1) - jnp.min(half, -1))
@@ -266,7 +264,6 @@ def _frusta(
     frame = _frame(axis)
     shape = _Frusta(base, frame, radius, height, radius if pointed else 0.0 * radius, pointed)
     eye = jnp.sum(frame * (rays.eye - base)[:, None], -1)  # in the solid's frame
-
     across = (height * radius - shape.taper * eye[:, 2]) / height
     cover = _between_ends(rays, shape, eye[:, :2], across, None)
     foot = jnp.asarray([0.0, 0.0, 1.0]) * height[:, None]

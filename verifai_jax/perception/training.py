@@ -54,7 +54,6 @@ def train_detector(
     CPUs. Rows are drawn without replacement, epoch by epoch.
 
     **Arguments:**
-
     - `images`: colours in [0, 1].
     - `labels`: the labels of each image.
     - `network`: one to go on from; None begins anew, with the layers that `detector` chooses.
@@ -63,9 +62,7 @@ def train_detector(
     - `noise`: standard deviation of what is added to each pixel, anew in each step.
     - `seed`: the seed of the weights, the order of the images and the noise.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Returns:** the network, and the loss of each step.
-
     **Raises:** `ValueError` where images and labels do not fit.
     """
     images = jnp.asarray(images, jnp.float32)
@@ -207,7 +204,6 @@ def score(
     """Compare a detector's output with the truth.
 
     **Arguments:**
-
     - `tolerance`: absolute error of a value above which it counts as wrong.
     """
     labels = _checked(jnp.asarray(images), labels)

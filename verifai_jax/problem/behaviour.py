@@ -46,12 +46,10 @@ class Behaviour:
     """Numbers of what a trace shows.
 
     **Arguments:**
-
     - `cells`: signal -> `(low, high, cells)`: it is cut into so many equally wide cells. The cells
       of all signals together that a trace visits are what it shows.
     - `formulas`: the formulas of which the clause nearest to breaking is shown too; none when left
       out.
-
     **Raises:** `ValueError` for a signal without a range, or too many cells together.
     """
 

@@ -27,15 +27,7 @@ import jax.numpy as jnp
 from jax.interpreters import ad
 from jaxtyping import Array, Key, PyTree
 
-from verifai_jax.core.fingerprint import (
-    as_function,
-    describe_step,
-    of_some,
-    operands_of_scan,
-    programs_in,
-    used_inputs,
-    without_unused,
-)
+from verifai_jax.core import fingerprint
 from verifai_jax.core.jaxprs import CALLS, called
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import Slot
@@ -55,10 +47,8 @@ class Slopes(NamedTuple):
 
 DEPENDENCE: Slot[None, Slopes] = Slot("dependence")
 """How the robustness of a problem depends on the features."""
-
 KEY: Slot[None, bool] = Slot("dependence on the key")
 """Whether the verdict of a simulation depends on its random key."""
-
 _FLAT = frozenset({"ceil", "floor", "nextafter", "round", "sign", "stop_gradient"})
 """Steps with real results whose derivative is zero."""
 
@@ -103,7 +93,7 @@ def _uses_key(problem: Problem) -> bool:
         return signals, trace.valid, trace.status
 
     key = jax.eval_shape(lambda: jax.random.key(0))
-    return used_inputs(jax.make_jaxpr(judged)(key, features))[0]
+    return fingerprint.used_inputs(jax.make_jaxpr(judged)(key, features))[0]
 
 
 @truncate_silently()
@@ -122,7 +112,7 @@ def _depends(problem: Problem) -> Slopes:
     numbers = jax.tree.unflatten(jax.tree.structure(trace), range(count))
     signals = {name: numbers.signals[name] for name in problem.monitored}
     judged = set(jax.tree.leaves((signals, numbers.valid, numbers.status)))
-    read = without_unused(program.jaxpr, [number in judged for number in range(count)])
+    read = fingerprint.without_unused(program.jaxpr, [number in judged for number in range(count)])
     reached = sweep(read, [*moved, *of_key])
     found = dict(zip(sorted(judged), reached, strict=True))
     depends = any(found[number] for number in jax.tree.leaves(signals))
@@ -152,7 +142,7 @@ class _Sweep:
         if name in CALLS:
             return self(_program(called(step)), moved)
         if name == "scan":
-            constants, carried = operands_of_scan(options)
+            constants, carried = fingerprint.operands_of_scan(options)
             fixed, carry = moved[:constants], moved[constants : constants + carried]
             rows = moved[constants + carried :]
             return self.repeated(_program(options["jaxpr"]), fixed, carry, rows)
@@ -163,7 +153,7 @@ class _Sweep:
         if name == "cond":
             branches = [self(_program(each), moved[1:]) for each in options["branches"]]
             return [any(each) for each in zip(*branches, strict=True)]
-        if name.startswith("scatter") or (_is_of_jax(step) and not programs_in(step)):
+        if name.startswith("scatter") or (_is_of_jax(step) and not fingerprint.programs_in(step)):
             return [name not in _FLAT] * len(step.outvars)
         return self.differentiated(program, step, moved)
 
@@ -171,21 +161,21 @@ class _Sweep:
         self, program: jax.extend.core.Jaxpr, step: Any, moved: list[bool]
     ) -> list[bool]:
         """Return the same from the derivative of the step along a direction."""
-        call, inputs = as_function(program, step)
+        call, inputs = fingerprint.as_function(program, step)
         pairs = zip(step.invars, moved, strict=True)
         moving = {each for each, moves in pairs if moves and _is_real(each)}
         indices = [i for i, each in enumerate(inputs) if each in moving]
         forms = [jax.ShapeDtypeStruct(each.aval.shape, each.aval.dtype) for each in inputs]
 
         def along(values: list[Array], direction: list[Array]) -> list[Any]:
-            function = of_some(call, values, indices)
+            function = fingerprint.of_some(call, values, indices)
             return jax.jvp(function, [values[i] for i in indices], direction)[1]
 
         try:
             derivative = jax.make_jaxpr(along)(forms, [forms[i] for i in indices]).jaxpr
         except Exception:
             # JAX says by errors of many kinds that there is none, each operation by its own.
-            self.lacking.setdefault(describe_step(step))
+            self.lacking.setdefault(fingerprint.describe_step(step))
             return [False] * len(step.outvars)
         # All that it is computed from in any way: the derivative is linear in the direction.
         reached = set(derivative.invars[len(inputs) :])

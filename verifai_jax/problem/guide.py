@@ -38,13 +38,11 @@ class Guide:
     property it receives the robustness.
 
     **Arguments:**
-
     - `term`: a formula or its text, whose robustness is used, or a function of the trace and
       the features, pure and traceable by JAX, also for a black box; less is nearer to a failure.
     - `weight`: the weight of the term, above 0; with 1 the robustness of safe simulations says
       nothing.
     - `scale`: the size of values of the term that matters, in its unit.
-
     **Raises:** `TypeError` for a term that is neither; `ValueError` for a formula that does not
     parse, or numbers out of range.
     """
@@ -99,7 +97,6 @@ class Guide:
         """Return what a search receives instead; failures, and rows without a verdict, as they are.
 
         **Arguments:**
-
         - `observed`: the robustness, or what a search receives otherwise.
         - `value`: the value of the term.
         """

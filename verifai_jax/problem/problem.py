@@ -55,7 +55,6 @@ class Problem(InNotebook):
     """A feature space, a system and the properties it must keep, under a name.
 
     **Arguments:**
-
     - `name`: how the command line and the report call it.
     - `space`: a `FeatureSpace`, or a dictionary of domains.
     - `system`: any function `(features, key) -> Trace`, pure and traceable by JAX, or a `System`;
@@ -90,7 +89,6 @@ class Problem(InNotebook):
         "black_box", "draws", "form", "made_in", "monitored", "on_backend",
         "programs", "requirement_entries", "sources",
     ))  # fmt: skip
-
     name: str
     space: FeatureSpace
     system: System
@@ -183,7 +181,6 @@ class Problem(InNotebook):
         """Return the files that make the problem, with their hashes, and versions.
 
         **Arguments:**
-
         - `first`: the row of a table from which on that holds.
         """
         return sources_of(self, made=self.made_in or (), first=first)
@@ -240,13 +237,11 @@ class Problem(InNotebook):
         """Return the same problem with faults of its sensors and actuators among its features.
 
         **Arguments:**
-
         - `faults`: the faults of `vj.faults`, in the order in which those of one channel apply.
           The numbers of a fault that vary are a feature with the name of the fault; its nominal
           value is the weakest, shortest and latest fault.
         - `by_simulator`: whether the simulator applies them itself, as `vj.faults.on_host` helps
           it to; for `remote`, and for a `blackbox` of one's own.
-
         **Raises:** `UnknownNameError` for a channel that the system does not have, with the nearest
         one; `ValueError` for a name that exists already, a fault that a channel cannot have, and
         a system whose loop is not known.
@@ -267,17 +262,14 @@ class Problem(InNotebook):
         cube; `jax.vmap` and `jax.jit` work as usual.
 
         **Arguments:**
-
         - `semantics`: `mtl.hard`, the margin of the verdict, or `mtl.smooth(temperature)`.
         - `of`: what it is a function of: `"unit"`, a point `[dim]` of the unit cube, or
           `"features"`, a dictionary by name.
         - `key`: random key of the simulation; `jax.random.key(0)` when left out.
         - `formula`: name of the one formula to evaluate; the least over all when left out.
-
         **Returns:** a function `(point, key=key)` to a scalar: positive where the property holds,
         NaN where the simulation has no verdict. Whether a point lies in its domains, and keeps the
         constraint of the space, is not checked.
-
         **Raises:** `ProblemError` for a system that JAX does not trace; `UnknownNameError` for an
         `of` or a formula that does not exist; what `check` raises.
         """
@@ -403,7 +395,6 @@ class Problem(InNotebook):
 
 FORM: Slot[None, Trace | None] = Slot("form")
 """The form of the traces of a problem's system."""
-
 BACKENDS: Slot[str, Problem] = Slot("backends")
 """The same problem on each backend of its system."""
 

@@ -23,7 +23,6 @@ from verifai_jax.core.errors import check_names
 
 Violation: TypeAlias = Sequence[float] | Shaped[np.ndarray, " k"]
 """By how much a row breaks each rule: numbers, 0 where a rule is kept, or truth values."""
-
 MAX_RULES = 30
 """Rules at most: beyond, a lexicographic number would not be exact."""
 

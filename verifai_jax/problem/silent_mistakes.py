@@ -28,23 +28,16 @@ from verifai_jax.systems.base import System
 
 PATIENCE = 1.0
 """Seconds of a first tracing above which there is no second one."""
-
 END_OF_TRACE = {
     "hold": "its last sample is taken for all that comes after",
     "truncate": "what comes after is left out",
 }
-
 COMPARED = ". A Categorical of texts has the place of the choice as its value, which no text equals"
 """Advice on a choice that seems to be read: a comparison with a text is false, silently."""
-
 MISTAKES: Slot[None, tuple[str, ...]] = Slot("silent mistakes")
 """Sentences on a problem."""
-
-
 SECONDS: Slot[None, float] = Slot("seconds of tracing")
 """Seconds that one tracing of a problem's system takes."""
-
-
 Program: TypeAlias = Any
 """A program with its constants, or one inside an operation, whose constants are operands of it."""
 

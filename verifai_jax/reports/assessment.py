@@ -45,11 +45,7 @@ STEPS = (
         (),
         "How good must each kind of evidence be for this risk, as set before the simulations?",
     ),
-    (
-        "Adequacy, before",
-        (),
-        "Would evidence that reaches these goals be enough for the decision?",
-    ),
+    ("Adequacy, before", (), "Would evidence that reaches these goals be enough for the decision?"),
     (
         "Generation of the evidence",
         ("found", "limits", "reproduce"),
@@ -104,8 +100,6 @@ def claims_tree(subject: str, headline: str, claims: Sequence[Mapping[str, Any]]
     """Draw the tree: the headline, the strategy, and a row for each claim.
 
     **Arguments:**
-
-    - `subject`: what the claims are about, the context.
     - `headline`: the goal at the root.
     - `claims`: as plain data.
     """

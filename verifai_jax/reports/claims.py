@@ -36,9 +36,6 @@ def claims_json(
     """Describe claims as plain data.
 
     **Arguments:**
-
-    - `subject`: what the claims are about.
-    - `claims`: the claims.
     - `chain`: last hash of the chain over all inputs of the report.
     - `about`: what `vj.trace_matrix` compares with what there is later, see `about_json`.
     """
@@ -61,7 +58,6 @@ def about_json(
     """Describe what claims are about as plain data.
 
     **Arguments:**
-
     - `result`: `"run"` or `"estimate"`.
     - `formulas`: their texts by name.
     - `requirements`: what they stand for, by name.

@@ -7,8 +7,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from verifai_jax.falsification.fuzzing.run import FuzzRun
 from verifai_jax.falsification.run import Run
-from verifai_jax.fuzzing.run import FuzzRun
 from verifai_jax.reports.provenance import shown_folder
 from verifai_jax.search import named
 

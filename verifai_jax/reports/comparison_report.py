@@ -1,23 +1,15 @@
 """The report on a comparison: which candidate fails more often, by how much, and where."""
 
-from verifai_jax.comparison.result import BETTER, SAME, WORSE, Comparison
 from verifai_jax.core.text import format_percent
+from verifai_jax.estimation.comparison.result import BETTER, SAME, WORSE, Comparison
 from verifai_jax.features.english import number
 from verifai_jax.problem.problem import Problem
-from verifai_jax.reports.claims import Claim, claims_json
-from verifai_jax.reports.markup import Markup, bullets, element, paragraph, preformatted, table
-from verifai_jax.reports.page import Page, Section
-from verifai_jax.reports.provenance import Model, chained
+from verifai_jax.reports.claims import Claim
+from verifai_jax.reports.markup import Markup, element, paragraph, preformatted, table
+from verifai_jax.reports.page import Page
+from verifai_jax.reports.provenance import Model
 from verifai_jax.reports.run_question import About, space_table
-from verifai_jax.reports.sections import (
-    MODEL,
-    answers_section,
-    claims_section,
-    model_answer,
-    model_warnings,
-    problem_content,
-    provenance_content,
-)
+from verifai_jax.reports.sections import MODEL, problem_content, result_page
 
 PAIRED = (
     "Both sides of a pair have the same features, drawn independently from the prior, and the same "
@@ -32,14 +24,10 @@ def comparison_page(comparison: Comparison, about: About, problem: Problem | Non
     """Make the report on a comparison.
 
     **Arguments:**
-
-    - `comparison`: the comparison.
-    - `about`: units and reasons of the features.
     - `problem`: the baseline; None if it is not at hand.
     """
     # That of one side says nothing of the files of the others.
     model = Model.of(comparison.sources.values())
-    links = tuple(chained(model.inputs))
     first = comparison.candidates[0]
     sure = format_percent(1 - len(comparison.candidates) * (1 - first.rates.confidence))
     headline = (
@@ -76,62 +64,39 @@ def comparison_page(comparison: Comparison, about: About, problem: Problem | Non
         f"vj.compare(baseline, candidates, margin={first.margin}, seed={comparison.seed}, "
         f"budget={comparison.simulations})"
     )
-    sections = (
-        answers_section(
-            [
-                ("What was claimed?", headline, "claims"),
-                ("What was varied, and what was the prior?", "see the table", "asked"),
-                ("How many simulations were there?", f"{comparison.simulations:,}", "found"),
-                ("How many pairs had no two verdicts?", f"{without:,}", "limits"),
-                ("Which assumption is under the intervals?", PAIRED, "limits"),
-                ("With which seed?", str(comparison.seed), "reproduce"),
-                model_answer(model),
-            ]
-        ),
-        Section(
-            "asked",
-            "What was asked",
-            (
-                paragraph(
-                    f"Whether a candidate fails more often than {comparison.baseline}, by more "
-                    f"than {100 * first.margin:zg} points."
-                ),
-                *([asked] if problem is None else problem_content(problem, about)),
+    return result_page(
+        comparison.baseline,
+        "evidence report on a comparison",
+        headline,
+        {WORSE: "fails", BETTER: "holds", SAME: "holds"}.get(comparison.verdict, "open"),
+        claims,
+        model,
+        answers=[
+            ("What was varied, and what was the prior?", "see the table", "asked"),
+            ("How many simulations were there?", f"{comparison.simulations:,}", "found"),
+            ("How many pairs had no two verdicts?", f"{without:,}", "limits"),
+            ("Which assumption is under the intervals?", PAIRED, "limits"),
+            ("With which seed?", str(comparison.seed), "reproduce"),
+        ],
+        asked=[
+            paragraph(
+                f"Whether a candidate fails more often than {comparison.baseline}, by more "
+                f"than {100 * first.margin:zg} points."
             ),
-        ),
-        Section("found", "What was found", (table(heads, rows), *_pairs(comparison))),
-        Section(
-            "limits",
-            "What was not shown",
-            (
-                bullets(
-                    [
-                        f"In {without:,} pairs a side has no verdict: they widen the intervals in "
-                        "both directions.",
-                        "Single failures were not replayed more closely.",
-                        f"Sampling was ended by: {comparison.stopped}.",
-                        MODEL,
-                        PAIRED,
-                        *comparison.notes,
-                    ]
-                ),
-            ),
-        ),
-        claims_section(claims),
-        Section(
-            "reproduce",
-            "How to reproduce it",
-            (preformatted(python), *provenance_content(links, model)),
-        ),
-    )
-    tones = {WORSE: "fails", BETTER: "holds", SAME: "holds"}
-    return Page(
-        title=f"{comparison.baseline}: evidence report on a comparison",
-        headline=headline,
-        tone=tones.get(comparison.verdict, "open"),
-        sections=sections,
-        claims=claims_json(comparison.baseline, claims, links[-1].chain if links else ""),
-        warnings=model_warnings(model._replace(parts=model.parts[:1])),
+            *([asked] if problem is None else problem_content(problem, about)),
+        ],
+        found=[table(heads, rows), *_pairs(comparison)],
+        limits=[
+            f"In {without:,} pairs a side has no verdict: they widen the intervals in both "
+            "directions.",
+            "Single failures were not replayed more closely.",
+            f"Sampling was ended by: {comparison.stopped}.",
+            MODEL,
+            PAIRED,
+            *comparison.notes,
+        ],
+        reproduce=[preformatted(python)],
+        warned=model._replace(parts=model.parts[:1]),
     )
 
 

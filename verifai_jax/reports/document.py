@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from verifai_jax.analysis import OperationalDomain
-from verifai_jax.comparison.result import Comparison, Transfer
 from verifai_jax.core.atomic_files import replacing
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.progress import shows_progress
-from verifai_jax.error_budgets.result import ErrorBudget
+from verifai_jax.estimation.comparison.result import Comparison, Transfer
+from verifai_jax.estimation.error_budgets.result import ErrorBudget
 from verifai_jax.estimation.result import Estimate
-from verifai_jax.failure_table.result import FailureTable
 from verifai_jax.falsification.run import Run
+from verifai_jax.faults.failure_table.result import FailureTable
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import Judgement
 from verifai_jax.problem.problem import Problem
@@ -34,7 +34,7 @@ from verifai_jax.reports.run_report import run_page
 from verifai_jax.reports.sweep_report import sweep_page
 from verifai_jax.reports.transfer_report import transfer_page
 from verifai_jax.reports.verification_report import verification_page
-from verifai_jax.sweeps.result import Sweep
+from verifai_jax.training.sweeps.result import Sweep
 from verifai_jax.verification.result import Verification
 
 
@@ -57,7 +57,6 @@ def write_report(
     """Write the evidence report on a result as one HTML file, and its claims as JSON next to it.
 
     **Arguments:**
-
     - `result`: a run, a sweep, an estimate, a verification, a comparison, a transfer, a failure
       table or a judgement. The failures of a run that has its problem are simulated again.
     - `path`: the path of the HTML file; the claims go to the same name with the ending
@@ -78,9 +77,6 @@ def write_report(
     - `assessment`: whether sections for an assessor follow: the claims as a tree, the nine steps of
       credibility with boxes to be filled in, and a page to be signed.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
-    **Returns:** the path of the HTML file.
-
     **Raises:** `UnknownNameError` for a unit or a reason of a feature that does not exist;
     `ValueError` for a number of simulations that is none, and for a run whose rows have changed
     since they were written;

@@ -6,22 +6,12 @@ from verifai_jax.core.text import format_percent
 from verifai_jax.estimation.result import METHODS, Estimate
 from verifai_jax.problem.model_digest import digest_of_model
 from verifai_jax.problem.problem import Problem
-from verifai_jax.reports.claims import Claim, about_json, claims_json
-from verifai_jax.reports.markup import Child, bullets, paragraph, picture, preformatted, table
-from verifai_jax.reports.page import Page, Section
-from verifai_jax.reports.provenance import Model, chained
+from verifai_jax.reports.claims import Claim, about_json
+from verifai_jax.reports.markup import Child, paragraph, picture, preformatted, table
+from verifai_jax.reports.page import Page
+from verifai_jax.reports.provenance import Model
 from verifai_jax.reports.run_question import About
-from verifai_jax.reports.sections import (
-    MODEL,
-    NOT_SEEN,
-    SAMPLES,
-    answers_section,
-    claims_section,
-    model_answer,
-    model_warnings,
-    problem_content,
-    provenance_content,
-)
+from verifai_jax.reports.sections import MODEL, NOT_SEEN, SAMPLES, problem_content, result_page
 from verifai_jax.reports.studies import png
 
 
@@ -29,14 +19,9 @@ def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> 
     """Make the report on an estimate.
 
     **Arguments:**
-
-    - `estimate`: the estimate.
-    - `about`: units and reasons of the features.
     - `problem`: what was asked; None if it is not at hand.
     """
     model = Model.of([estimate.sources], None if problem is None else problem.sources())
-    links = tuple(chained(model.inputs))
-    chain = links[-1].chain if links else ""
     sure = format_percent(estimate.confidence)
     interval = f"{estimate.low:z.3g} to {estimate.high:z.3g}"
     bound = f"{estimate.upper_bound:z.2g}"
@@ -96,54 +81,31 @@ def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> 
         f"{estimate.no_verdict:,} simulations have no verdict; the upper ends take those of the "
         "prior's samples for failing."
     )
-    sections = (
-        answers_section(
-            [
-                ("What was claimed?", headline, "claims"),
-                ("What was the prior?", prior, "asked"),
-                ("How many simulations were there?", f"{estimate.simulations:,}", "found"),
-                ("How many had no verdict?", f"{estimate.no_verdict:,}", "limits"),
-                ("Which assumption is under the interval?", assumptions[-1], "limits"),
-                ("With which seed?", ", ".join(steps), "reproduce"),
-                model_answer(model),
-            ]
-        ),
-        Section(
-            "asked",
-            "What was asked",
-            (paragraph(f"How probable a failure of {estimate.name} is, under the prior."), *asked),
-        ),
-        Section(
-            "found",
-            "What was found",
-            (
-                table(["number", "value"], numbers),
-                picture(png(estimate.plot()), "The interval, and what the method saw"),
-            ),
-        ),
-        Section(
-            "limits",
-            "What was not shown",
-            (bullets([without, *assumptions, *estimate.notes]),),
-        ),
-        claims_section(claims),
-        Section(
-            "reproduce",
-            "How to reproduce it",
-            (
-                preformatted(python),
-                paragraph(f"Made with verifai_jax {estimate.version}."),
-                *provenance_content(links, model),
-            ),
-        ),
-    )
-    return Page(
-        title=f"{estimate.name}: evidence report on a probability",
-        headline=headline,
-        tone="open",
-        sections=sections,
-        claims=claims_json(estimate.name, claims, chain, _about(estimate, model, problem)),
-        warnings=model_warnings(model),
+    return result_page(
+        estimate.name,
+        "evidence report on a probability",
+        headline,
+        "open",
+        claims,
+        model,
+        about=_about(estimate, model, problem),
+        answers=[
+            ("What was the prior?", prior, "asked"),
+            ("How many simulations were there?", f"{estimate.simulations:,}", "found"),
+            ("How many had no verdict?", f"{estimate.no_verdict:,}", "limits"),
+            ("Which assumption is under the interval?", assumptions[-1], "limits"),
+            ("With which seed?", ", ".join(steps), "reproduce"),
+        ],
+        asked=[
+            paragraph(f"How probable a failure of {estimate.name} is, under the prior."),
+            *asked,
+        ],
+        found=[
+            table(["number", "value"], numbers),
+            picture(png(estimate.plot()), "The interval, and what the method saw"),
+        ],
+        limits=[without, *assumptions, *estimate.notes],
+        reproduce=[preformatted(python), paragraph(f"Made with verifai_jax {estimate.version}.")],
     )
 
 

@@ -1,22 +1,14 @@
 """The report on a failure table: what each fault does, how probable that is, and its replay."""
 
 from verifai_jax.core.text import format_percent, format_seconds
-from verifai_jax.failure_table.result import Effect, FailureTable
+from verifai_jax.faults.failure_table.result import Effect, FailureTable
 from verifai_jax.problem.problem import Problem
-from verifai_jax.reports.claims import Claim, claims_json
-from verifai_jax.reports.markup import bullets, paragraph, picture, preformatted, table
-from verifai_jax.reports.page import Page, Section
-from verifai_jax.reports.provenance import Model, chained
+from verifai_jax.reports.claims import Claim
+from verifai_jax.reports.markup import paragraph, picture, preformatted, table
+from verifai_jax.reports.page import Page
+from verifai_jax.reports.provenance import Model
 from verifai_jax.reports.run_question import About
-from verifai_jax.reports.sections import (
-    MODEL,
-    answers_section,
-    claims_section,
-    model_answer,
-    model_warnings,
-    problem_content,
-    provenance_content,
-)
+from verifai_jax.reports.sections import MODEL, problem_content, result_page
 from verifai_jax.reports.studies import png
 
 NOMINAL = "All features that are not of the faults of a row are nominal."
@@ -28,14 +20,10 @@ def failure_table_page(found: FailureTable, about: About, problem: Problem | Non
     """Make the report on a failure table.
 
     **Arguments:**
-
-    - `found`: the failure table.
-    - `about`: units and reasons of the features.
     - `problem`: the problem with its faults; None if it is not at hand.
     """
     run, sure = found.run, format_percent(found.confidence)
     model = Model.of(() if run is None else run.sources, problem and problem.sources())
-    links = tuple(chained(model.inputs))
     failing = [each for each in found if each.fails]
     assumed = (MODEL, NOMINAL, SAMPLED, *([] if found.rate is None else [INDEPENDENT]))
     when = "in a mission" if found.rate is not None else "given that it happens"
@@ -62,49 +50,30 @@ def failure_table_page(found: FailureTable, about: About, problem: Problem | Non
     limits = ["A fault without a failure may fail in ways that no sample and no search met."]
     if not found.healthy:
         limits.append("The nominal features break the property without any fault.")
-    sections = (
-        answers_section(
-            [
-                ("What was claimed?", headline, "claims"),
-                ("How probable is it?", f"see the table: {when}, {sure} intervals", "found"),
-                ("What does it rest on?", SAMPLED, "limits"),
-                model_answer(model),
-            ]
-        ),
-        Section(
-            "asked",
-            "What was asked",
-            (
-                paragraph(
-                    f"What each fault of {found.name} does, and each pair of those that do "
-                    "not fail alone."
-                ),
-                *([] if problem is None else problem_content(problem, about)),
+    return result_page(
+        found.name,
+        "failure modes and effects of faults",
+        headline,
+        "fails" if failing else "open",
+        claims,
+        model,
+        answers=[
+            ("How probable is it?", f"see the table: {when}, {sure} intervals", "found"),
+            ("What does it rest on?", SAMPLED, "limits"),
+        ],
+        asked=[
+            paragraph(
+                f"What each fault of {found.name} does, and each pair of those that do not fail "
+                "alone."
             ),
-        ),
-        Section(
-            "found",
-            "What was found",
-            (
-                table(heads, rows, f"Probabilities {when}, with {sure} intervals"),
-                picture(png(found.plot()), "The probability of each row with its interval"),
-            ),
-        ),
-        Section("limits", "What was not shown", (bullets([*limits, *assumed]),)),
-        claims_section(claims),
-        Section(
-            "reproduce",
-            "How to reproduce it",
-            (preformatted("\n".join(commands)), *provenance_content(links, model)),
-        ),
-    )
-    return Page(
-        title=f"{found.name}: failure modes and effects of faults",
-        headline=headline,
-        tone="fails" if failing else "open",
-        sections=sections,
-        claims=claims_json(found.name, claims, links[-1].chain if links else ""),
-        warnings=model_warnings(model),
+            *([] if problem is None else problem_content(problem, about)),
+        ],
+        found=[
+            table(heads, rows, f"Probabilities {when}, with {sure} intervals"),
+            picture(png(found.plot()), "The probability of each row with its interval"),
+        ],
+        limits=[*limits, *assumed],
+        reproduce=[preformatted("\n".join(commands))],
     )
 
 

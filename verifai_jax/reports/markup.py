@@ -51,9 +51,6 @@ def element(tag: str, *children: Child, **attributes: str | int | None) -> Marku
     """Return an element.
 
     **Arguments:**
-
-    - `tag`: its name.
-    - `children`: its content.
     - `attributes`: by name; `class_` is `class`, `aria_label` is `aria-label`, None is left out.
     """
     words = [
@@ -84,17 +81,12 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[Child]], caption: str = 
     """Return a table that scrolls by itself where the page is narrow.
 
     **Arguments:**
-
     - `heads`: the heads of the columns.
     - `rows`: their cells; the first of each is the head of its row.
     - `caption`: above the table, if any.
     """
     body = [
-        element(
-            "tr",
-            element("th", first, scope="row"),
-            [element("td", cell) for cell in others],
-        )
+        element("tr", element("th", first, scope="row"), [element("td", cell) for cell in others])
         for first, *others in rows
     ]
     return element(
@@ -116,8 +108,6 @@ def picture(content: bytes, alternative: str, caption: str = "", kind: str = "pn
     """Return a figure with a picture inside of the page.
 
     **Arguments:**
-
-    - `content`: the content of the file.
     - `alternative`: text for readers who cannot see the picture.
     - `caption`: below it; the words again when left out.
     - `kind`: `"png"` or `"gif"`.
@@ -134,7 +124,6 @@ def data_block(name: str, value: Mapping[str, Any] | Sequence[Any]) -> Markup:
     """Return plain data as JSON inside of the page, which no text of it can end.
 
     **Arguments:**
-
     - `name`: id of the block.
     - `value`: plain data without NaN and infinities.
     """

@@ -6,8 +6,8 @@ from typing import Any
 
 from verifai_jax.analysis import OddCoverage
 from verifai_jax.core.text import format_percent
-from verifai_jax.error_budgets.result import ErrorBudget
-from verifai_jax.failure_modes import Mode, Modes
+from verifai_jax.estimation.error_budgets.result import ErrorBudget
+from verifai_jax.estimation.failure_modes import Mode, Modes
 from verifai_jax.features.english import number
 from verifai_jax.reports.claims import Claim
 from verifai_jax.reports.markup import Child, Markup, bullets, element, paragraph, picture, table
@@ -87,13 +87,7 @@ MAX_MODES = 8
 
 
 def modes_section(found: Modes, about: About) -> Section:
-    """Write the ways of failing, the most probable first.
-
-    **Arguments:**
-
-    - `found`: the modes.
-    - `about`: units of the features.
-    """
+    """Write the ways of failing, the most probable first."""
     content: list[Markup] = [paragraph(_whole(found))]
     if found.modes:
         rows = [

@@ -42,8 +42,6 @@ def folder_inputs(folder: Path, roles: Sequence[tuple[str, str]]) -> list[Input]
     """Hash files of a folder of results.
 
     **Arguments:**
-
-    - `folder`: the folder.
     - `roles`: patterns of file names, and what these files are; the order is that of the chain.
     """
     return [

@@ -11,7 +11,6 @@ from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.summary import first_message
 from verifai_jax.features.density import tails
 from verifai_jax.features.english import number
-from verifai_jax.plotting.scatter import plot_features
 from verifai_jax.reports.commands import replay_command
 from verifai_jax.reports.markup import (
     Child,
@@ -25,6 +24,7 @@ from verifai_jax.reports.markup import (
     table,
 )
 from verifai_jax.reports.page import Section
+from verifai_jax.reports.plotting.scatter import plot_features
 from verifai_jax.reports.run_question import About
 from verifai_jax.reports.studies import Failure, Studies, png
 
@@ -32,8 +32,6 @@ DRAWN = ("clusters", "importance", "coverage")
 """Analyses of the table that a report draws."""
 MAX_FEATURES = 40
 """Features of a failure that are listed one by one."""
-
-
 _AGAIN = "Each can be simulated again from its row, bit for bit."
 _NOT_AGAIN = "Not all rows give their numbers when they are simulated again."
 
@@ -41,10 +39,7 @@ _NOT_AGAIN = "Not all rows give their numbers when they are simulated again."
 def findings(run: Run) -> Section:
     """Write what was found, in numbers."""
     content = [table(["number", "value"], number_rows(run))]
-    content += [
-        element("h3", "The summary, as the tool prints it"),
-        preformatted(run.summary()),
-    ]
+    content += [element("h3", "The summary, as the tool prints it"), preformatted(run.summary())]
     return Section("found", "What was found", tuple(content))
 
 

@@ -23,8 +23,6 @@ ENDS = {
 """Meaning of the end of a trace for the formulas."""
 NO_REASON = "not stated"
 """Cell of a missing unit or reason."""
-
-
 DEMANDED = ("text", "source", "severity", "rationale", "links")
 """What is shown of a requirement."""
 
@@ -67,14 +65,11 @@ def _unknown(features: Any) -> Any:
 
 
 def property_content(
-    texts: Mapping[str, str],
-    problem: Problem | None,
-    requirements: Mapping[str, Mapping[str, str]],
+    texts: Mapping[str, str], problem: Problem | None, requirements: Mapping[str, Mapping[str, str]]
 ) -> list[Markup]:
     """Write properties as formulas and in words.
 
     **Arguments:**
-
     - `texts`: the texts of the formulas by name.
     - `problem`: for what else is known; None if it is not.
     - `requirements`: what the formulas stand for, by name.

@@ -18,13 +18,7 @@ from verifai_jax.reports.commands import replay_command, report_command, run_com
 from verifai_jax.reports.markup import element, paragraph, preformatted
 from verifai_jax.reports.optional_sections import mode_claims, modes_section
 from verifai_jax.reports.page import Page, Section
-from verifai_jax.reports.provenance import (
-    Input,
-    Link,
-    Model,
-    chained,
-    folder_inputs,
-)
+from verifai_jax.reports.provenance import Input, Link, Model, chained, folder_inputs
 from verifai_jax.reports.run_findings import (
     analysis,
     explore,
@@ -94,9 +88,6 @@ def run_page(
     """Make the report on a run.
 
     **Arguments:**
-
-    - `run`: the run.
-    - `about`: units and reasons of the features.
     - `traces`, `studies`, `modes`: as in `write_report`.
     - `words`: further ones of the command that builds the report again; None if there is no command
       for all of it.

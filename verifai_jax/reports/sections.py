@@ -1,12 +1,13 @@
 """Sections that reports on all kinds of results share: claims, inputs, versions, what was asked."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from verifai_jax.problem.problem import Problem
-from verifai_jax.reports.claims import Claim
+from verifai_jax.reports.claims import Claim, claims_json
 from verifai_jax.reports.markup import Child, Markup, bullets, element, paragraph, table
-from verifai_jax.reports.page import Section
-from verifai_jax.reports.provenance import Link, Model, versions
+from verifai_jax.reports.page import Page, Section
+from verifai_jax.reports.provenance import Input, Link, Model, chained, versions
 from verifai_jax.reports.run_question import About, property_content, space_table
 
 MODEL = (
@@ -56,7 +57,6 @@ def model_warnings(model: Model, findings: Sequence[str] = ()) -> tuple[Markup, 
     """Write that the model is another one by now, with both hashes of each file; often nothing.
 
     **Arguments:**
-
     - `model`: what the result was made of.
     - `findings`: rows that did not give their numbers again, as sentences.
     """
@@ -162,7 +162,6 @@ def answers_section(rows: Sequence[tuple[str, str, str]]) -> Section:
     """Answer the questions of an auditor, with links to the long answers.
 
     **Arguments:**
-
     - `rows`: question, answer, and the anchor of the section that says more.
     """
     cells: list[list[Child]] = [
@@ -173,3 +172,49 @@ def answers_section(rows: Sequence[tuple[str, str, str]]) -> Section:
         "In short: the questions of an auditor",
         (table(["question", "answer", "section"], cells),),
     )
+
+
+def result_page(
+    name: str,
+    kind: str,
+    headline: str,
+    tone: str,
+    claims: list[Claim],
+    model: Model,
+    *,
+    answers: Sequence[tuple[str, str, str]],
+    asked: Sequence[Markup],
+    found: Sequence[Markup],
+    limits: Sequence[Child],
+    reproduce: Sequence[Markup],
+    files: Sequence[Input] = (),
+    about: Mapping[str, Any] | None = None,
+    warned: Model | None = None,
+) -> Page:
+    """Make the report on a result, which has the same sections whatever it is about.
+
+    **Arguments:**
+    - `name`, `kind`: the subject of the claims, and the kind of the report: its title.
+    - `headline`, `tone`, `claims`: the finding, as in `Page`, and what it lets one claim.
+    - `model`, `files`: files of the model, and those of the result.
+    - `answers`: questions as in `answers_section`, besides what was claimed and of which model.
+    - `asked`, `found`, `limits`, `reproduce`: content of these sections.
+    - `about`: what the claims are about, as in `claims_json`.
+    - `warned`: the model of whose changes the page warns, if it is not `model`.
+    """
+    links = tuple(chained([*files, *model.inputs]))
+    chain = links[-1].chain if links else ""
+    first = ("What was claimed?", headline, "claims")
+    sections = (
+        answers_section([first, *answers, model_answer(model)]),
+        Section("asked", "What was asked", tuple(asked)),
+        Section("found", "What was found", tuple(found)),
+        Section("limits", "What was not shown", (bullets(limits),)),
+        claims_section(claims),
+        Section(
+            "reproduce", "How to reproduce it", (*reproduce, *provenance_content(links, model))
+        ),
+    )
+    claimed = claims_json(name, claims, chain, about)
+    warnings = model_warnings(warned or model)
+    return Page(f"{name}: {kind}", headline, tone, sections, claimed, warnings=warnings)

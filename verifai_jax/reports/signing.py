@@ -9,12 +9,7 @@ ROLES = ("prepared by", "checked by", "approved by")
 
 
 def signing_section(sentence: str) -> Section:
-    """Return the section that persons sign.
-
-    **Arguments:**
-
-    - `sentence`: what they sign.
-    """
+    """Return the section that persons sign."""
     rows = [(role, *(blank(name) for name in ("name", "date", "signature"))) for role in ROLES]
     content = (
         paragraph(f"By signing, each person confirms that {sentence}."),

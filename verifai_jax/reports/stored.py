@@ -10,9 +10,9 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
-from verifai_jax.comparison.result import Compared, Comparison
 from verifai_jax.core.sources import Sources
 from verifai_jax.core.text import one_line
+from verifai_jax.estimation.comparison.result import Compared, Comparison
 from verifai_jax.estimation.result import METHODS, Estimate
 from verifai_jax.features import FeatureSpace
 from verifai_jax.statistics.paired_rates import PairedRates
@@ -30,13 +30,10 @@ def read_result(
     """Read an estimate, a comparison or a verification from the JSON that a command wrote.
 
     **Arguments:**
-
     - `file`: the output of `verifai-jax estimate --json` or `verifai-jax compare --json`, or what
       `verifai-jax verify --into` wrote.
     - `space`: the space of the problems that were compared, which the JSON does not have.
-
     **Returns:** the result; a comparison without its single pairs.
-
     **Raises:** `FileNotFoundError` where there is no such file; `ValueError` for anything else than
     such a result.
     """

@@ -13,19 +13,18 @@ from typing import Any, TypeVar
 import numpy as np
 
 from verifai_jax.analysis import Analysis, analyze
+from verifai_jax.analysis.counterexamples import Explained, Shrunk, explain, shrink
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.text import format_error, one_line
-from verifai_jax.counterexamples import Explained, Shrunk, explain, shrink
+from verifai_jax.estimation.failure_modes import Modes
+from verifai_jax.estimation.failure_modes import modes as find_modes
 from verifai_jax.evaluation.replay import Replay
-from verifai_jax.failure_modes import Modes
-from verifai_jax.failure_modes import modes as find_modes
 from verifai_jax.falsification.run import Run
-from verifai_jax.plotting.animation import animate
-from verifai_jax.plotting.mujoco_motion import can_draw
+from verifai_jax.reports.plotting.animation import animate
+from verifai_jax.reports.plotting.mujoco_motion import can_draw
 from verifai_jax.reports.view import rows_to_trace, trace_data
 
 Result = TypeVar("Result")
-
 MAX_FAILURES = 5
 """Failures that are shown one by one."""
 TRACES = 24
@@ -88,7 +87,6 @@ def study(
     """Study a run for its report: everything is decided by the run and its seed.
 
     **Arguments:**
-
     - `run`: the run.
     - `traces`: rows simulated beforehand at most; chosen when left out.
     - `studies`: whether the worst failure is explained and shrunk, which takes up to 2000

@@ -4,22 +4,15 @@ from typing import Any
 
 from verifai_jax.core.text import format_percent
 from verifai_jax.features.english import number
-from verifai_jax.reports.claims import Claim, claims_json
+from verifai_jax.reports.claims import Claim
 from verifai_jax.reports.commands import report_command
-from verifai_jax.reports.markup import bullets, paragraph, picture, preformatted, table
-from verifai_jax.reports.page import Page, Section
-from verifai_jax.reports.provenance import Model, chained, folder_inputs
+from verifai_jax.reports.markup import paragraph, picture, preformatted, table
+from verifai_jax.reports.page import Page
+from verifai_jax.reports.provenance import Model, folder_inputs
 from verifai_jax.reports.run_question import About, space_table
-from verifai_jax.reports.sections import (
-    MODEL,
-    answers_section,
-    claims_section,
-    model_answer,
-    model_warnings,
-    provenance_content,
-)
+from verifai_jax.reports.sections import MODEL, result_page
 from verifai_jax.reports.studies import png
-from verifai_jax.sweeps.result import Sweep
+from verifai_jax.training.sweeps.result import Sweep
 
 FILES = (
     ("sweep.json", "the record of the sweep"),
@@ -44,14 +37,11 @@ def sweep_page(sweep: Sweep, about: About) -> Page:
     """Make the report on a sweep.
 
     **Arguments:**
-
     - `sweep`: the sweep; its study is not needed.
     - `about`: units and reasons of the hyper-parameters.
     """
     record = sweep.record
     model = Model.of(record.sources, None if sweep.study is None else sweep.study.sources())
-    files = [] if sweep.folder is None else folder_inputs(sweep.folder, FILES)
-    links = tuple(chained(files + model.inputs))
     frame, safe = sweep.table, sweep.safe
     limit = "a limit that is not recorded" if sweep.p is None else format_percent(sweep.p)
     headline = f"{sweep.headline[:1].upper()}{sweep.headline[1:].rstrip('.')}."
@@ -83,62 +73,36 @@ def sweep_page(sweep: Sweep, about: About) -> Page:
     if sweep.folder is not None:
         command = report_command(sweep.folder, about.units, about.reasons)
         repeat.append(preformatted(command))
-    sections = (
-        answers_section(
-            [
-                ("What was claimed?", headline, "claims"),
-                ("What was varied?", ", ".join(sweep.hyperparameters), "asked"),
-                ("How many policies were trained?", f"{len(frame):,}", "found"),
-                ("How many are safe, unsafe, open?", verdicts, "found"),
-                ("Which assumption is under the intervals?", TOGETHER, "limits"),
-                ("With which seed?", str(record.seed), "reproduce"),
-                model_answer(model),
-            ]
-        ),
-        Section("asked", "What was asked", tuple(asked)),
-        Section(
-            "found",
-            "What was found",
-            (
-                preformatted(sweep.summary()),
-                picture(png(sweep.plot()), "Return against failure probability, and the curves"),
-                paragraph(f"{len(rows):,} of {len(frame):,} policies, the safe ones first:"),
-                table(["policy", *names], rows),
-            ),
-        ),
-        Section(
-            "limits",
-            "What was not shown",
-            (
-                bullets(
-                    [
-                        "A high return is not safety: a policy without the verdict safe is not "
-                        "shown to be safe.",
-                        f"{len(statuses):,} policies did not end properly.",
-                        *([] if record.complete else ["The sweep was cut off before its end."]),
-                        "An attack finds counterexamples and enters no interval.",
-                        MODEL,
-                        TOGETHER,
-                    ]
-                ),
-            ),
-        ),
-        claims_section(claims),
-        Section(
-            "reproduce",
-            "How to reproduce it",
-            (
-                *repeat,
-                paragraph(f"The sweep was made with verifai_jax {record.version}."),
-                *provenance_content(links, model),
-            ),
-        ),
-    )
-    return Page(
-        title=f"{sweep.name}: evidence report on a sweep",
-        headline=headline,
-        tone="holds" if len(safe) else "open",
-        sections=sections,
-        claims=claims_json(sweep.name, claims, links[-1].chain if links else ""),
-        warnings=model_warnings(model),
+    return result_page(
+        sweep.name,
+        "evidence report on a sweep",
+        headline,
+        "holds" if len(safe) else "open",
+        claims,
+        model,
+        files=[] if sweep.folder is None else folder_inputs(sweep.folder, FILES),
+        answers=[
+            ("What was varied?", ", ".join(sweep.hyperparameters), "asked"),
+            ("How many policies were trained?", f"{len(frame):,}", "found"),
+            ("How many are safe, unsafe, open?", verdicts, "found"),
+            ("Which assumption is under the intervals?", TOGETHER, "limits"),
+            ("With which seed?", str(record.seed), "reproduce"),
+        ],
+        asked=asked,
+        found=[
+            preformatted(sweep.summary()),
+            picture(png(sweep.plot()), "Return against failure probability, and the curves"),
+            paragraph(f"{len(rows):,} of {len(frame):,} policies, the safe ones first:"),
+            table(["policy", *names], rows),
+        ],
+        limits=[
+            "A high return is not safety: a policy without the verdict safe is not shown to be "
+            "safe.",
+            f"{len(statuses):,} policies did not end properly.",
+            *([] if record.complete else ["The sweep was cut off before its end."]),
+            "An attack finds counterexamples and enters no interval.",
+            MODEL,
+            TOGETHER,
+        ],
+        reproduce=[*repeat, paragraph(f"The sweep was made with verifai_jax {record.version}.")],
     )

@@ -2,22 +2,15 @@
 
 from typing import Any
 
-from verifai_jax.comparison.result import Transfer
 from verifai_jax.core.text import format_percent
+from verifai_jax.estimation.comparison.result import Transfer
 from verifai_jax.features.english import number
-from verifai_jax.reports.claims import Claim, claims_json
-from verifai_jax.reports.markup import bullets, paragraph, picture, preformatted, table
-from verifai_jax.reports.page import Page, Section
-from verifai_jax.reports.provenance import Model, chained
+from verifai_jax.reports.claims import Claim
+from verifai_jax.reports.markup import paragraph, picture, preformatted, table
+from verifai_jax.reports.page import Page
+from verifai_jax.reports.provenance import Model
 from verifai_jax.reports.run_question import About, space_table
-from verifai_jax.reports.sections import (
-    MODEL,
-    answers_section,
-    claims_section,
-    model_answer,
-    model_warnings,
-    provenance_content,
-)
+from verifai_jax.reports.sections import MODEL, result_page
 from verifai_jax.reports.studies import png
 
 PAIRED = "Both simulations of a pair have the same features and the same random key."
@@ -28,7 +21,6 @@ MAX_PAIRS = 10
 def transfer_page(result: Transfer, about: About) -> Page:
     """Make the report on one policy in two engines."""
     model = Model.of(result.sources.values())
-    links = tuple(chained(model.inputs))
     a, b = result.names
     pairs: Any = result.table
     proper = pairs[pairs["proper"]]
@@ -61,69 +53,41 @@ def transfer_page(result: Transfer, about: About) -> Page:
         ]
     shares = [(name, format_percent(share)) for name, share in result.influence.items()]
     causes = [table(["feature", "share of the gap's variance"], shares)] if shares else []
-    sections = (
-        answers_section(
-            [
-                ("What was claimed?", headline, "claims"),
-                ("What was varied?", "see the table", "asked"),
-                ("How many pairs were there?", evidence, "found"),
-                ("How many had no two verdicts?", f"{lost:,}", "limits"),
-                ("With which seed?", str(result.seed), "reproduce"),
-                model_answer(model),
-            ]
-        ),
-        Section(
-            "asked",
-            "What was asked",
-            (
-                paragraph(f"Whether the same policy does the same in {a} (a) and in {b} (b)."),
-                space_table(result.space, {}, about),
-            ),
-        ),
-        Section(
-            "found",
-            "What was found",
-            (
-                preformatted(str(result)),
-                picture(png(result.plot()), "The pair that parts most, and the gaps of all"),
-                *flipped,
-                *causes,
-            ),
-        ),
-        Section(
-            "limits",
-            "What was not shown",
-            (
-                bullets(
-                    [
-                        f"{lost:,} pairs have no verdict in one of the two.",
-                        f"Gaps below {result.tolerance:zg} of a signal's range do not count, nor "
-                        "what rounding can make.",
-                        rule,
-                        MODEL,
-                        *result.notes,
-                    ]
-                ),
-            ),
-        ),
-        claims_section(claims),
-        Section(
-            "reproduce",
-            "How to reproduce it",
-            (
-                preformatted(
-                    f"vj.transfer(policy, problem_a, problem_b, seed={result.seed}, "
-                    f"tolerance={result.tolerance:zg})"
-                ),
-                *provenance_content(links, model),
-            ),
-        ),
-    )
-    return Page(
-        title=f"{a} and {b}: evidence report on a transfer",
-        headline=headline,
-        tone="fails" if result.differs else "open",
-        sections=sections,
-        claims=claims_json(f"{a} and {b}", claims, links[-1].chain if links else ""),
-        warnings=model_warnings(model),
+    return result_page(
+        f"{a} and {b}",
+        "evidence report on a transfer",
+        headline,
+        "fails" if result.differs else "open",
+        claims,
+        model,
+        answers=[
+            ("What was varied?", "see the table", "asked"),
+            ("How many pairs were there?", evidence, "found"),
+            ("How many had no two verdicts?", f"{lost:,}", "limits"),
+            ("With which seed?", str(result.seed), "reproduce"),
+        ],
+        asked=[
+            paragraph(f"Whether the same policy does the same in {a} (a) and in {b} (b)."),
+            space_table(result.space, {}, about),
+        ],
+        found=[
+            preformatted(str(result)),
+            picture(png(result.plot()), "The pair that parts most, and the gaps of all"),
+            *flipped,
+            *causes,
+        ],
+        limits=[
+            f"{lost:,} pairs have no verdict in one of the two.",
+            f"Gaps below {result.tolerance:zg} of a signal's range do not count, nor what rounding "
+            "can make.",
+            rule,
+            MODEL,
+            *result.notes,
+        ],
+        reproduce=[
+            preformatted(
+                f"vj.transfer(policy, problem_a, problem_b, seed={result.seed}, "
+                f"tolerance={result.tolerance:zg})"
+            )
+        ],
     )

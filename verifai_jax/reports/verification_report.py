@@ -5,20 +5,12 @@ from typing import Any
 from verifai_jax.core.text import format_percent
 from verifai_jax.problem.model_digest import digest_of_model
 from verifai_jax.problem.problem import Problem
-from verifai_jax.reports.claims import Claim, about_json, claims_json
-from verifai_jax.reports.markup import Child, bullets, paragraph, picture, preformatted, table
-from verifai_jax.reports.page import Page, Section
-from verifai_jax.reports.provenance import Model, chained
+from verifai_jax.reports.claims import Claim, about_json
+from verifai_jax.reports.markup import Child, paragraph, picture, preformatted, table
+from verifai_jax.reports.page import Page
+from verifai_jax.reports.provenance import Model
 from verifai_jax.reports.run_question import About
-from verifai_jax.reports.sections import (
-    MODEL,
-    answers_section,
-    claims_section,
-    model_answer,
-    model_warnings,
-    problem_content,
-    provenance_content,
-)
+from verifai_jax.reports.sections import MODEL, problem_content, result_page
 from verifai_jax.reports.studies import png
 from verifai_jax.verification.result import Verification
 
@@ -35,13 +27,9 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
     """Make the report on a verification.
 
     **Arguments:**
-
-    - `result`: the verification.
-    - `about`: units and reasons of the features.
     - `problem`: what was asked; None if it is not at hand.
     """
     model = Model.of([result.sources], None if problem is None else problem.sources())
-    links = tuple(chained(model.inputs))
     proved, broken, undecided = result.proved, result.broken, result.undecided
     shares = [format_percent(part.mass) for part in (proved, broken, undecided)]
     headline = f"{shares[0]} of the prior is proved, {shares[1]} broken, {shares[2]} undecided."
@@ -77,71 +65,48 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
         for values in largest[[*columns, *ends]].itertuples(index=False)
     ]
     asked = [] if problem is None else problem_content(problem, about)
-    sections = (
-        answers_section(
-            [
-                ("What was claimed?", headline, "claims"),
-                ("What was the prior?", "see what was asked", "asked"),
-                ("How many boxes are there?", boxes, "found"),
-                ("How probable is a failure?", f"{bounds}, at {sure}", "found"),
-                ("Which assumption is under what is proved?", verified, "limits"),
-                model_answer(model),
-            ]
-        ),
-        Section(
-            "asked",
-            "What was asked",
-            (paragraph(f"Where no {what} of {result.name} fails, for certain."), *asked),
-        ),
-        Section(
-            "found",
-            "What was found",
-            (
-                table(["part", "of the prior", "of the volume"], parts),
-                picture(png(result.plot()), "The parts, two coordinates at a time"),
-                table(
-                    [*columns, *ends], rows,
-                    "The most probable boxes; ends are shares of the range of a feature.",
-                ),
-            ),
-        ),
-        Section(
-            "limits",
-            "What was not shown",
-            (
-                bullets(
-                    [
-                        f"{shares[2]} of the prior is undecided; at most "
-                        f"{format_percent(result.failure_bound)} of it fails, at {sure}.",
-                        verified, SAMPLED, MODEL, *result.notes,
-                    ]
-                ),
-            ),
-        ),
-        claims_section(claims),
-        Section(
-            "reproduce",
-            "How to reproduce it",
-            (
-                preformatted(
-                    f"vj.verify(problem, boxes={result.looked_at}, precision={result.precision!r}, "
-                    f"confidence={result.confidence}, continuous={result.continuous})"
-                ),
-                paragraph(f"Made with verifai_jax {result.version}."),
-                *provenance_content(links, model),
-            ),
-        ),
-    )  # fmt: skip
     subject: dict[str, Any] = {}
     if problem is not None:
         digest = "" if model.changes else digest_of_model(problem)
         entries = problem.requirement_entries()
         subject = about_json("verification", result.formulas, entries, digest)
-    return Page(
-        title=f"{result.name}: evidence report on a verification",
-        headline=headline,
-        tone="fails" if broken.mass else "open",
-        sections=sections,
-        claims=claims_json(result.name, claims, links[-1].chain if links else "", subject),
-        warnings=model_warnings(model),
+    return result_page(
+        result.name,
+        "evidence report on a verification",
+        headline,
+        "fails" if broken.mass else "open",
+        claims,
+        model,
+        about=subject,
+        answers=[
+            ("What was the prior?", "see what was asked", "asked"),
+            ("How many boxes are there?", boxes, "found"),
+            ("How probable is a failure?", f"{bounds}, at {sure}", "found"),
+            ("Which assumption is under what is proved?", verified, "limits"),
+        ],
+        asked=[paragraph(f"Where no {what} of {result.name} fails, for certain."), *asked],
+        found=[
+            table(["part", "of the prior", "of the volume"], parts),
+            picture(png(result.plot()), "The parts, two coordinates at a time"),
+            table(
+                [*columns, *ends],
+                rows,
+                "The most probable boxes; ends are shares of the range of a feature.",
+            ),
+        ],
+        limits=[
+            f"{shares[2]} of the prior is undecided; at most "
+            f"{format_percent(result.failure_bound)} of it fails, at {sure}.",
+            verified,
+            SAMPLED,
+            MODEL,
+            *result.notes,
+        ],
+        reproduce=[
+            preformatted(
+                f"vj.verify(problem, boxes={result.looked_at}, precision={result.precision!r}, "
+                f"confidence={result.confidence}, continuous={result.continuous})"
+            ),
+            paragraph(f"Made with verifai_jax {result.version}."),
+        ],
     )

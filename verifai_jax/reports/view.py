@@ -18,9 +18,9 @@ from verifai_jax.falsification.counts import claimed_rows, violating_rows
 from verifai_jax.falsification.run import Run
 from verifai_jax.mtl.bounds import signal_bounds
 from verifai_jax.mtl.expression import constant_value
-from verifai_jax.plotting.replay import decisive_instant
-from verifai_jax.plotting.scatter import distinguishing_features
-from verifai_jax.plotting.style import FAILING, NOT_CLAIMED, SAFE, WITHOUT_VERDICT
+from verifai_jax.reports.plotting.replay import decisive_instant
+from verifai_jax.reports.plotting.scatter import distinguishing_features
+from verifai_jax.reports.plotting.style import FAILING, NOT_CLAIMED, SAFE, WITHOUT_VERDICT
 
 GROUPS = (
     ("safe", SAFE, 4000),
@@ -53,11 +53,9 @@ def view_data(
     """Describe a run's table for `view.js`.
 
     **Arguments:**
-
     - `run`: a run with a row at least.
     - `traces`: by number of row, as `trace_data` describes them; these rows are among those shown.
     - `command`: the command that a number of a row follows, to simulate it again.
-
     **Returns:** plain data; `shown` and `simulations` tell how much it was thinned.
     """
     table = run.table.all
@@ -146,8 +144,6 @@ def trace_data(replay: Replay, label: str = "") -> dict[str, Any]:
     """Describe the trace of a replay: the signals of its formulas, their bounds, the instant.
 
     **Arguments:**
-
-    - `replay`: the replay.
     - `label`: words for the list of traces; the number of the row when left out.
     """
     trace, problem = replay.trace, replay.problem
@@ -192,8 +188,6 @@ def rows_to_trace(run: Run, maximum: int, first: Sequence[int] = ()) -> dict[int
     The worst ones that are claimed, those nearest to the bound on either side, those not claimed.
 
     **Arguments:**
-
-    - `run`: a run.
     - `maximum`: rows at most.
     - `first`: rows that come first, such as the failures that a report shows.
     """

@@ -9,8 +9,8 @@ from typing import Any
 
 from verifai_jax.core.text import format_error, one_line
 from verifai_jax.falsification.run import Run
-from verifai_jax.plotting.scatter import plot_features
 from verifai_jax.reports.page import asset
+from verifai_jax.reports.plotting.scatter import plot_features
 from verifai_jax.reports.studies import png
 from verifai_jax.reports.view import trace_data, view_data
 
@@ -21,9 +21,7 @@ def explore(run: Run) -> Any:
     A row under the pointer shows its values. A clicked one is simulated again, and shows its trace.
 
     **Arguments:**
-
     - `run`: a run with a row at least.
-
     **Returns:** a widget of anywidget; without that package the figure of `run.plot()`.
     """
     try:

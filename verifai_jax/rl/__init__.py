@@ -1,34 +1,36 @@
 """Training of the policies whose closed loops are then tested."""
 
-from verifai_jax.rl._evaluate import evaluate
-from verifai_jax.rl._train import Checkpoint, Training, train
-from verifai_jax.rl.algorithm import Algorithm, Progress
-from verifai_jax.rl.algorithms import ALGORITHMS
-from verifai_jax.rl.batched_training import BatchedTraining, Configuration
-from verifai_jax.rl.policy import (
-    Policy,
-    PolicyFileError,
-    load_policy,
-    policy_notes,
-    policy_sources,
-    save_policy,
-)
-from verifai_jax.rl.ppo import PPO
-from verifai_jax.rl.pqn import PQN
-from verifai_jax.rl.sac import SAC
-from verifai_jax.rl.task.brax import brax_task, playground_task
-from verifai_jax.rl.task.gymnax import gymnax_task
-from verifai_jax.rl.task.mjx import mjx_task
-from verifai_jax.rl.task.ode import ode_task
-from verifai_jax.rl.task.task import Continuous, Discrete, Task
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "ALGORITHMS", "PPO", "PQN", "SAC", "Algorithm", "BatchedTraining", "Checkpoint",
-    "Configuration", "Continuous", "Discrete", "Policy", "PolicyFileError", "Progress", "Task",
-    "Training", "brax_task", "evaluate", "gymnax_task", "load_policy", "mjx_task", "ode_task",
-    "playground_task", "policy_notes", "policy_sources", "save_policy", "train",
-]  # fmt: skip
+from verifai_jax.core.lazy import attach
 
+if TYPE_CHECKING:
+    from verifai_jax.rl._evaluate import evaluate as evaluate
+    from verifai_jax.rl._train import Checkpoint as Checkpoint
+    from verifai_jax.rl._train import Training as Training
+    from verifai_jax.rl._train import train as train
+    from verifai_jax.rl.algorithm import Algorithm as Algorithm
+    from verifai_jax.rl.algorithm import Progress as Progress
+    from verifai_jax.rl.algorithms import ALGORITHMS as ALGORITHMS
+    from verifai_jax.rl.batched_training import BatchedTraining as BatchedTraining
+    from verifai_jax.rl.batched_training import Configuration as Configuration
+    from verifai_jax.rl.policy import Policy as Policy
+    from verifai_jax.rl.policy import PolicyFileError as PolicyFileError
+    from verifai_jax.rl.policy import load_policy as load_policy
+    from verifai_jax.rl.policy import policy_notes as policy_notes
+    from verifai_jax.rl.policy import policy_sources as policy_sources
+    from verifai_jax.rl.policy import save_policy as save_policy
+    from verifai_jax.rl.ppo import PPO as PPO
+    from verifai_jax.rl.pqn import PQN as PQN
+    from verifai_jax.rl.sac import SAC as SAC
+    from verifai_jax.rl.task.brax import brax_task as brax_task
+    from verifai_jax.rl.task.brax import playground_task as playground_task
+    from verifai_jax.rl.task.gymnax import gymnax_task as gymnax_task
+    from verifai_jax.rl.task.mjx import mjx_task as mjx_task
+    from verifai_jax.rl.task.ode import ode_task as ode_task
+    from verifai_jax.rl.task.task import Continuous as Continuous
+    from verifai_jax.rl.task.task import Discrete as Discrete
+    from verifai_jax.rl.task.task import Task as Task
 
-def __dir__() -> list[str]:
-    return list(__all__)
+# Imported when first used: a folder inside needs few of these names.
+__getattr__, __dir__, __all__ = attach(__name__)

@@ -27,30 +27,22 @@ POLICIES_PER_DEVICE = 8
 """Policies that a device simulates at a time."""
 EPISODES = 32
 """Episodes of a mean return, when nothing else is said."""
-
 Totals = tuple[State, Float[Array, "..."], Bool[Array, "..."]]
 """States, rewards so far, and the episodes that are over."""
 
 
 @shows_progress("simulating episodes of", "episodes")
 def evaluate(
-    task: Task,
-    policy: Policy,
-    *,
-    seed: int = 0,
-    episodes: int = 100,
-    progress: bool | None = None,
+    task: Task, policy: Policy, *, seed: int = 0, episodes: int = 100, progress: bool | None = None
 ) -> Float[np.ndarray, " episodes"]:
     """Simulate episodes with the policy's most likely actions and return their returns.
 
     **Arguments:**
-
     - `task`: the task. An episode ends where it says so, or at its time limit.
     - `policy`: the policy to measure.
     - `seed`: the seed of the episodes' starts and of what is random in their steps.
     - `episodes`: their number.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Returns:** `[episodes]`, the sum of rewards of each episode.
     """
     numbers, _ = numbers_of(task)
@@ -64,7 +56,6 @@ def mean_returns(
     """Measure the mean return of each policy's most likely actions over the same episodes.
 
     **Arguments:** as in `evaluate`.
-
     **Returns:** `[policies]`.
     """
     means = np.full(len(policies), np.nan)

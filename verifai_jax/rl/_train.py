@@ -67,7 +67,6 @@ def train(
     other hyper-parameters re-use the program.
 
     **Arguments:**
-
     - `task`: the task to learn; see `Task`.
     - `algorithm`: the algorithm with its hyper-parameters; `PPO()` when left out.
     - `seed`: the seed of everything random in the training.
@@ -77,9 +76,7 @@ def train(
       environment steps so far and a dictionary of plain numbers: `update`, and `mean_return` where
       an episode ended in it.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Returns:** the policy with its learning curve.
-
     **Raises:** `ValueError` for hyper-parameters that cannot train, an algorithm that does not fit
     the task's actions, no steps, or checkpoints outside of the training.
     """

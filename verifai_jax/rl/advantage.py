@@ -31,7 +31,6 @@ def advantages(
     """Estimate the advantage of each action taken; advantage plus `value` is the critic's target.
 
     **Arguments:**
-
     - `reward`: of each step.
     - `value`: the value of the state in which the action was taken.
     - `next_value`: the value of the state that the step led to, *before* any reset.

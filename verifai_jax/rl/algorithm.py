@@ -65,7 +65,6 @@ class Algorithm(Protocol):
         """Make the state before the first update.
 
         **Arguments:**
-
         - `task`: the task to learn.
         - `key`: a random key, from which all randomness of the training run comes.
         - `updates`: the number of updates, at whose end schedules end.
@@ -95,12 +94,10 @@ def check_values(
     """Refuse the first of the named hyper-parameters for which `holds` is false.
 
     **Arguments:**
-
     - `algorithm`: the object with the hyper-parameters.
     - `names`: fields to check.
     - `holds(value) -> bool`: the condition on each value.
     - `wanted`: the condition in words, which follow "must be".
-
     **Raises:** `ValueError`: "PPO's clip must be positive; got -1".
     """
     for name in names:

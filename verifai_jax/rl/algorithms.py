@@ -14,7 +14,6 @@ from verifai_jax.rl.task.task import Action
 
 AlgorithmClass: TypeAlias = type[PPO] | type[PQN] | type[SAC]
 """The class of a training algorithm of this package."""
-
 ALGORITHMS: dict[str, AlgorithmClass] = {"ppo": PPO, "pqn": PQN, "sac": SAC}
 """The classes of the training algorithms, by name."""
 

@@ -39,8 +39,6 @@ RUNS_PER_ACCELERATOR = 64
 """Training runs under one `vmap` on an accelerator; a CPU core is busy with one."""
 SLICE_SECONDS = 2.0
 """Seconds that a call into compiled code lasts at most, about; one can interrupt between calls."""
-
-
 PyTreeDef: TypeAlias = jax.tree_util.PyTreeDef  # pyright: ignore[reportInvalidTypeForm]
 """The structure of a pytree; its own name of the class is a variable to type checkers."""
 Shapes = tuple[tuple[tuple[int, ...], str], ...]
@@ -112,12 +110,10 @@ class BatchedTraining:
     """Training runs that can be advanced side by side, any of them to any step.
 
     **Arguments:**
-
     - `configurations`: the runs; numbers below are indices in this sequence.
     - `devices`: JAX devices to spread them over; all of this process when left out.
     - `per_device`: runs under one `vmap` on a device; when left out 1 on CPUs, else 64.
     - `watch`: called every few seconds with the number of each run and its learning curve so far.
-
     **Raises:** `ValueError` for a configuration that cannot train.
     """
 
@@ -145,9 +141,7 @@ class BatchedTraining:
         """Advance runs until each has used its target of environment steps.
 
         **Arguments:**
-
         - `targets`: environment steps to reach, by number of the run.
-
         **Yields:** each number as it gets there, those of one structure after another. Between
         updates, every few seconds, it can be interrupted; numbers not yielded yet may be requested
         again.

@@ -69,11 +69,9 @@ def advance(
     """Take one step of each environment.
 
     **Arguments:**
-
     - `episodes`: the episodes before it.
     - `action`: the action of each environment, as `task.step` takes it.
     - `key`: a random key, of this step of all environments.
-
     **Returns:** the episodes after it, new ones where it ended one; the transition.
     """
     step_key, reset_key = jax.random.split(key)

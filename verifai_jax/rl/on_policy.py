@@ -32,14 +32,12 @@ def minibatch_epochs(
     """Descend the loss, one step for each minibatch.
 
     **Arguments:**
-
     - `loss(weights, minibatch) -> number`: what is descended.
     - `start`: weights, and the optimizer's state.
     - `batch`: a pytree of arrays with two leading axes, such as environments and time.
     - `key`: a random key, of the order.
     - `optimizer`, `rate`: the direction of a step, and its length.
     - `epochs`, `minibatches`: passes over the batch, and parts in a pass.
-
     **Returns:** weights, and the optimizer's state.
     """
     rows = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)

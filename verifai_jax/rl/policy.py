@@ -34,10 +34,8 @@ from verifai_jax.rl.task.task import Action, Continuous, Discrete
 Layer = tuple[Float[Array | np.ndarray, "... _ _"], Float[Array | np.ndarray, "... _"]]
 Layers = tuple[Layer, ...]
 """Weights `[inputs, outputs]` and biases `[outputs]` of each layer, first layer first."""
-
 ACTIVATIONS: dict[str, Callable[[ArrayLike], Array]] = {"tanh": jnp.tanh, "relu": jax.nn.relu}
 """Functions between the layers, by name. All are 0 at 0."""
-
 _KINDS: dict[str, type[Discrete] | type[Continuous]] = {
     "discrete": Discrete,
     "continuous": Continuous,
@@ -68,7 +66,6 @@ class Policy:
 
     # JAX rebuilds the class with stacked arrays and placeholders, which have other shapes.
     __no_type_check__ = True
-
     layers: Layers
     mean: Float[Array | np.ndarray, " k"] | None
     scale: Float[Array | np.ndarray, " k"] | None
@@ -105,18 +102,19 @@ class Policy:
         """Write the policy as `.npz` (`save_policy`), or its action as `.onnx` or `.safetensors`.
 
         **Returns:** the path.
-
         **Raises:** `PolicyError` for another ending.
         """
         if Path(path).suffix == ".npz":
             save_policy(self, path)
             return Path(path)
         graph, arrays, start = self.as_graph()
-        return lazy_import("verifai_jax.policies.base", "write")(graph, arrays, start, Path(path))
+        return lazy_import("verifai_jax.rl.policies.base", "write")(
+            graph, arrays, start, Path(path)
+        )
 
     def as_graph(self, observation: object = None) -> tuple[Any, Any, Any]:
         """Return the policy as a graph of ONNX operators, as policies of other frameworks do."""
-        as_any = lazy_import("verifai_jax.policies.base", "Policy")(self, _act)
+        as_any = lazy_import("verifai_jax.rl.policies.base", "Policy")(self, _act)
         return as_any.as_graph(np.zeros(self.layers[0][0].shape[0]))
 
 
@@ -199,7 +197,6 @@ def save_policy(
     """Write a policy as a compressed `.npz` of float32 arrays.
 
     **Arguments:**
-
     - `policy`: the policy to write.
     - `path`: the file.
     - `sources`: what it was trained with, as a run records it; that of the modules that call this
@@ -229,7 +226,6 @@ def load_policy(path: str | Path) -> Policy:
     """Read a policy that `save_policy` wrote. The file can hold numbers and text only.
 
     **Returns:** the policy, with JAX arrays of float32.
-
     **Raises:** `FileNotFoundError`; `PolicyFileError` for a file of another kind, and for arrays
     that are missing, not finite, or of shapes that do not fit to each other and to the actions.
     """
@@ -338,7 +334,6 @@ def policy_sources(path: str | Path) -> dict[str, Any]:
 
     **Returns:** plain data with the hashes of `files` and the `versions`; empty for a file that
     does not say so.
-
     **Raises:** `FileNotFoundError`; `PolicyFileError` for a file of another kind.
     """
     return _plain_data(path, "sources")

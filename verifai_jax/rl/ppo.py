@@ -23,12 +23,7 @@ from verifai_jax.rl.experience import (
     progress,
     start_episodes,
 )
-from verifai_jax.rl.observations import (
-    ObservationStatistics,
-    mean_and_scale,
-    normalise,
-    update,
-)
+from verifai_jax.rl.observations import ObservationStatistics, mean_and_scale, normalise, update
 from verifai_jax.rl.on_policy import minibatch_epochs
 from verifai_jax.rl.optimizer import adam, annealed
 from verifai_jax.rl.policy import Layers, Policy, network, new_layers, scale_to_range
@@ -54,7 +49,6 @@ class PPO:
     # JAX rebuilds the class with stacked numbers and placeholders in place of numbers.
     __no_type_check__ = True
     actions: ClassVar[tuple[type, ...]] = (Discrete, Continuous)
-
     learning_rate: Number = 2.5e-4
     discount: Number = 0.99
     gae_lambda: Number = 0.95
@@ -149,7 +143,6 @@ class Weights:
 
     # JAX rebuilds the class with stacked arrays and placeholders, which have other shapes.
     __no_type_check__ = True
-
     policy: Layers
     critic: Layers
     log_std: Float[Array, " size"] | None

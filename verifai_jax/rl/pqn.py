@@ -29,12 +29,7 @@ from verifai_jax.rl.experience import (
     progress,
     start_episodes,
 )
-from verifai_jax.rl.observations import (
-    ObservationStatistics,
-    mean_and_scale,
-    normalise,
-    update,
-)
+from verifai_jax.rl.observations import ObservationStatistics, mean_and_scale, normalise, update
 from verifai_jax.rl.on_policy import minibatch_epochs
 from verifai_jax.rl.optimizer import adam, annealed
 from verifai_jax.rl.policy import ACTIVATIONS, Layers, Policy, network, new_layers
@@ -63,7 +58,6 @@ class PQN:
     # JAX rebuilds the class with stacked numbers and placeholders in place of numbers.
     __no_type_check__ = True
     actions: ClassVar[tuple[type, ...]] = (Discrete,)
-
     learning_rate: Number = 2e-3
     discount: Number = 0.99
     q_lambda: Number = 0.9
@@ -203,7 +197,6 @@ def q_lambda_targets(
     """Compute targets for the values of the actions taken, lane by lane.
 
     **Arguments:**
-
     - `reward`: of each step.
     - `next_value`: the value of the best action in the state that the step led to, *before*
       any reset.

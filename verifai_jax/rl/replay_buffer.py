@@ -69,7 +69,6 @@ def sample(
     """Draw transitions uniformly, with replacement, from a buffer that is not empty.
 
     **Arguments:**
-
     - `count`: the number of transitions.
     - `actions`: the numbers in an action.
     """

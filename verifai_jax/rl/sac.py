@@ -18,21 +18,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
+from verifai_jax.rl import experience
 from verifai_jax.rl.algorithm import Number, Progress, check_values, static_field
-from verifai_jax.rl.experience import (
-    Episodes,
-    Transition,
-    advance,
-    observation_size,
-    progress,
-    start_episodes,
-)
-from verifai_jax.rl.observations import (
-    ObservationStatistics,
-    mean_and_scale,
-    normalise,
-    update,
-)
+from verifai_jax.rl.observations import ObservationStatistics, mean_and_scale, normalise, update
 from verifai_jax.rl.optimizer import adam, annealed
 from verifai_jax.rl.policy import ACTIVATIONS, Layers, Policy, network, new_layers, scale_to_range
 from verifai_jax.rl.replay_buffer import ReplayBuffer, StoredTransitions, add, empty_buffer, sample
@@ -72,7 +60,6 @@ class SAC:
     # JAX rebuilds the class with stacked numbers and placeholders in place of numbers.
     __no_type_check__ = True
     actions: ClassVar[tuple[type, ...]] = (Continuous,)
-
     learning_rate: Number = 1e-3
     discount: Number = 0.99
     target_rate: Number = 0.01
@@ -124,8 +111,8 @@ class SAC:
     def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "SACState":
         """Make the state before the first of `updates` updates."""
         policy_key, critic_key, reset_key, noise_key, key = jax.random.split(key, 5)
-        episodes = start_episodes(task, reset_key, self.environments)
-        size, actions = observation_size(task, episodes), _count(task)
+        episodes = experience.start_episodes(task, reset_key, self.environments)
+        size, actions = experience.observation_size(task, episodes), _count(task)
 
         def critic(key: Key[Array, ""]) -> Layers:
             return new_layers(key, (size + actions, *self.value_hidden, 1), gain=1.0)
@@ -163,14 +150,12 @@ class SAC:
                 Int[Array, ""],
                 tuple[Float[Array, "environments actions"], Key[Array, ""], Key[Array, ""]],
             ],
-        ) -> tuple["SACState", tuple[Transition, Float[Array, "environments k"]]]:
+        ) -> tuple["SACState", tuple[experience.Transition, Float[Array, "environments k"]]]:
             number, (noise, step_key, learn_key) = numbered
             carry, transition, observation = act(self, task, carry, noise, step_key)
             taken = (state.done * self.horizon + number + 1) * self.environments
             carry = jax.lax.cond(
-                taken >= self.warmup,
-                lambda: _learn(self, carry, rate, learn_key),
-                lambda: carry,
+                taken >= self.warmup, lambda: _learn(self, carry, rate, learn_key), lambda: carry
             )
             return carry, (transition, observation)
 
@@ -186,7 +171,7 @@ class SAC:
         )
         statistics = update(state.statistics, observation) if self.normalise else state.statistics
         after = after._replace(statistics=statistics, key=key, done=state.done + 1)
-        return after, progress(transition)
+        return after, experience.progress(transition)
 
     def policy(self, task: Task, state: "SACState") -> Policy:
         """Return the policy learnt so far, without exploration."""
@@ -209,7 +194,6 @@ class Weights:
 
     # JAX rebuilds the class with stacked arrays and placeholders, which have other shapes.
     __no_type_check__ = True
-
     policy: Layers
     critics: Layers
     log_temperature: Float[Array, ""]
@@ -232,7 +216,7 @@ class SACState(NamedTuple):
     slow: Layers
     moments: PyTree
     statistics: ObservationStatistics
-    episodes: Episodes
+    episodes: experience.Episodes
     noise: Float[Array, "environments actions"]
     buffer: ReplayBuffer
     key: Key[Array, ""]
@@ -262,14 +246,16 @@ def act(
     state: SACState,
     noise: Float[Array, "environments actions"],
     key: Key[Array, ""],
-) -> tuple[SACState, Transition, Float[Array, "environments k"]]:
+) -> tuple[SACState, experience.Transition, Float[Array, "environments k"]]:
     """Take one step of each environment, and write the transitions into the buffer."""
     observation = jax.vmap(task.observe)(state.episodes.state)
     normalised = normalise(state.statistics, observation, sac.normalise)
     mean, log_std = _gaussian(sac, state.weights.policy, normalised)
     unit = jnp.tanh(mean + jnp.exp(log_std) * state.noise)
     assert isinstance(task.action, Continuous)
-    episodes, transition = advance(task, state.episodes, scale_to_range(task.action, unit), key)
+    episodes, transition = experience.advance(
+        task, state.episodes, scale_to_range(task.action, unit), key
+    )
     new = StoredTransitions(
         observation,
         transition.next_observation,
@@ -325,7 +311,6 @@ def total_loss(
     """Add up three losses, each with a gradient for its own part of the weights only."""
     fixed = jax.lax.stop_gradient(weights)
     temperature = jnp.exp(fixed.log_temperature)
-
     mean, log_std = _gaussian(sac, fixed.policy, batch.next_observation)
     next_action = jnp.tanh(mean + jnp.exp(log_std) * noise[0])
     next_value = jnp.min(_values(sac, slow, batch.next_observation, next_action), axis=0)
@@ -334,13 +319,11 @@ def total_loss(
     target = jax.lax.stop_gradient(sac.reward_scale * batch.reward + discount * next_value)
     value = _values(sac, weights.critics, batch.observation, batch.action)
     value_error = jnp.sum(jnp.mean(jnp.square(value - target), axis=1)) / 2  # eq. 5
-
     mean, log_std = _gaussian(sac, weights.policy, batch.observation)
     action = jnp.tanh(mean + jnp.exp(log_std) * noise[1])
     log_probability = squash_log_prob(mean, log_std, noise[1])
     worth = jnp.min(_values(sac, fixed.critics, batch.observation, action), axis=0)
     policy_loss = jnp.mean(temperature * log_probability - worth)  # eq. 9
-
     wanted = sac.target_entropy * noise.shape[2]
     excess = jax.lax.stop_gradient(jnp.mean(-log_probability) - wanted)
     return value_error + policy_loss + weights.log_temperature * excess  # eq. 18, of the logarithm

@@ -59,14 +59,11 @@ def clopper_pearson(
     """Compute the exact two-sided binomial interval.
 
     **Arguments:**
-
     - `failures`: samples that failed.
     - `simulations`: samples in all, a number fixed beforehand.
     - `confidence`: probability with which the interval is to hold.
     - `undecided`: further samples that may have failed: without a verdict, for instance.
-
     **Returns:** the `Rate`.
-
     **Raises:** `ValueError` unless `0 <= failures <= failures + undecided <= simulations`,
     `simulations >= 1` and `0 < confidence < 1`.
 
@@ -85,7 +82,6 @@ def exact_interval(
     """Compute the ends of the interval of Clopper and Pearson; counts may be effective ones.
 
     **Arguments:**
-
     - `low_count`, `high_count`: the smallest and the greatest possible number of failures, each
       used for one end.
     - `samples`: samples in all, or as many as weighted ones are worth.
@@ -104,7 +100,6 @@ def upper_bound(failures: int, simulations: int, confidence: float = 0.95) -> fl
     """Compute the one-sided Clopper-Pearson bound: the largest rate that is not excluded.
 
     **Arguments:** as `clopper_pearson`; no simulations, or nothing but failures, exclude nothing.
-
     **Returns:** the bound; without a failure about `3 / simulations` at a confidence of 95 %.
     """
     from scipy.special import betaincinv
@@ -118,12 +113,9 @@ def simulations_without_failure(rate: float, confidence: float = 0.95) -> int:
     """Count the simulations without a failure that show that the failure rate is below `rate`.
 
     **Arguments:**
-
     - `rate`: failure rate to exclude.
     - `confidence`: probability with which the statement is to hold.
-
     **Returns:** the least `n` with `(1 - rate)^n <= 1 - confidence`: about `3 / rate` at 95 %.
-
     **Raises:** `ValueError` unless `0 < rate < 1` and `0 < confidence < 1`.
     """
     check_fraction("rate", rate)
@@ -137,13 +129,10 @@ def simulations_until(
     """Count the further simulations, none failing, that show that the failure rate is below `p0`.
 
     **Arguments:**
-
     - `p0`: failure rate to exclude.
     - `failures`, `simulations`: samples taken so far.
     - `confidence`: probability with which the statement is to hold.
-
     **Returns:** the least `n` for which `upper_bound(failures, simulations + n)` is at most `p0`.
-
     **Raises:** `ValueError` unless `0 < p0 < 1`.
     """
     check_fraction("p0", p0)

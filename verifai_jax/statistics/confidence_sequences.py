@@ -35,15 +35,12 @@ from verifai_jax.statistics.binomial import Rate, check_counts
 
 ATOM = 0.75
 """Weight of rate 0 in the mixture for upper bounds."""
-
 UNDECIDED = "undecided"
 """Verdict of a policy whose interval contains the failure rate that is allowed."""
-
 SAFE = "safe"
 """Beginning of the verdict `safe@p`."""
 UNSAFE = "unsafe"
 """Verdict of a policy that fails more often than is allowed."""
-
 Counts = Real[np.ndarray, "*#n"] | float
 """Numbers of samples, one or many; fractions where they are expectations."""
 
@@ -58,9 +55,7 @@ def anytime_interval(
     factor of 1.5 to 2.
 
     **Arguments:** as `clopper_pearson`, but anything may have decided the number of simulations.
-
     **Returns:** the `Rate`.
-
     **Raises:** `ValueError` unless `0 <= failures <= simulations`, `simulations >= 1` and
     `0 < confidence < 1`.
     """
@@ -86,14 +81,11 @@ def simultaneous_interval(
     policies share their features.
 
     **Arguments:**
-
     - `failures`: samples that failed.
     - `simulations`: samples in all; anything may have decided their number.
     - `confidence`: probability with which all intervals are to hold.
     - `among`: number of rates, this one included.
-
     **Returns:** the `Rate`.
-
     **Raises:** `ValueError` unless `0 <= failures <= simulations`, `simulations >= 1`,
     `0 < confidence < 1` and `among >= 1`.
     """
@@ -124,12 +116,9 @@ def evidence_below(failures: Counts, simulations: Counts, rate: Counts) -> Float
     The mixture is an atom at 0 and, above it, a density proportional to `t^(-1/2)`.
 
     **Arguments:**
-
     - `failures`, `simulations`: numbers of samples, which broadcast; `failures` may be fractions,
       for what is expected of samples to come.
     - `rate`: rates to reject from above.
-
-    **Returns:** the logarithms.
     """
     from scipy.special import betainc, betaln
 
@@ -151,8 +140,6 @@ def evidence_above(failures: Counts, simulations: Counts, rate: Counts) -> Float
     The mixture has a density proportional to `t^(-1/2) (1-t)^(-1/2)` there.
 
     **Arguments:** as `evidence_below`, with rates to reject from below.
-
-    **Returns:** the logarithms.
     """
     from scipy.special import betaincc, betaln
 

@@ -33,7 +33,6 @@ def worst_probability(p: float, radius: float) -> float:
     """Return the greatest probability of an event over all priors within a divergence.
 
     **Arguments:**
-
     - `p`: its probability under the prior.
     - `radius`: nats, at least 0.
     """
@@ -45,7 +44,6 @@ def radius_of(p: float, limit: float) -> float:
     """Return the least divergence in nats at which a prior gives an event the probability `limit`.
 
     **Arguments:**
-
     - `p`: its probability under the prior.
     - `limit`: a greater one; 0 is returned for one that is not greater.
     """
@@ -57,7 +55,6 @@ def worst_mean(values: Sequence[float], weights: Sequence[float], radius: float)
     """Return the greatest mean of a number over all distributions within a divergence.
 
     **Arguments:**
-
     - `values`: that the number takes.
     - `weights`: their probabilities, whose sum is 1.
     - `radius`: nats, at least 0.

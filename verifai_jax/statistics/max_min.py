@@ -21,13 +21,11 @@ def max_min_step(
     """Compute the step within `radius` a coordinate that raises `min(rho + gradients @ step)` most.
 
     **Arguments:**
-
     - `theta`: present parameters, from which the step is taken.
     - `rho`, `gradients`: robustness in each environment at `theta`, and its derivatives.
     - `radius`: greatest change of a coordinate.
     - `free`: coordinates that may move.
     - `bounded`: whether they stay in the unit cube.
-
     **Returns:** the step; zero where nothing can be gained, or the solver finds nothing.
     """
     step = np.zeros_like(theta)

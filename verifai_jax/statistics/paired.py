@@ -63,14 +63,11 @@ def paired_difference(
     """Compute the mean of `values - reference` and its Student's t interval.
 
     **Arguments:**
-
     - `values`, `reference`: the two values of each pair; pairs in which one is not finite are left
       out.
     - `confidence`: probability with which the interval is to hold, if the differences are
       independent and normal.
-
     **Returns:** the `PairedDifference`.
-
     **Raises:** `ValueError` for lists of different lengths, or a confidence out of range.
 
     Source: Student, The probable error of a mean, Biometrika 6 (1908).

@@ -71,16 +71,13 @@ def paired_rates(
     """Compute the interval of a difference of failure rates on paired samples.
 
     **Arguments:**
-
     - `only_first`, `only_second`: pairs in which only the first, only the second fails.
     - `pairs`: in all; anything may have decided their number.
     - `confidence`: probability with which the interval is to hold at all times together.
     - `undecided`: further pairs without both verdicts.
     - `at_any_time`: False for a number of pairs that was fixed beforehand, of which the interval is
       narrower.
-
     **Returns:** the `PairedRates`.
-
     **Raises:** `ValueError` for counts below zero or above `pairs`, and unless `pairs >= 1` and
     `0 < confidence < 1`.
     """

@@ -19,12 +19,9 @@ def fronts(points: ArrayLike) -> Int[np.ndarray, " n"]:
     """Return each point's front: 0 where none dominates it, 1 once those are gone, and so on.
 
     **Arguments:**
-
     - `points`: `[n, objectives]`, all objectives to be minimised. Infinite entries compare as
       numbers do.
-
     **Returns:** the numbers; -1 for a point with a NaN, which takes no part.
-
     **Raises:** `ValueError` for points that are no matrix.
     """
     points = np.asarray(points, np.float64)

@@ -16,10 +16,8 @@ def shortest(
     """Compute the shortest `z` with `matrix @ z >= bound`.
 
     **Arguments:**
-
     - `matrix`: rows of length one, up to rounding, so that one tolerance fits them all.
     - `bound`: least value of each row.
-
     **Returns:** the vector; None if the inequalities contradict each other.
     """
     if np.all(bound <= 0):
@@ -48,10 +46,8 @@ def shortest_in_box(
     """Compute the shortest `z` with `rows @ z <= most` and `low <= z <= high`.
 
     **Arguments:**
-
     - `rows`, `maximum`: linear inequalities; rows of zeros are left out.
     - `low`, `high`: the box.
-
     **Returns:** the vector, or None.
     """
     sizes = np.linalg.norm(rows, axis=1)
@@ -79,14 +75,12 @@ def smallest_change(
     Exact for this linear model; the caller checks the step by simulation.
 
     **Arguments:**
-
     - `theta`: present parameters, from which the step is taken.
     - `nominal`: parameters to stay near to.
     - `rho`, `gradients`: robustness in each environment at `theta`, and its derivatives.
     - `target`: robustness to reach in every environment.
     - `free`: coordinates that may move.
     - `bounded`: whether they stay in the unit cube.
-
     **Returns:** the step; None if the linear model has no such point.
     """
     indices = np.flatnonzero(free)

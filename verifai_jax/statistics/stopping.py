@@ -22,7 +22,6 @@ class StoppingRule(Protocol):
         """Return whether to stop; called after every batch.
 
         **Arguments:**
-
         - `failures`: samples that failed so far, as simulated.
         - `simulations`: samples so far.
         - `without_verdict`: those among them that have no verdict.

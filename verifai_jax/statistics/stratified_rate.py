@@ -92,7 +92,6 @@ def stratified_rate(
     """Compute a failure rate and its interval from the trials of two strata.
 
     **Arguments:**
-
     - `first`, `second`: failures and trials of each stratum.
     - `share`: probability of the second stratum: a number, or how many of how many independent
       samples lie in it.
@@ -101,9 +100,7 @@ def stratified_rate(
     - `allocated`: whether somebody chose the number of trials of each stratum beforehand; without
       that they are samples of the whole.
     - `at_any_time`: whether verdicts decided which trials were made, or when to stop.
-
     **Returns:** the `StratifiedRate`.
-
     **Raises:** `ValueError` for counts below zero or failures above trials, no trial, and for a
     share or a confidence out of range.
     """

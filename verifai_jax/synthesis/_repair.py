@@ -30,28 +30,10 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.max_min import max_min_step
 from verifai_jax.statistics.smallest_change import smallest_change
+from verifai_jax.synthesis import arguments, optimize
 from verifai_jax.synthesis.adversary import attack
-from verifai_jax.synthesis.arguments import (
-    AIMS,
-    ATTACK,
-    attack_search,
-    check_numbers,
-    repaired_arrays,
-    repaired_features,
-)
 from verifai_jax.synthesis.failure_counts import FailureCounts
 from verifai_jax.synthesis.held_out import held_out
-from verifai_jax.synthesis.optimize import (
-    MIN_BATCH,
-    Archive,
-    Choice,
-    climb,
-    cross_entropy,
-    evaluate,
-    explore,
-    has_gradients,
-    value_merit,
-)
 from verifai_jax.synthesis.parametric import FeatureParameters, Parametric
 from verifai_jax.synthesis.region import Region, region_of
 from verifai_jax.synthesis.results import Repair, Round
@@ -89,7 +71,6 @@ def repair(
     """Change parameters as little as makes the formula hold in all counterexamples.
 
     **Arguments:**
-
     - `problem`: what fails, or a run of it, whose counterexamples come first.
     - `parameters`: names of features; or, with `system_of`, a pytree of arrays.
     - `budget`: simulations at most, the check not counted.
@@ -109,9 +90,7 @@ def repair(
     - `max_seconds`: wall-clock seconds; a fifth is reserved for the check.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
     - all other arguments: as in `falsify`.
-
     **Returns:** a `Repair`; after Ctrl-C what is finished, without the check.
-
     **Raises:** `ValueError` before anything compiles for unknown features, parameters without a
     nominal value, no environment, options out of range, or arrays of a system without gradients.
     """
@@ -122,8 +101,8 @@ def repair(
         assert run is not None
         raise ValueError(f"the run of {run.name!r} was loaded without its problem; load it with it")
     check_options(budget, batch, seed, max_seconds, None)
-    check_numbers(margin, rounds=rounds, held_out=held_out)
-    check_names("aim", [aim], AIMS)
+    arguments.check_numbers(margin, rounds=rounds, held_out=held_out)
+    check_names("aim", [aim], arguments.AIMS)
     if aim == "probability" and system_of is not None:
         raise ValueError(
             "arrays of parameters are repaired by gradients, for their robustness; "
@@ -131,15 +110,15 @@ def repair(
         )
     loop: Parametric
     if system_of is not None:
-        loop = repaired_arrays(
+        loop = arguments.repaired_arrays(
             whole, parameters, system_of, nominal, gradient, batch, precision, seed
         )
         start = loop.start
     else:
-        loop, start = repaired_features(
+        loop, start = arguments.repaired_features(
             whole, parameters, nominal, gradient, batch, budget, precision, backend, seed
         )
-    search = attack_search(whole, attack, loop)
+    search = arguments.attack_search(whole, attack, loop)
     sources, begun = sources_of(whole, system_of, made=whole.made_in or ()), time.time()
     limits, checking = split_budget(lambda: loop.simulations, budget, started, max_seconds)
     region = region_of(loop, mass)
@@ -222,14 +201,14 @@ class _Repair:
         self.margin, self.seed = margin, seed
         self.rng = np.random.default_rng((seed, 2))
         # An attack that finds nothing costs a tenth of the budget; one that does costs less.
-        self.share = min(ATTACK, max(64, limits.maximum // 10))
+        self.share = min(arguments.ATTACK, max(64, limits.maximum // 10))
         self.batch = min(128, usual_batch(search, self.share))
         self.environments = np.zeros((0, loop.environment.dim), np.float32)
-        self.now = Choice(start, np.inf, 0)
+        self.now = optimize.Choice(start, np.inf, 0)
         self.robustness = np.inf
         self.deficit: float | None = None
         self.slack = 0.0
-        self.archive = Archive()
+        self.archive = optimize.Archive()
         self.turns: list[Round] = []
         self.notes: list[str] = [region.describe()]
         self.counts: FailureCounts | None = None
@@ -287,7 +266,7 @@ class _Repair:
             try:
                 counts.run()
             finally:
-                self.now = Choice(counts.theta, counts.value, counts.samples)
+                self.now = optimize.Choice(counts.theta, counts.value, counts.samples)
                 self.robustness, self.environments = counts.value, counts.environments
             self.stopped = "fewest failures" if counts.failing else "repaired"
             return
@@ -323,27 +302,29 @@ class _Repair:
     def repair_set(self) -> bool:
         """Move to the nearest parameters that keep the whole set; return whether there are any."""
         # What was near and what was robust in the old set may still be in this one.
-        old = self.archive.best(4, self.merit) + self.archive.best(8, value_merit, apart=0.05)
-        self.archive = archive = Archive()
-        if self.limits.left < MIN_BATCH * len(self.environments):
+        old = self.archive.best(4, self.merit) + self.archive.best(
+            8, optimize.value_merit, apart=0.05
+        )
+        self.archive = archive = optimize.Archive()
+        if self.limits.left < optimize.MIN_BATCH * len(self.environments):
             self.archive, self.stopped = archive, self.limits.stopped_by
             return False
         starts = np.stack([self.start, self.now.theta, *(choice.theta for choice in old)])
         affordable = max(2, self.limits.left // 4 // len(self.environments))
-        evaluate(self.loop, starts[:affordable], self.environments, archive)
+        optimize.evaluate(self.loop, starts[:affordable], self.environments, archive)
         scale = self.deficit or 1.0
-        if has_gradients(self.loop):
+        if optimize.has_gradients(self.loop):
             # From where it is now, and from the start anew: the nearest may lie elsewhere.
             starts = [self.now.theta] if np.all(self.now.theta == self.start) else [
                 self.now.theta, self.start
             ]  # fmt: skip
-            climb(
+            optimize.climb(
                 self.loop, starts, self.environments, archive,
                 self.limits.slice(self.limits.left // 3), propose=self.propose, merit=self.merit,
                 scale=scale, radius=0.1 if self.loop.bounded else 0.1 * self.size,
             )  # fmt: skip
         best = archive.best(1, self.merit)[0]
-        followed = has_gradients(self.loop) and self.loop.free.all()
+        followed = optimize.has_gradients(self.loop) and self.loop.free.all()
         if self.loop.bounded and (best.value < self.enough or not followed):
             best = self.without_gradients(archive)
         if self.margin <= best.value < self.enough:
@@ -354,7 +335,7 @@ class _Repair:
         self.robustness = best.value
         if best.value >= self.enough:
             return True
-        if self.limits.left < MIN_BATCH * len(self.environments):
+        if self.limits.left < optimize.MIN_BATCH * len(self.environments):
             self.stopped = self.limits.stopped_by
             return False
         self.stopped = "no parameters"
@@ -395,16 +376,16 @@ class _Repair:
         moved = [theta + step for step in steps]
         return [np.clip(m, 0.0, 1.0) for m in moved] if loop.bounded else moved
 
-    def without_gradients(self, archive: Archive) -> Choice:
+    def without_gradients(self, archive: optimize.Archive) -> optimize.Choice:
         """Search by cross-entropy, over the whole space where nothing is known, then nearer."""
         limits = self.limits.slice(max(self.limits.maximum // 8, self.limits.left // 8))
         if archive.best(1, self.merit)[0].value < self.enough:
-            explore(
+            optimize.explore(
                 self.loop, self.environments, archive, limits.slice(limits.left // 2),
                 merit=self.merit, batch=CANDIDATES, rng=self.rng,
             )  # fmt: skip
         best = archive.best(6, self.merit)
-        cross_entropy(
+        optimize.cross_entropy(
             self.loop, [c.theta for c in best], self.environments, archive,
             limits.slice(limits.left // 2),
             merit=self.merit, batch=CANDIDATES, rng=self.rng, rounds=40,
@@ -415,7 +396,7 @@ class _Repair:
         return archive.best(1, self.merit)[0]
 
     def move_to_nominal(
-        self, theta: Float[np.ndarray, " p"], archive: Archive, limits: Budget
+        self, theta: Float[np.ndarray, " p"], archive: optimize.Archive, limits: Budget
     ) -> None:
         """Move towards the nominal parameters: each coordinate alone first, then all together."""
         blocks = [np.arange(self.loop.dim) == i for i in range(self.loop.dim)]
@@ -428,7 +409,7 @@ class _Repair:
                         for s in shares]  # fmt: skip
                 if limits.left < len(fractions) * len(self.environments) or high - low < 1e-3:
                     return
-                values = evaluate(self.loop, fractions, self.environments, archive)
+                values = optimize.evaluate(self.loop, fractions, self.environments, archive)
                 good = values >= self.enough
                 # Nearest above which all are good, so that it is not an island.
                 upper = len(good) - int(np.argmin(np.append(good[::-1], False)))

@@ -27,6 +27,7 @@ from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.max_min import max_min_step
+from verifai_jax.synthesis import optimize
 from verifai_jax.synthesis.adversary import attack
 from verifai_jax.synthesis.arguments import (
     AIMS,
@@ -37,25 +38,12 @@ from verifai_jax.synthesis.arguments import (
 )
 from verifai_jax.synthesis.failure_counts import FailureCounts
 from verifai_jax.synthesis.held_out import HeldOut, draw, held_out
-from verifai_jax.synthesis.optimize import (
-    Archive,
-    Choice,
-    climb,
-    cross_entropy,
-    evaluate,
-    explore,
-    has_gradients,
-    typical_size,
-    value_merit,
-    worst_case,
-)
 from verifai_jax.synthesis.parametric import FeatureParameters, Parametric, rows_of
 from verifai_jax.synthesis.region import Region, region_of
 from verifai_jax.synthesis.results import Synthesis
 
 if TYPE_CHECKING:
     import pandas as pd
-
 CANDIDATES = 32
 """Choices of parameters at a time, and at most in the table at the end."""
 STARTS = 4
@@ -91,7 +79,6 @@ def synthesize(
     """Find features for which the formula holds robustly, whatever the other features are.
 
     **Arguments:**
-
     - `problem`: the system, its features and formulas.
     - `parameters`: names of the features to choose; all when left out. The others are the
       environment, which varies.
@@ -113,9 +100,7 @@ def synthesize(
     - `max_seconds`: wall-clock seconds; a fifth is reserved for the check.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
     - all other arguments: as in `falsify`.
-
     **Returns:** a `Synthesis`; after Ctrl-C what is finished, without the check.
-
     **Raises:** `ValueError` before anything compiles for unknown features and options out of range.
     """
     started = time.perf_counter()
@@ -227,14 +212,14 @@ class _Synthesis:
         self.margin = margin
         # One shape for all attacks: a twentieth of what one may cost.
         self.batch = min(128, usual_batch(search, max(256, limits.maximum // 4)))
-        self.archive = Archive()
+        self.archive = optimize.Archive()
         self.rng = np.random.default_rng((seed, 2))
         self.scale = 1.0
         self.stopped = "budget"
-        self.attacked: list[Choice] = []
+        self.attacked: list[optimize.Choice] = []
         self.attacks: dict[bytes, int] = {}
         self.counts: FailureCounts | None = None
-        self.final: list[Choice] = []
+        self.final: list[optimize.Choice] = []
         self.rho: Any = None  # Of the best, in each environment of the set.
         self.environments: Any = np.zeros((1, 0), np.float32)
         if loop.environment is not None:
@@ -267,14 +252,16 @@ class _Synthesis:
         alone = self.loop.environment is None
         maximum = EXPLORED if alone else 1000 * len(self.environments)
         first = self.limits.slice(min(maximum, int((0.5 if alone else 0.15) * total)))
-        explore(
+        optimize.explore(
             self.loop, self.environments, self.archive, first,
-            merit=value_merit, batch=CANDIDATES, rng=self.rng,
+            merit=optimize.value_merit, batch=CANDIDATES, rng=self.rng,
         )  # fmt: skip
         if not self.archive.choices:
             # Not even one choice fits into the share: at least one is evaluated.
-            evaluate(self.loop, np.full((1, self.loop.dim), 0.5), self.environments, self.archive)
-        self.scale = typical_size([choice.value for choice in self.archive.choices])
+            optimize.evaluate(
+                self.loop, np.full((1, self.loop.dim), 0.5), self.environments, self.archive
+            )
+        self.scale = optimize.typical_size([choice.value for choice in self.archive.choices])
         if self.loop.environment is None:
             self.improve(self.limits, 2 * STARTS)
             self.stopped = self.limits.stopped_by if self.limits.exhausted else "converged"
@@ -309,18 +296,20 @@ class _Synthesis:
         self.stopped = self.limits.stopped_by if self.limits.exhausted else "no verdict"
 
     def improve(self, limits: Budget, starts: int) -> None:
-        best = self.archive.best(starts, value_merit, apart=1e-3)
-        if has_gradients(self.loop):
+        best = self.archive.best(starts, optimize.value_merit, apart=1e-3)
+        if optimize.has_gradients(self.loop):
             part = limits if self.loop.differentiable else limits.slice(limits.left // 2)
-            climb(
+            optimize.climb(
                 self.loop, [c.theta for c in best], self.environments, self.archive, part,
-                propose=self.propose, merit=value_merit, scale=self.scale, radius=0.1,
+                propose=self.propose, merit=optimize.value_merit, scale=self.scale, radius=0.1,
             )  # fmt: skip
         if not self.loop.free.all() or not self.loop.differentiable:
-            best = self.archive.best(2, value_merit) + self.archive.best(6, value_merit, apart=0.05)
-            cross_entropy(
+            best = self.archive.best(2, optimize.value_merit) + self.archive.best(
+                6, optimize.value_merit, apart=0.05
+            )
+            optimize.cross_entropy(
                 self.loop, [c.theta for c in best], self.environments, self.archive, limits,
-                merit=value_merit, batch=CANDIDATES, rng=self.rng, rounds=1000
+                merit=optimize.value_merit, batch=CANDIDATES, rng=self.rng, rounds=1000
                 if self.loop.environment is None else 12,
             )  # fmt: skip
 
@@ -338,26 +327,26 @@ class _Synthesis:
     def extend(self, points: Float[np.ndarray, "n d"]) -> None:
         """Add environments `[n, d]` to the set, and evaluate the best choices over the new one."""
         self.environments = np.concatenate([self.environments, points]).astype(np.float32)
-        best = self.archive.best(4, value_merit, apart=1e-3)
-        best += self.archive.best(12, value_merit, apart=0.1)
+        best = self.archive.best(4, optimize.value_merit, apart=1e-3)
+        best += self.archive.best(12, optimize.value_merit, apart=0.1)
         affordable = min(len(best), self.limits.left // len(self.environments))
-        again, self.archive = best[:affordable], Archive()
+        again, self.archive = best[:affordable], optimize.Archive()
         if again:
-            evaluate(self.loop, [c.theta for c in again], self.environments, self.archive)
+            optimize.evaluate(self.loop, [c.theta for c in again], self.environments, self.archive)
             return
         # Old values bound the new ones from above; the attacked ones are known best.
         self.archive.choices = best
 
-    def best_in_archive(self) -> Choice:
-        return self.archive.best(1, value_merit)[0]
+    def best_in_archive(self) -> optimize.Choice:
+        return self.archive.best(1, optimize.value_merit)[0]
 
     @property
-    def best(self) -> Choice:
+    def best(self) -> optimize.Choice:
         """The choice of parameters with the greatest least robustness in all attacks."""
         if (counts := self.counts) is not None:
-            return Choice(counts.theta, counts.value, len(counts.environments))
+            return optimize.Choice(counts.theta, counts.value, len(counts.environments))
         if self.attacked:
-            known: dict[bytes, Choice] = {}
+            known: dict[bytes, optimize.Choice] = {}
             for choice in self.attacked:
                 name = choice.theta.tobytes()
                 if name not in known or choice.value < known[name].value:
@@ -365,7 +354,7 @@ class _Synthesis:
             return max(known.values(), key=lambda choice: choice.value)
         if self.archive.choices:
             return self.best_in_archive()
-        return Choice(np.full(self.loop.dim, 0.5), -np.inf, 0)
+        return optimize.Choice(np.full(self.loop.dim, 0.5), -np.inf, 0)
 
     @property
     def robustness(self) -> float:
@@ -379,19 +368,22 @@ class _Synthesis:
             return
         if self.loop.environment is None:
             return
-        pool = Archive()
-        pool.choices = [*self.attacked, *self.archive.best(CANDIDATES, value_merit, apart=1e-3)]
+        pool = optimize.Archive()
+        pool.choices = [
+            *self.attacked,
+            *self.archive.best(CANDIDATES, optimize.value_merit, apart=1e-3),
+        ]
         thetas: dict[bytes, Any] = {}
-        for choice in pool.best(len(pool.choices), value_merit):
+        for choice in pool.best(len(pool.choices), optimize.value_merit):
             thetas.setdefault(choice.theta.tobytes(), choice)
         affordable = max(0, self.limits.maximum - self.loop.simulations) // len(self.environments)
         chosen = list(thetas.values())[: min(CANDIDATES, affordable)]
         if not chosen:
             return
         pairs = self.loop.evaluate(np.stack([c.theta for c in chosen]), self.environments)
-        values = worst_case(pairs)
+        values = optimize.worst_case(pairs)
         self.final = [
-            Choice(c.theta, float(v), len(self.environments))
+            optimize.Choice(c.theta, float(v), len(self.environments))
             for c, v in zip(chosen, values, strict=True)
         ]
         values_by_name = {c.theta.tobytes(): c.value for c in self.final}
@@ -406,7 +398,7 @@ class _Synthesis:
     def table(self) -> "pd.DataFrame":
         """Return the candidates, best first."""
         if self.loop.environment is None:
-            pool = self.archive.best(len(self.archive.choices), value_merit)
+            pool = self.archive.best(len(self.archive.choices), optimize.value_merit)
             chosen = [c for i, c in enumerate(pool) if c.value >= self.margin or i < CANDIDATES]
         else:
             chosen = sorted(self.final or [self.best], key=lambda c: c.value, reverse=True)

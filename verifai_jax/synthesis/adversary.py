@@ -77,7 +77,6 @@ def attack(
     """Search environments whose robustness lies below `level`.
 
     **Arguments:**
-
     - `loop`: the system with its parameters.
     - `theta` `[p]`: the parameters to attack.
     - `level`: robustness below which an environment counts.
@@ -96,11 +95,7 @@ def attack(
     reserved = DESCENT * MAX_FOLLOWED * (each + len(STEPS)) if follows else 0
     searching = limits.slice(limits.left - min(reserved, limits.left // 3))
     proposals = Proposals(
-        search,
-        loop.environment.cube,
-        batch,
-        jax.random.key(seed),
-        loop.environment.constraint,
+        search, loop.environment.cube, batch, jax.random.key(seed), loop.environment.constraint
     )
     parts: list[tuple[np.ndarray, Pairs]] = []
     violations = 0
@@ -161,7 +156,9 @@ def _descend(
             break
         points = np.where(better[:, None], moved[np.arange(len(points)), which], points)
         best = np.where(better, lowest, best)
-    return _join(first, _collect(tried, level, loop))
+    return Attack(
+        *(np.concatenate(both) for both in zip(first, _collect(tried, level, loop), strict=True))
+    )
 
 
 def _gradients(
@@ -199,7 +196,3 @@ def _collect(parts: list[tuple[np.ndarray, Pairs]], level: float, loop: Parametr
         np.concatenate([pairs.rho[0] for _, pairs in parts]),
         np.concatenate([pairs.violates(level)[0] for _, pairs in parts]),
     )
-
-
-def _join(one: Attack, other: Attack) -> Attack:
-    return Attack(*(np.concatenate(both) for both in zip(one, other, strict=True)))

@@ -24,10 +24,7 @@ ATTACK = 20_000
 
 
 def check_numbers(margin: float, **counts: int) -> None:
-    """Check that numbers are in range.
-
-    **Raises:** `ValueError`.
-    """
+    """Check that numbers are in range."""
     if isinstance(margin, bool) or not isinstance(margin, int | float) or not margin >= 0:
         raise ValueError(f"margin must be a robustness of at least 0; got {margin!r}")
     for name, count in counts.items():
@@ -87,7 +84,6 @@ def attack_search(problem: Problem, search: str | Search, loop: Parametric) -> S
         search = searches.named(search)
     if loop.environment is None:
         return search
-
     checked = check_search(problem, search) if loop.problem.black_box else search
     if not isinstance(checked, Search):
         raise TypeError(f"attack must be a name or a search like CrossEntropy(); got {search!r}")

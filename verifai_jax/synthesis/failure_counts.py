@@ -35,14 +35,12 @@ class FailureCounts:
     """The search, whose best candidate can be read at any time.
 
     **Arguments:**
-
     - `loop`: the system with its parameters, some features being its environment.
     - `margin`: robustness below which a sample fails.
     - `limits`: its budget.
     - `seed`: alone decides samples and candidates.
     - `start` `[p]`: nominal parameters, which are candidates; of others that fail as seldom the
       nearest to these is best. None without any.
-
     **Raises:** `ValueError` where nothing varies but the parameters.
     """
 

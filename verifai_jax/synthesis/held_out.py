@@ -25,7 +25,6 @@ class HeldOut:
     """Verdicts of parameters in fresh environments.
 
     **Fields:**
-
     - `simulations` made.
     - `failures`: simulations that broke a formula.
     - `short`: simulations that kept it, but by less than the wanted margin.
@@ -84,14 +83,12 @@ def held_out(
     """Simulate environments drawn from the prior.
 
     **Arguments:**
-
     - `loop`: the system with its parameters.
     - `theta` `[p]`: the parameters.
     - `count`: environments; fewer where the constraint of the space refuses nearly all.
     - `margin`: robustness that is wanted.
     - `seed`: alone decides the environments.
     - `limits`: time at which to stop early.
-
     **Returns:** a `HeldOut`.
     """
     points = draw(loop, theta, count, seed)

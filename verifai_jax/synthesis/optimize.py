@@ -28,7 +28,6 @@ MAX_DIFFERENCES = 12
 """Parameters up to which differences take the place of gradients."""
 MAX_REFUSED = 1000
 """Draws in a row without one that the constraint accepts, after which no more are made."""
-
 Thetas: TypeAlias = Float[np.ndarray, "k p"] | Sequence[Float[np.ndarray, " p"]]
 Environments: TypeAlias = Float[np.ndarray, "n d"]
 Merit = Callable[[np.ndarray, float], tuple[float, ...]]
@@ -154,7 +153,6 @@ def climb(
     """Follow the gradients of the least robust environments from each start, all in step.
 
     **Arguments:**
-
     - `propose(theta, rho, gradients, radius)`: candidates for a step, the boldest first.
 
     A step is taken where simulations show that it is better; the radius follows its success.

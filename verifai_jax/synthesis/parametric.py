@@ -33,7 +33,6 @@ from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
-
 ROWS = 64
 """Rows of a table made at a time, so that one shape compiles."""
 MAX_DIFFERENTIATED = 64
@@ -66,12 +65,10 @@ class FeatureParameters:
     """Some features of a problem as parameters, the others as the environment.
 
     **Arguments:**
-
     - `problem`: on the backend that it is to run on.
     - `names`: the names of the features that are parameters; all that vary when left out.
     - `batch`: simulations at once.
     - `gradient`: whether gradients may be asked for.
-
     **Raises:** `ValueError` for unknown features, none, or one that does not vary.
     """
 
@@ -193,12 +190,10 @@ class ArrayParameters:
     """Arrays as parameters, such as the weights of a network; all features are the environment.
 
     **Arguments:**
-
     - `problem`: its space, formulas and `end` are used; the system is what `system_of` makes.
     - `parameters`: a pytree of arrays of real numbers.
     - `system_of(parameters) -> system`: pure, and traced by JAX.
     - `batch`: simulations at once.
-
     **Raises:** `TypeError` for leaves that are no real numbers; `ValueError` for a system that JAX
     cannot trace in the parameters.
     """

@@ -27,8 +27,6 @@ SLICES = 8
 """Looks at what is proved before the parameters come closer."""
 ENOUGH = 0.9
 """Share of the box without known failures at which a proved one is wide enough."""
-
-
 Corner: TypeAlias = Float[np.ndarray, " dim"]
 
 
@@ -67,13 +65,11 @@ def prove_around(
     """Prove a box of parameters around a point; None if no box was proved in time.
 
     **Arguments:**
-
     - `problem`: one that `enclosable` gave.
     - `point`: of the unit cube; its `chosen` coordinates are the parameters.
     - `low`, `high`: corners of the part of the cube in which the other features lie.
     - `seconds`: how long, about.
     - `precision`, `seed`: as of `verify`.
-
     **Raises:** `MissingRule` for an operation of the system that sets cannot go through.
     """
     started, end = time.perf_counter(), time.perf_counter() + seconds
@@ -129,7 +125,6 @@ class _Hope:
     """The box of parameters around a point that holds none which is known to fail.
 
     **Arguments:**
-
     - `low`, `high`: corners of the part of the cube that is looked at.
     - `point`, `chosen`: as in `prove_around`.
     """

@@ -155,7 +155,6 @@ class Round(NamedTuple):
     """One round of a repair: the attack on the present parameters.
 
     **Fields:**
-
     - `attacked`: environments simulated; `counterexamples` among them; `worst` robustness.
     - `change`: of the parameters from the nominal ones, Euclidean in unit coordinates (or in the
       arrays' own).
@@ -171,7 +170,6 @@ class RepairEstimates(NamedTuple):
     """Failure probabilities before and after a repair, as `Repair.estimate` returns them.
 
     **Fields:**
-
     - `name`: the name of the problem.
     - `before`, `after`: an `Estimate` each.
     """
@@ -226,7 +224,6 @@ class Repair(Drawn, InNotebook):
 
     _picture = "repair", "plot_repair"
     """The worst robustness that each attack found."""
-
     name: str
     before: Any
     parameters: Any
@@ -277,10 +274,8 @@ class Repair(Drawn, InNotebook):
         looks for them, as `vj.estimate` does.
 
         **Arguments:**
-
         - `method`, `options`: of `vj.estimate`.
         - `budget`: simulations at most for each of the two.
-
         **Raises:** as `vj.estimate`.
         """
         estimate = lazy_import("verifai_jax.estimation", "estimate")

@@ -25,13 +25,10 @@ from verifai_jax.systems.channels import Link, Passing
 
 KnownSignals: TypeAlias = tuple[str, ...] | Mapping[str, int] | None
 """Names of signals, or names with their numbers of components, 1 for a scalar; None if unknown."""
-
 Features: TypeAlias = PyTree
 """The features of one simulation, as `FeatureSpace.unflatten` gives them; or of a batch."""
-
 Seed: TypeAlias = Key[Array, ""] | int | None
 """A random key of JAX; for a system on the host, an integer seed will also do."""
-
 Carry = TypeVar("Carry")
 
 
@@ -50,7 +47,6 @@ def outcome_of(simulate: Callable[[], Any]) -> Outcome:
     exceptions that are no `Exception` too. Only Ctrl-C ends the run.
 
     **Arguments:**
-
     - `simulate`: calls the system.
     """
     try:
@@ -92,7 +88,6 @@ class System(ForUsers):
         "refined", "renewed", "reverse_hint", "simulate_batch", "simulate_each", "switches",
         "traced_factor", "unroll", "why_error", "why_not", "with_backend", "with_links", "workers",
     ))  # fmt: skip
-
     black_box: bool = False
     # About 1 MB of a trace with 200 samples and two signals.
     lanes: int = 512
@@ -118,9 +113,7 @@ class System(ForUsers):
         """Refuse features that the system does not fit, before anything compiles.
 
         **Arguments:**
-
         - `features`: `jax.ShapeDtypeStruct`s.
-
         **Raises:** `ValueError` that says what does not fit.
         """
 
@@ -130,7 +123,6 @@ class System(ForUsers):
         None if nothing but a simulation can tell.
 
         **Arguments:**
-
         - `features`: `jax.ShapeDtypeStruct`s.
         """
         if self.black_box:
@@ -174,9 +166,7 @@ class System(ForUsers):
         """Return the same system, sampled and decided as before, at a smaller step.
 
         **Arguments:**
-
         - `factor`: the step is divided by it; a traced integer where `traced_factor` allows it.
-
         **Raises:** `ValueError` for a factor that is not a positive integer.
         """
         raise NotImplementedError(f"{self!r} has no refined(factor)")
@@ -203,7 +193,6 @@ class System(ForUsers):
         """Say why compiling this system takes minutes, and what is cheaper; empty if it is quick.
 
         **Arguments:**
-
         - `gradient`: whether derivatives are compiled too.
         """
         return ""
@@ -212,7 +201,6 @@ class System(ForUsers):
         """Return the reason why a traced simulation ended with the status `ERROR`, None if unknown.
 
         **Arguments:**
-
         - `features`: numbers by the names of the table's columns.
         """
         return None
@@ -221,9 +209,7 @@ class System(ForUsers):
         """Return what passes between the system and its policy, where faults can be.
 
         **Arguments:**
-
         - `features`: `jax.ShapeDtypeStruct`s.
-
         **Raises:** `ValueError` for a system that has no policy or controller that is known here.
         """
         raise ValueError(
@@ -243,7 +229,6 @@ class System(ForUsers):
         JAX tells of any other system. What nobody knows may.
 
         **Arguments:**
-
         - `features`: `jax.ShapeDtypeStruct`s.
         """
         return True
@@ -257,9 +242,7 @@ class System(ForUsers):
         """Simulate `n` rows on the host, in lock-step.
 
         **Arguments:**
-
         - `features`: each leaf with a leading axis `[n]`.
-
         **Returns:** a trace, each leaf with a leading axis `[n]`.
         """
         raise NotImplementedError(f"{self!r} has no simulate_batch(features, keys)")

@@ -153,7 +153,6 @@ def first_refusal(links: Iterable[Link], features: PyTree, owner: str) -> str | 
     """Return what is wrong with the numbers of the first link that `owner` cannot have; or None.
 
     **Arguments:**
-
     - `features`: numbers by name.
     """
     return next(filter(None, (link.refusal(features, owner) for link in links)), None)
@@ -190,9 +189,7 @@ class Passing(NamedTuple):
         """Return the numbers that a channel names.
 
         **Arguments:**
-
         - `channel`: `"observation"`, `"action"`, a name, or either with an index: `"action[0]"`.
-
         **Raises:** `UnknownNameError` with the nearest channel; `ValueError` for an index that does
         not exist, and a channel without numbers.
         """

@@ -11,10 +11,8 @@ def count_periods(seconds: float, period: float, name: str, of: str = "dt") -> i
     """Return the number of periods in a time.
 
     **Arguments:**
-
     - `seconds`, `period`: in seconds.
     - `name`, `of`: their names in the error.
-
     **Raises:** `ValueError` unless it is a whole number of at least 1.
     """
     number = isinstance(seconds, int | float) and math.isfinite(seconds) and period > 0

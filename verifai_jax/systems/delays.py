@@ -22,7 +22,6 @@ from verifai_jax.systems.channels import Instant, Link, Side
 
 Features: TypeAlias = PyTree
 Value: TypeAlias = Array | np.ndarray
-
 DelayOption: TypeAlias = int | Mapping[str, int]
 """The option of a delay: a number of steps, or `{feature: greatest number of steps}`."""
 FEW = 16

@@ -72,10 +72,8 @@ def check_like(
     A weakly typed number (a Python literal) may stand for any dtype that it can turn into.
 
     **Arguments:**
-
     - `same_precision`: whether real numbers must have the same number of bits; where not, whoever
       asks converts them (`as_precise_as`).
-
     **Raises:** `ValueError`: `origin` must return `role`, and the first difference.
     """
     must = f"{origin} must return {role}"

@@ -10,9 +10,16 @@ Each raises `AssertionError` that says which law is broken.
     def test_keeps_lane(features): ...
 """
 
-from verifai_jax.testing.domains import check_domain
-from verifai_jax.testing.searches import check_batch_independence, check_search
-from verifai_jax.testing.strategies import strategy
-from verifai_jax.testing.systems import check_system
+from typing import TYPE_CHECKING
 
-__all__ = ["check_batch_independence", "check_domain", "check_search", "check_system", "strategy"]
+from verifai_jax.core.lazy import attach
+
+if TYPE_CHECKING:
+    from verifai_jax.testing.domains import check_domain as check_domain
+    from verifai_jax.testing.searches import check_batch_independence as check_batch_independence
+    from verifai_jax.testing.searches import check_search as check_search
+    from verifai_jax.testing.strategies import strategy as strategy
+    from verifai_jax.testing.systems import check_system as check_system
+
+# Imported when first used: a folder inside needs few of these names.
+__getattr__, __dir__, __all__ = attach(__name__)

@@ -16,11 +16,9 @@ def check_domain(domain: Domain, *, samples: int = 64, seed: int = 0) -> None:
     """Check the laws of a domain on random points and on the corners of its cube.
 
     **Arguments:**
-
     - `domain`: to check.
     - `samples`: number of random points.
     - `seed`: the seed of the points.
-
     **Raises:** `AssertionError` naming the broken law.
     """
     size, levels = domain.size, np.array(domain.levels, int)
@@ -61,7 +59,6 @@ def check_domain(domain: Domain, *, samples: int = 64, seed: int = 0) -> None:
         atol=1e-6,
         err_msg="to_unit(from_unit(u)) must be the middle of the cell of u",
     )
-
     columns = domain.columns("value")
     rows = domain.to_columns(jax.tree.map(np.asarray, values), "value")
     assert tuple(rows) == columns, f"to_columns must give {columns}; got {tuple(rows)}"

@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from verifai_jax.core.clauses import CLAUSES, OUTCOME
+from verifai_jax.core.clauses import ABSENT, CLAUSES, OUTCOME
 from verifai_jax.core.cube import Cube
-from verifai_jax.mtl.clauses import ABSENT
 from verifai_jax.search import Observations, Search
 from verifai_jax.testing.laws import same, same_type
 
@@ -22,13 +21,11 @@ def check_search(
     """Check the contract of a search on one cube, on a quadratic robustness with failures.
 
     **Arguments:**
-
     - `search`: to check.
     - `cube`: that it searches.
     - `batch`: points in a round.
     - `rounds`: number of rounds.
     - `seed`: the seed of its random key.
-
     **Raises:** `AssertionError` naming the broken law.
     """
     search.check(cube)
@@ -73,18 +70,15 @@ def check_search(
     middle, before = run(state, 0, rounds // 2)
     _, after = run(middle, rounds // 2, rounds)
     whole = before + after
-
     _, again = run(init(key, cube, batch), 0, rounds)
     same(whole, again, "the same key must give the same points", exact=True)
     _, resumed = run(_saved(middle), rounds // 2, rounds)
     same(after, resumed, "a resumed state must go on as the saved one", exact=True)
-
     spoiled = [run(state, 0, rounds, value)[1] for value in (-1e9, np.nan)]
     law = "rows that are not valid must not influence the search"
     same(spoiled[0], spoiled[1], law, exact=True)
     for points in spoiled[0]:
         assert np.all(np.isfinite(points)), "points must be finite"
-
     # What a constraint does: some rows are those of the second proposals, some stay refused.
     first, pending = ask(state, cube, batch)
     second, pending = ask(pending, cube, batch)
@@ -92,7 +86,6 @@ def check_search(
     refused = mixed._replace(valid=mixed.valid & (np.arange(batch) % 4 != 0))
     after = tell(pending, cube, refused)
     same_type(pending, after)
-
     earlier = jax.random.uniform(jax.random.key(seed + 1), (batch, cube.dim), jnp.float32)
     rho = _evaluate(earlier, search, pending, cube).rho
     warmed = warm(state, cube, Observations(earlier, rho, jnp.ones(batch, bool)))
@@ -106,11 +99,9 @@ def check_batch_independence(search: Search, cube: Cube, *, points: int = 48) ->
     """Check that a passive search gives the same points whatever the batch size is.
 
     **Arguments:**
-
     - `search`: to check.
     - `cube`: that it searches.
     - `points`: number of points to compare.
-
     **Raises:** `AssertionError` if it does not.
     """
     sequences = []

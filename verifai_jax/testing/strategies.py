@@ -24,13 +24,10 @@ def strategy(space: FeatureSpace, nominal: Mapping[str, Any] | None = None) -> A
             assert abs(features["x"]) * features["n"] < 4
 
     **Arguments:**
-
     - `space`: a feature space.
     - `nominal`: ordinary features, towards which examples shrink; the middles of the domains, and
       the least lengths, when left out.
-
     **Returns:** a `hypothesis.strategies.SearchStrategy` of dictionaries of features.
-
     **Raises:** `ImportError` without Hypothesis; `ValueError` for nominal features outside the
     space.
     """
@@ -44,7 +41,6 @@ def strategy(space: FeatureSpace, nominal: Mapping[str, Any] | None = None) -> A
     middle[list(space.lengths)] = 0.0
     if nominal is not None:
         middle = np.array(space.point_of(space.coerce(nominal)))
-
     # Whether an item is there is drawn by itself, so that each can be shrunk away.
     counted = {length for length, *_ in space.cube.sequences}
     middle[list(counted)] = 1.0

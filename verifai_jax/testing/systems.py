@@ -19,14 +19,12 @@ def check_system(
     """Check the contract of a system on random features: pure, one clock, all its ways agree.
 
     **Arguments:**
-
     - `system`: to check, as `Problem` takes it.
     - `space`: the space of the features that it takes.
     - `samples`: number of random features.
     - `seed`: the seed of features and keys.
     - `tolerance`: difference of signals between the ways to simulate, relative to their largest
       value.
-
     **Raises:** `AssertionError` naming the broken law.
     """
     points = jax.random.uniform(jax.random.key(seed), (samples, space.dim), jnp.float32)

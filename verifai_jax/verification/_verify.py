@@ -47,7 +47,6 @@ def verify(
     time as it is simulated, with its steps; or, if `continuous`, the differential equation itself.
 
     **Arguments:**
-
     - `problem`: whose system JAX traces, without randomness of its own.
     - `budget`: seconds, about; 60 if `boxes` is left out too. One may stop at any time with Ctrl-C.
     - `boxes`: number of boxes to look at, at most.
@@ -61,9 +60,7 @@ def verify(
       next. Nothing is sampled; searches and estimates simulate steps, and do not take the result.
     - `resume`: an earlier result of the same problem, or its file, to go on with.
     - `progress`: as in `falsify`.
-
     **Returns:** the result: the three volumes, the three probabilities, the boxes.
-
     **Raises:** `ProblemError` for a black box, for a system that draws random numbers, and for what
     `continuous` cannot be about;
     `MissingRule` for an operation that sets cannot go through, with its name and line; `ValueError`

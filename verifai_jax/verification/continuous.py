@@ -16,9 +16,9 @@ from jaxtyping import PyTree
 
 from verifai_jax.mtl.expression import about_single_samples
 from verifai_jax.problem.problem import Problem, ProblemError
-from verifai_jax.sets import flow
 from verifai_jax.systems.ode.closed_loop import Ode, substep
 from verifai_jax.systems.pytree_checks import default_signals
+from verifai_jax.verification.sets import flow
 
 
 def between_samples(problem: Problem) -> Problem:

@@ -25,10 +25,10 @@ from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.verdicts import boolean_semantics, trace_verdict
 from verifai_jax.features.ranges import FeatureRanges
 from verifai_jax.problem.problem import Problem, ProblemError
-from verifai_jax.sets import Form, Interpreter, Whole
-from verifai_jax.sets.functions import FUNCTIONS
-from verifai_jax.sets.interpreter import Value, as_form, as_whole
 from verifai_jax.systems.ode import sin_cos
+from verifai_jax.verification.sets import Form, Interpreter, Whole
+from verifai_jax.verification.sets.functions import FUNCTIONS
+from verifai_jax.verification.sets.interpreter import Value, as_form, as_whole
 
 TOGETHER = 512
 """Boxes that are evaluated at once: the arrays of a step then fit the cache."""
@@ -56,7 +56,6 @@ class Enclosure:
     """The program of one simulation of a problem, for sets of features.
 
     **Arguments:**
-
     - `problem`: a checked one.
     - `precision`: the precision of simulations, `"float32"` or `"float64"`.
     """

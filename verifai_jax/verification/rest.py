@@ -21,8 +21,6 @@ from verifai_jax.verification.boxes import BROKEN, OUTSIDE, Boxes
 MARGIN = 2.0**-20
 """Distance from the faces of a box within which a point of float32 does not count as in it: the
 rounding of a point, and of the edges of discrete features."""
-
-
 Node: TypeAlias = tuple[int, float, list[int], np.ndarray, np.ndarray]
 """A cut: its coordinate, where it is, the nodes below and above it; the corners of what is decided
 where there is no cut any more."""
@@ -32,7 +30,6 @@ class Rest:
     """The part of the unit cube that is neither decided nor refused by the constraint.
 
     **Arguments:**
-
     - `boxes`: the partition of the cube.
     - `states`: those that count as decided.
 
@@ -65,7 +62,6 @@ class Rest:
         """Return whether points lie in boxes that are decided, and not near faces within the cube.
 
         **Arguments:**
-
         - `points`: of the unit cube.
         - `margin`: distance from the faces.
         - `xp`: NumPy, or JAX's, which may trace the points.

@@ -15,14 +15,13 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.lazy import lazy_import
+from verifai_jax.core.figure import Drawn, Reported
 from verifai_jax.core.notebook import InNotebook, frame_html, picture_html
+from verifai_jax.core.store.files import DamagedError, read_record, write_record
 from verifai_jax.core.text import counted, format_percent
 from verifai_jax.problem.model_digest import digest_of_model
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.confidence_sequences import anytime_interval
-from verifai_jax.store.files import DamagedError, read_record, write_record
 from verifai_jax.verification.boxes import BROKEN, OUTSIDE, PROVED, Boxes
 from verifai_jax.verification.rest import Rest, RestSpace
 
@@ -47,7 +46,7 @@ class Part(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Verification(Drawn, InNotebook):
+class Verification(Drawn, Reported, InNotebook):
     """The result of `verify`.
 
     - `name`: the name of the problem; `columns`: its unit coordinates.
@@ -63,7 +62,6 @@ class Verification(Drawn, InNotebook):
 
     _picture = "verification", "plot_verification"
     _internal = frozenset(("check_same", "left", "loosest", "note"))
-
     name: str
     columns: tuple[str, ...]
     boxes: Boxes = field(repr=False)
@@ -238,10 +236,8 @@ class Verification(Drawn, InNotebook):
         robustness has the lowest bound.
 
         **Arguments:**
-
         - `problem`: that of `rest`.
         - `budget`: simulations of the search, of which these take an eighth at most.
-
         **Returns:** the rows; None if nothing is left.
         """
         boxes = self.boxes[~np.isin(self.boxes.state, (PROVED, OUTSIDE))]
@@ -258,10 +254,8 @@ class Verification(Drawn, InNotebook):
         Its constraint refuses the boxes that are proved, so that rates are those of the rest.
 
         **Arguments:**
-
         - `problem`: the problem that was verified.
         - `precision`: the precision of the simulations of the rest, in which it was verified.
-
         **Raises:** `ValueError` for another problem or precision, and where nothing is left.
         """
         self.check_same(problem, precision)
@@ -270,27 +264,12 @@ class Verification(Drawn, InNotebook):
             raise ValueError(f"all of {problem.name!r} is proved: nothing is left to search")
         return replace(problem, space=RestSpace(problem.space, left))
 
-    def report(self, path: str | Path, **options: Any) -> Path:
-        """Write the evidence report on the verification as HTML, and its claims as JSON.
-
-        **Arguments:**
-
-        - `path`: the path of the HTML file.
-        - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`.
-
-        **Returns:** the path.
-        """
-        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
-
     def save(self, path: str | Path) -> Path:
         """Write the result as JSON; `load_verification` reads it.
 
         **Arguments:**
-
         - `path`: the path of the file, whose folder is made.
-
         **Returns:** the path.
-
         **Raises:** `OSError` that names the file, for whatever the file system refuses.
         """
         plain = {name: value for name, value in vars(self).items()

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from verifai_jax.blocks import delay_line
 from verifai_jax.systems.ode import ode
+from verifai_jax.systems.ode.blocks import delay_line
 
 
 def loop(dt):

@@ -7,7 +7,7 @@ import pytest
 from checked_types import unchecked
 from scipy.interpolate import RegularGridInterpolator
 
-from verifai_jax.blocks import LookupTable
+from verifai_jax.systems.ode.blocks import LookupTable
 
 X, Y = [1.0, 2.0, 4.0, 7.0], [0.1, 0.2, 0.4]
 NUMBERS = np.random.default_rng(0).normal(size=(4, 3))

@@ -9,9 +9,9 @@ import pytest
 from checked_types import unchecked
 from scipy.integrate import solve_ivp
 
-from verifai_jax.blocks import Switch, hysteresis, latch
 from verifai_jax.core.trace import Status
 from verifai_jax.systems.ode import ode
+from verifai_jax.systems.ode.blocks import Switch, hysteresis, latch
 
 G, BACK, ONE = 9.81, 0.8, np.float32(1)
 FLOOR = Switch(

@@ -61,7 +61,6 @@ class Clusters(Drawn, InNotebook):
 
     _picture = "clusters", "plot_clusters"
     """The clusters over the two columns that tell them apart best."""
-
     samples: Samples
     assigned: Int[np.ndarray, " n"]
     method: str
@@ -178,7 +177,6 @@ def clusters(
     """Find clusters of rows.
 
     **Arguments:**
-
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
     - `method`: `"kmeans"` looks at ordered columns only, `"kmodes"` at unordered ones only,
@@ -192,9 +190,7 @@ def clusters(
     - `seed`: an integer, a NumPy generator or a `jax.random` key.
     - `scale`: as in `Samples.scaling`.
     - `max_clusters`: clusters at most, where `count` is left out.
-
     **Returns:** `Clusters`; the same seed gives the same ones.
-
     **Raises:** `ValueError` for an unknown method; a method
     without a column that it can use; a `count` above the number of different rows, or for DBSCAN; a
     radius that is not positive, or for another method.

@@ -64,12 +64,9 @@ def count_occupied(
     """Count the cells that have rows in them.
 
     **Arguments:**
-
-    - `n`: number of rows.
     - `rows`: the features in cells.
     - `allowed`: samples of the prior in the same cells, where it is not uniform on all of them:
       cells in which none of them lies do not count.
-
     **Returns:** a table with a row for each feature, a table of the values and pairs of values that
     were never tried (1000 at most), and their number.
     """

@@ -71,7 +71,6 @@ class Samples:
         """Select samples of a run, of its table, or of any DataFrame with feature columns.
 
         **Arguments:**
-
         - `source`: a run, its table, a DataFrame with feature columns and row numbers as index, or
           `Samples`, which are taken as they are, with other `columns` where they are given.
         - `which`: `"counterexamples"`, `"safe"`, `"failed"` (rows without a verdict), or `"all"`
@@ -80,7 +79,6 @@ class Samples:
         - `columns`: what to analyse; by default all features. `"rho"` and `"rho.NAME"`, the
           robustness, are columns too, but only if named here.
         - `space`: says which columns are ordered and what their ranges are; a run knows its own.
-
         **Raises:** `TypeError` for another source; `ValueError` for another `which`, rows of a run
         that have changed since they were written, no rows,
         row numbers that are not unique integers, unknown columns (with the nearest names), or

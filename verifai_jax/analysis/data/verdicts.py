@@ -7,9 +7,7 @@ from jaxtyping import Bool
 from verifai_jax.evaluation.confirmations import NOT_CLAIMED
 
 
-def verdicts(
-    table: pd.DataFrame,
-) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+def verdicts(table: pd.DataFrame) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Return the counterexamples and the rows that keep the property.
 
     A row that violates it, and whose column `verdict` says that closer replays did not confirm it,

@@ -2,15 +2,7 @@
 
 import numpy as np
 
-from verifai_jax.analysis.sensitivity.sensitivity import (
-    RESAMPLES,
-    Sensitivity,
-    Simulator,
-    check_problem,
-    coordinates_of,
-    ranked,
-    variance_of,
-)
+from verifai_jax.analysis.sensitivity import sensitivity
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.problem.problem import Problem
@@ -25,7 +17,7 @@ def gradient_sensitivity(
     batch: int = 1024,
     temperature: float | None = None,
     progress: bool | None = None,
-) -> Sensitivity:
+) -> sensitivity.Sensitivity:
     """Mean squared gradient of the robustness by each feature, and what it bounds.
 
     `bound` is an upper bound on the total Sobol index: a feature whose bound is near 0 can be
@@ -44,14 +36,14 @@ def gradient_sensitivity(
     **Raises:** `ValueError` for a black box, a space with a constraint or without continuous
     coordinates, fewer than 16 samples; where the robustness never varies.
     """
-    check_problem(problem, "gradient sensitivity", None)
+    sensitivity.check_problem(problem, "gradient sensitivity", None)
     if problem.black_box:
         raise ValueError(
             f"the system of problem {problem.name!r} is a black box, which has no gradient; "
             "use sobol_indices or morris"
         )
     check_count("samples", samples, 16)
-    space = coordinates_of(problem)
+    space = sensitivity.coordinates_of(problem)
     continuous = np.array(space.levels) == 0
     if not continuous.any():
         raise ValueError(
@@ -64,26 +56,26 @@ def gradient_sensitivity(
 
     exponent = int(np.ceil(np.log2(samples)))
     u = qmc.Sobol(len(space.names), rng=seed).random_base2(exponent)[:samples]
-    simulate = Simulator(problem, seed, min(batch, samples), None, gradient=True)
+    simulate = sensitivity.Simulator(problem, seed, min(batch, samples), None, gradient=True)
     rho = simulate(u.astype(np.float32)[: simulate.batch], 0)
     if temperature is None:
-        temperature = 0.01 * float(np.sqrt(variance_of(rho, problem)))
+        temperature = 0.01 * float(np.sqrt(sensitivity.variance_of(rho, problem)))
     simulate.done = simulate.dropped = 0
     simulate.gradients.clear()
     rho = simulate(u.astype(np.float32), 0, temperature)
     gradient = np.concatenate(simulate.gradients)
     proper = np.isfinite(rho) & np.all(np.isfinite(gradient), axis=1)
-    variance = variance_of(np.where(proper, rho, np.nan), problem)
+    variance = sensitivity.variance_of(np.where(proper, rho, np.nan), problem)
     gradient, rho = gradient[proper].astype(np.float64), rho[proper]
     gradient[:, ~continuous] = np.nan
     generator = np.random.default_rng(seed)
     again = []
-    for _ in range(RESAMPLES):
+    for _ in range(sensitivity.RESAMPLES):
         rows = generator.integers(len(rho), size=len(rho))
         again.append(np.mean(gradient[rows] ** 2, axis=0) / (np.pi**2 * (np.var(rho[rows]) or 1)))
     low, high = np.percentile(np.array(again), [2.5, 97.5], axis=0)
     squared = np.mean(gradient**2, axis=0)
-    table = ranked(
+    table = sensitivity.ranked(
         space.names,
         {
             "bound": squared / (np.pi**2 * variance),
@@ -96,6 +88,6 @@ def gradient_sensitivity(
         by="bound",
     )
     dropped = int(np.sum(~proper))
-    return Sensitivity(
+    return sensitivity.Sensitivity(
         "Gradient sensitivity", problem.name, table, simulate.done, dropped, variance
     )

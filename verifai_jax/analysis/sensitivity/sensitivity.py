@@ -9,14 +9,13 @@ Simulation noise is held fixed while a feature changes, and counts as an input o
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.core.errors import check_names
-from verifai_jax.core.lazy import lazy_import
+from verifai_jax.core.figure import Drawn
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 from verifai_jax.evaluation.backends import resolved
@@ -25,14 +24,13 @@ from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
-
 RESAMPLES = 200
 """Bootstrap samples behind an interval."""
 MAX_SHOWN = 20
 
 
 @dataclass(frozen=True, eq=False)
-class Sensitivity(InNotebook):
+class Sensitivity(Drawn, InNotebook):
     """Result of a sensitivity analysis.
 
     **Fields:** `method`; `problem`: its name; `table`: one row a unit coordinate, the most
@@ -41,16 +39,14 @@ class Sensitivity(InNotebook):
     `variance` of the robustness.
     """
 
+    _picture = "overview", "plot_sensitivity"
+    """The indices with their intervals."""
     method: str
     problem: str
     table: "pd.DataFrame"
     simulations: int
     dropped: int
     variance: float
-
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Draw the indices with their intervals; returns the figure."""
-        return lazy_import("verifai_jax.plotting.overview", "plot_sensitivity")(self, path)
 
     def __repr__(self) -> str:
         return str(self)

@@ -3,15 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
-from verifai_jax.analysis.sensitivity.sensitivity import (
-    RESAMPLES,
-    Sensitivity,
-    Simulator,
-    check_problem,
-    coordinates_of,
-    ranked,
-    variance_of,
-)
+from verifai_jax.analysis.sensitivity import sensitivity
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.progress import shows_progress
 from verifai_jax.problem.problem import Problem
@@ -28,7 +20,7 @@ def sobol_indices(
     batch: int = 1024,
     of: str | None = None,
     progress: bool | None = None,
-) -> Sensitivity:
+) -> sensitivity.Sensitivity:
     """Shares of the robustness's variance that each feature explains, alone and in all.
 
     `first` is the share that goes away when the feature is known; `total` the share that stays
@@ -48,15 +40,15 @@ def sobol_indices(
     **Raises:** `ValueError` for a space with a constraint, whose features are not independent; for
     fewer than 16 samples; where no simulation has a verdict or the robustness never varies.
     """
-    check_problem(problem, "Sobol indices", of)
+    sensitivity.check_problem(problem, "Sobol indices", of)
     check_count("samples", samples, 16)
-    names = coordinates_of(problem).names
+    names = sensitivity.coordinates_of(problem).names
     d = len(names)
     from scipy.stats import qmc
 
     exponent = int(np.ceil(np.log2(samples)))
     points = qmc.Sobol(2 * d, rng=seed).random_base2(exponent)[:samples].astype(np.float32)
-    simulate = Simulator(problem, seed, min(batch, samples), of)
+    simulate = sensitivity.Simulator(problem, seed, min(batch, samples), of)
     a, b = points[:, :d], points[:, d:]
     # One base point has one random key, and its partner another: noise is a further coordinate.
     f_a, f_b = simulate(a, 0), simulate(b, samples)
@@ -72,15 +64,15 @@ def sobol_indices(
         names = (*names, NOISE)
     f_ab = np.stack(swapped, axis=1)
     proper = np.isfinite(f_a) & np.isfinite(f_b)
-    variance = variance_of(np.concatenate([f_a, f_b]), problem)
+    variance = sensitivity.variance_of(np.concatenate([f_a, f_b]), problem)
     first, total = _sobol_estimates(f_a, f_b, f_ab, proper)
     generator = np.random.default_rng(seed)
     again = []
-    for _ in range(RESAMPLES):
+    for _ in range(sensitivity.RESAMPLES):
         rows = generator.integers(samples, size=samples)
         again.append(_sobol_estimates(f_a[rows], f_b[rows], f_ab[rows], proper[rows]))
     low, high = np.nanpercentile(np.array(again), [2.5, 97.5], axis=0)
-    table = ranked(
+    table = sensitivity.ranked(
         names,
         {
             "first": first,
@@ -93,7 +85,7 @@ def sobol_indices(
         },
         by="total",
     )
-    return Sensitivity(
+    return sensitivity.Sensitivity(
         "Sobol indices", problem.name, table, simulate.done, simulate.dropped, variance
     )
 

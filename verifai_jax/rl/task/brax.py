@@ -27,7 +27,6 @@ from verifai_jax.systems.environments.brax_model import explain_errors
 if TYPE_CHECKING:
     from brax.envs.base import Env
     from brax.envs.base import State as BraxState
-
 Option = float | str
 """A keyword argument of an environment: a number or text."""
 
@@ -91,14 +90,11 @@ def brax_task(
     """Make a `Task` of an environment of Brax.
 
     **Arguments:**
-
     - `env`: the name of an environment of Brax, or an `Env` of your own.
     - `backend`: the physics pipeline, as for `brax`.
     - `time_limit`: in steps, after which an episode is cut off; Brax trains on 1000.
     - `options`: keyword arguments of an environment by name, numbers or text.
-
     **Returns:** a task with actions from -1 to 1 for each actuator.
-
     **Raises:** `MissingExtra` without brax; `UnknownNameError` for an unknown environment or
     backend; `ValueError` for an environment in a wrapper that resets, ends or batches episodes, for
     observations that are no array, and for a `time_limit` that is not a positive integer.
@@ -113,21 +109,15 @@ def brax_task(
 
 @suggests_options
 def playground_task(
-    env: str | PlaygroundEnv,
-    *,
-    time_limit: int = 1000,
-    options: Mapping[str, object] | None = None,
+    env: str | PlaygroundEnv, *, time_limit: int = 1000, options: Mapping[str, object] | None = None
 ) -> BraxTask:
     """Make a `Task` of an environment of MuJoCo Playground.
 
     **Arguments:**
-
     - `env`: the name of an environment, or an `MjxEnv` of your own.
     - `time_limit`: in steps, after which an episode is cut off.
     - `options`: overrides of the configuration of an environment by name.
-
     **Returns:** a task with actions from -1 to 1 for each actuator.
-
     **Raises:** `MissingExtra` without Playground; `UnknownNameError` for an unknown environment;
     `ValueError` for observations that are no array, and for one whose assets are not installed.
     """

@@ -19,14 +19,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree, Shaped
 
 from verifai_jax.core.errors import suggests_options
-from verifai_jax.rl.task.stepping import (
-    ActionAdapter,
-    ObservedState,
-    box_actions,
-    discrete_actions,
-    flat_observation,
-    match_types,
-)
+from verifai_jax.rl.task import stepping
 from verifai_jax.rl.task.task import Action
 from verifai_jax.systems.environments._gymnax import Gymnax, gymnax
 from verifai_jax.systems.pytree_checks import outline
@@ -49,7 +42,7 @@ class GymnaxTask:
 
     params: PyTree
     env: "Environment" = dataclasses.field(metadata={"static": True})
-    adapter: ActionAdapter = dataclasses.field(metadata={"static": True})
+    adapter: stepping.ActionAdapter = dataclasses.field(metadata={"static": True})
     time_limit: int = dataclasses.field(metadata={"static": True})
 
     @property
@@ -57,31 +50,31 @@ class GymnaxTask:
         """The kind of action."""
         return self.adapter.action
 
-    def reset(self, key: Key[Array, ""]) -> ObservedState:
+    def reset(self, key: Key[Array, ""]) -> stepping.ObservedState:
         """Draw the environment's own start."""
         observation, state = self.env.reset_env(key, self.params)
-        start = ObservedState(state, flat_observation(observation, self.env.name))
+        start = stepping.ObservedState(state, stepping.flat_observation(observation, self.env.name))
         action = jax.ShapeDtypeStruct(self.adapter.shape, self.adapter.dtype)
         following = jax.eval_shape(
             lambda start, action: self._step(key, start, action)[0], start, action
         )
-        return match_types(start, following, self.env.name)
+        return stepping.match_types(start, following, self.env.name)
 
     def step(
-        self, key: Key[Array, ""], state: ObservedState, action: Shaped[Array, "..."]
-    ) -> tuple[ObservedState, Float[Array, ""], Bool[Array, ""]]:
+        self, key: Key[Array, ""], state: stepping.ObservedState, action: Shaped[Array, "..."]
+    ) -> tuple[stepping.ObservedState, Float[Array, ""], Bool[Array, ""]]:
         """Take the environment's own step, `terminated` only where its episode ends for good."""
         after, reward, over = self._step(key, state, self.adapter(action))
-        after = match_types(after, state, self.env.name)
+        after = stepping.match_types(after, state, self.env.name)
         return after, jnp.asarray(reward, jnp.float32).reshape(()), over
 
-    def observe(self, state: ObservedState) -> Float[Array, " k"]:
+    def observe(self, state: stepping.ObservedState) -> Float[Array, " k"]:
         """Return the environment's observation as a vector `[k]`."""
         return state.observation
 
     def _step(
-        self, key: Key[Array, ""], state: ObservedState, action: Shaped[Array, "..."]
-    ) -> tuple[ObservedState, ArrayLike, Bool[Array, ""]]:
+        self, key: Key[Array, ""], state: stepping.ObservedState, action: Shaped[Array, "..."]
+    ) -> tuple[stepping.ObservedState, ArrayLike, Bool[Array, ""]]:
         env, params = self.env, self.params
         observation, after, reward, over, _ = env.step_env(key, state.state, action, params)
         if _may_end_at_its_limit(env, params):
@@ -91,7 +84,7 @@ class GymnaxTask:
             far = np.iinfo(np.int32).max if jnp.issubdtype(limit.dtype, jnp.integer) else jnp.inf
             endless = params.replace(max_steps_in_episode=jnp.asarray(far, limit.dtype))
             over = env.step_env(key, state.state, action, endless)[3]
-        observed = ObservedState(after, flat_observation(observation, env.name))
+        observed = stepping.ObservedState(after, stepping.flat_observation(observation, env.name))
         return observed, reward, jnp.asarray(over, bool).reshape(())
 
 
@@ -102,14 +95,11 @@ def gymnax_task(
     """Make a `Task` of an environment of gymnax.
 
     **Arguments:**
-
     - `env`: the id of a registered environment, or an `Environment` of your own.
     - `params`: the environment's parameters; its default ones when left out.
     - `time_limit`: in steps; the environment's `max_steps_in_episode` when left out.
-
     **Returns:** a task with the environment's actions: a choice, or a box. A box whose entries have
     different bounds takes actions from -1 to 1 for each. Observations are one vector of float32.
-
     **Raises:** `MissingExtra` without gymnax, or with one that is too old; `UnknownNameError` for
     an unknown environment; `ValueError` for an environment in a wrapper, a missing time limit, and
     actions or observations of another kind.
@@ -141,12 +131,14 @@ _by_name = functools.cache(_checked)
 """One object for one id, so that programs compiled for it are found again."""
 
 
-def _action_adapter(env: "Environment", params: PyTree) -> ActionAdapter:
+def _action_adapter(env: "Environment", params: PyTree) -> stepping.ActionAdapter:
     space = env.action_space(params)
     if hasattr(space, "n"):
-        return discrete_actions(space.n, getattr(space, "shape", ()), space.dtype)
+        return stepping.discrete_actions(space.n, getattr(space, "shape", ()), space.dtype)
     if hasattr(space, "low") and hasattr(space, "high"):
-        return box_actions(space.low, space.high, tuple(space.shape), space.dtype, env.name)
+        return stepping.box_actions(
+            space.low, space.high, tuple(space.shape), space.dtype, env.name
+        )
     raise ValueError(
         f"the actions of {env.name} are {space!r}; a task takes a choice of several, or a box"
     )

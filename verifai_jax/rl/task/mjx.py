@@ -158,7 +158,6 @@ def mjx_task(
     """Make a `Task` of a MuJoCo model.
 
     **Arguments:**
-
     - `model`: the path of an MJCF file, its text, an `mujoco.MjSpec` or an `mujoco.MjModel`.
     - `control_period`: seconds of a step, a multiple of the model's timestep.
     - `time_limit`: steps after which an episode is cut off.
@@ -173,9 +172,7 @@ def mjx_task(
       from -1 to 1 spread over the actuators' `ctrlrange` where all have one.
     - `vary(key, model) -> {field: array}`: fields of the MJX model that differ from one episode to
       the next, `{"body_mass": ...}`. Constants that MuJoCo derives from them stay as they are.
-
     **Returns:** a task; its states are `MjxState`.
-
     **Raises:** `MissingExtra` without MuJoCo; `FileNotFoundError`; `ValueError` for a model that
     does not compile or that MJX does not support, times that do not fit the model's timestep, and
     functions whose results have the wrong shape.

@@ -60,7 +60,6 @@ class OdeTask:
     """
 
     weights: ClassVar[tuple[str, ...]] = ()
-
     loop: Ode
     action: Action
     time_limit: int
@@ -132,7 +131,6 @@ def ode_task(
     The loop's own controller is not used.
 
     **Arguments:**
-
     - `loop`: a system made by `ode`.
     - `action`: the kind of action.
     - `reward(time, state, control, after) -> number`: the reward of one control period that begins
@@ -146,9 +144,7 @@ def ode_task(
     - `weights`: numbers that `reward` is given by name, such as `{"effort": 0.01}`. They are fields
       of the task, so that `dataclasses.replace` changes them and a sweep may vary them: all values
       share one compiled training.
-
     **Returns:** a task; its states are `OdeState`.
-
     **Raises:** `ValueError` for a loop with a traced step, discrete actions without `control`,
     weights that are no numbers or whose names are taken, and functions that do not fit together.
     """

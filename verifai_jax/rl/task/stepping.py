@@ -97,11 +97,8 @@ def match_types(state: PyTree, following: PyTree, name: str) -> PyTree:
     """Return a state in the dtypes that it has from step to step: a count may begin as an integer.
 
     **Arguments:**
-
-    - `state`: a state of the environment.
     - `following`: the state after a step, or its shapes and dtypes.
     - `name`: the environment's, for the error message.
-
     **Raises:** `ValueError` for a step that leads to a state of another structure.
     """
     if jax.tree.structure(state) != jax.tree.structure(following):

@@ -87,9 +87,7 @@ class Task(Protocol):
         """Draw a first state.
 
         **Arguments:**
-
         - `key`: a random key, of this episode's start alone.
-
         **Returns:** a state with the structure, shapes and dtypes that `step` returns.
         """
         ...
@@ -100,12 +98,10 @@ class Task(Protocol):
         """Take one step.
 
         **Arguments:**
-
         - `key`: a random key, of this step alone.
         - `state`: as `reset` or `step` returned it.
         - `action`: an int32 scalar of a `Discrete` task, a float32 vector `[size]` of a
           `Continuous` one.
-
         **Returns:** the next state; the reward; whether the episode is over for good.
         """
         ...

@@ -73,12 +73,10 @@ class _RowByRow(System):
     simulation: Simulation
 
     def abstract(self, features: Features) -> Trace | None:
-        """Return the form of the traces, if it is given."""
         return self.simulation.declared.abstract()
 
     @property
     def known_signals(self) -> KnownSignals:
-        """Signals of a trace, see `System.known_signals`."""
         return self.simulation.known_signals
 
     def may_draw(self, features: Features) -> bool:
@@ -99,7 +97,6 @@ class _RowByRow(System):
         return as_system(self.simulation.function).passing(features)
 
     def with_links(self, links: tuple[Link, ...]) -> System:
-        """Return the same simulator with faults in its loop."""
         simulation = replace(
             self.simulation, function=_bare(as_system(self.simulation.function).with_links(links))
         )
@@ -118,7 +115,6 @@ class BlackBox(_RowByRow):
         """Simulate once, with features as plain Python and NumPy values.
 
         **Arguments:**
-
         - `key`: a JAX random key, or an integer seed.
         """
         return self.simulation(plain_leaves(features), seed_of(key))
@@ -128,7 +124,6 @@ class BlackBox(_RowByRow):
 
     @property
     def can_refine(self) -> bool:
-        """True for a simulator that has a `refined(factor)` of its own."""
         return as_system(self.simulation.function).can_refine
 
     def refined(self, factor: int) -> "BlackBox":
@@ -164,7 +159,6 @@ class PooledBlackBox(_RowByRow):
     def simulate_each(
         self, features: Sequence[Features], seeds: Sequence[int]
     ) -> Iterator[tuple[int, Outcome]]:
-        """Simulate each row in a worker; see `System.simulate_each`."""
         return self.pool.outcomes(features, seeds)
 
     def _with(self, simulation: Simulation) -> System:
@@ -198,7 +192,6 @@ class VectorisedBlackBox(System):
 
     @property
     def known_signals(self) -> KnownSignals:
-        """Signals of a trace, see `System.known_signals`."""
         return None if self.declared.signals is None else self.declared.widths
 
     @property
@@ -208,7 +201,6 @@ class VectorisedBlackBox(System):
 
     @property
     def can_refine(self) -> bool:
-        """True for a simulator that has a `refined(factor)` of its own."""
         return as_system(self.function).can_refine
 
     def refined(self, factor: int) -> "VectorisedBlackBox":
@@ -221,7 +213,6 @@ class VectorisedBlackBox(System):
         return self if made is self.function else replace(self, function=made)
 
     def simulate_batch(self, features: Features, keys: Key[Array, " n"]) -> Trace:
-        """Simulate many rows at a time; see `System.simulate_batch`."""
         seeds = np.zeros(len(keys), np.uint32)
         if self.seeded:
             seeds = np.asarray(jax.vmap(jax.random.bits)(keys))
@@ -232,7 +223,6 @@ class VectorisedBlackBox(System):
         return self.seeded
 
     def abstract(self, features: Features) -> Trace | None:
-        """Return the form of one trace, if it is given."""
         return self.declared.abstract()
 
     def _simulate(self, features: Features, seeds: np.ndarray, n: int) -> Trace:
@@ -290,7 +280,6 @@ def blackbox(
     """Mark a Python function as a system that runs on the host.
 
     **Arguments:**
-
     - `function(features) -> Trace`: numbers arrive as `float` and `int`, arrays as NumPy. It may
       have a `refined(factor)`, the same function with a smaller step, to confirm failures with (not
       in workers).
@@ -306,10 +295,8 @@ def blackbox(
       is `[n]`, and so is every array of the trace; see `stack_traces`.
     - `signals`, `dt`, `length`: the form of every trace; see `TraceForm`. One that differs is a
       row with status `error`.
-
     **Returns:** a `VectorisedBlackBox` with `vectorised`, a `PooledBlackBox` with `workers`, else a
     `BlackBox`.
-
     **Raises:** `ValueError` for a function that cannot be called, or that workers cannot import,
     and for options that do not go together.
     """
@@ -346,9 +333,7 @@ def stack_traces(
 
     **Arguments:** those of `Trace`, each array with a leading axis: `signals` are `[n, time]` or
     `[n, time, k]`, `times` `[n, time]`, `valid` and `status` `[n]`.
-
     **Returns:** a `Trace` whose leaves have a leading axis `[n]`.
-
     **Raises:** as `Trace` does for the first of them.
     """
     signals = {name: with_gaps(name, signal) for name, signal in signals.items()}

@@ -19,11 +19,9 @@ class TraceForm:
     """The form that every trace of a simulator must have; a part that is None may be anything.
 
     **Arguments:**
-
     - `signals`: names of scalars, or names with their number of components (1 for a scalar).
     - `dt`: sampling period in seconds.
     - `length`: number of samples.
-
     **Raises:** `ValueError` for a declaration that no trace can meet.
     """
 

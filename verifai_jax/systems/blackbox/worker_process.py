@@ -22,7 +22,6 @@ from verifai_jax.core.user_errors import format_user_error
 from verifai_jax.systems.base import Features, Outcome
 
 preparing = False
-
 # What a worker runs. Its path is that of this process, whatever was added since it started.
 START = (
     "import sys; sys.path[:] = {path!r}; "

@@ -31,7 +31,6 @@ from verifai_jax.systems.blackbox import worker_process
 from verifai_jax.systems.blackbox.worker_process import START, main_guard, pickled_setup
 
 log = logging.getLogger("verifai_jax.workers")
-
 WORKER_ENVIRONMENT = {
     "JAX_PLATFORMS": "cpu",
     "OMP_NUM_THREADS": "1",
@@ -44,13 +43,10 @@ POLL_SECONDS = 0.5
 """Time between two checks that a silent worker is alive."""
 SLOW_IMPORT_SECONDS = 30.0
 """Time until the log says that a worker is still importing."""
-
 DROPPED = "an answer of a worker belonged to another simulation and was dropped"
 """The note of a simulation before whose answer there came one to another question."""
-
 REMEMBERED = 1 << 16
 """Simulations whose workers a pool remembers."""
-
 # True in a worker that still imports the simulator.
 _numbers = itertools.count()
 
@@ -63,12 +59,10 @@ class Pool:
     """Processes that run one simulation at a time each; started when first needed.
 
     **Arguments:**
-
     - `simulation(features, seed) -> Trace`: picklable, as `function` is.
     - `function`: the user's part of it, which errors speak of.
     - `workers`, `timeout` (s), `retries`: see `blackbox`.
     - `fresh`: each simulation gets a process of its own.
-
     **Raises:** `ValueError` for numbers out of range, and for a function that a new process cannot
     import.
     """
@@ -388,7 +382,11 @@ class _Worker:
                 if self.pipe.poll(min(max(left, 0.0), POLL_SECONDS)):
                     number, outcome = self.pipe.recv()
                     if number == self.asked:
-                        return self._noted(outcome)
+                        if not self.dropped or outcome.trace is None:
+                            return outcome
+                        notes = {**outcome.trace.notes, DROPPED: self.dropped}
+                        self.dropped = 0
+                        return outcome._replace(trace=replace(outcome.trace, notes=notes))
                     # Such as of a copy of the worker that its simulator has forked.
                     self.dropped += 1
                     continue
@@ -399,14 +397,6 @@ class _Worker:
                     return Outcome(None, Status.TIMEOUT, message)
         except Exception:  # The pipe is closed, or somebody else has written into it.
             return None
-
-    def _noted(self, outcome: Outcome) -> Outcome:
-        """Return an outcome that says how many answers to other questions came before it."""
-        if not self.dropped or outcome.trace is None:
-            return outcome
-        notes = {**outcome.trace.notes, DROPPED: self.dropped}
-        self.dropped = 0
-        return outcome._replace(trace=replace(outcome.trace, notes=notes))
 
     def kill(self) -> None:
         """Kill the process, and those that it has started."""

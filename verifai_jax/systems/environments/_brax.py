@@ -20,18 +20,7 @@ from verifai_jax.core.compilation import XlaOptimization
 from verifai_jax.core.errors import require, suggests_options, unknown_name
 from verifai_jax.systems.base import Features
 from verifai_jax.systems.delays import DelayOption
-from verifai_jax.systems.environments.brax_model import (
-    Env,
-    check_parts_are_read,
-    explain_errors,
-    joint_location,
-    steps_plainly,
-    system_location,
-    with_finer_step,
-    with_start,
-    with_system,
-    with_value,
-)
+from verifai_jax.systems.environments import brax_model
 from verifai_jax.systems.environments.episode import Moment, step_count, vector_action
 from verifai_jax.systems.environments.policy_loop import PolicyLoop, check_version, loop_options
 from verifai_jax.systems.ode.integrators import check_factor
@@ -68,7 +57,7 @@ class Brax(PolicyLoop):
     @property
     def traced_factor(self) -> bool:
         """True where JAX may trace the factor of `refined`."""
-        return not self.exact_step and steps_plainly(self.env)
+        return not self.exact_step and brax_model.steps_plainly(self.env)
 
     def refined(self, factor: int | Int[Array, ""]) -> "Brax":
         """Return the same episode, decided and sampled as before, at a `factor` times smaller step.
@@ -87,24 +76,26 @@ class Brax(PolicyLoop):
             )
         if not isinstance(factor, jax.Array):
             check_factor(factor)
-        return replace(self, env=with_finer_step(self.env, factor, self.name))
+        return replace(self, env=brax_model.with_finer_step(self.env, factor, self.name))
 
-    def _start(self, configured: Env, features: Features, key: Key[Array, ""]) -> Moment:
+    def _start(self, configured: brax_model.Env, features: Features, key: Key[Array, ""]) -> Moment:
         env = configured
         if callable(self.initial):
             return _moment(self.initial(env, features, key), self.name)
         if self.initial:
-            env = with_start(
+            env = brax_model.with_start(
                 env, {location: features[name] for name, location in self.initial.items()}
             )
-        with explain_errors(self.env, self.name, "reset"):
+        with brax_model.explain_errors(self.env, self.name, "reset"):
             return _moment(env.reset(key), self.name)
 
-    def _step(self, configured: Env, state: Env, action: PyTree, key: Key[Array, ""]) -> Moment:
-        with explain_errors(self.env, self.name, "step"):
+    def _step(
+        self, configured: brax_model.Env, state: brax_model.Env, action: PyTree, key: Key[Array, ""]
+    ) -> Moment:
+        with brax_model.explain_errors(self.env, self.name, "step"):
             return _moment(configured.step(state, action), self.name)
 
-    def _parts(self, state: Env) -> dict[str, Any]:
+    def _parts(self, state: brax_model.Env) -> dict[str, Any]:
         physics = getattr(state, "pipeline_state", None)
         parts = {part: getattr(physics, part, None) for part in ("q", "qd")} | dict(state.metrics)
         return {name: value for name, value in parts.items() if value is not None}
@@ -117,8 +108,8 @@ class Brax(PolicyLoop):
         if self.features:
             sys = env.unwrapped.sys
             for name, location in self.features.items():
-                sys = with_value(sys, location, features[name], name)
-            env = with_system(env, sys)
+                sys = brax_model.with_value(sys, location, features[name], name)
+            env = brax_model.with_system(env, sys)
         if self.configure is None:
             return env
         if not hasattr(env.unwrapped, "sys"):
@@ -135,12 +126,12 @@ class Brax(PolicyLoop):
                 f"configure must return the sys of {self.name}, a "
                 f"{type(env.unwrapped.sys).__name__}; got {outline(sys)}"
             )
-        return with_system(env, sys)
+        return brax_model.with_system(env, sys)
 
 
 @suggests_options
 def brax(
-    env: Env,
+    env: brax_model.Env,
     policy: object,
     *,
     steps: int | None = None,
@@ -160,7 +151,6 @@ def brax(
     """Make a system `(features, key) -> Trace` from an environment of Brax and a policy.
 
     **Arguments:**
-
     - `env`: the name of an environment, or an `Env` of your own without training wrappers.
     - `policy`: `observation -> action`, or `(observation, key) -> action` for a random one; a
       function, or an object with a method `act`, such as an `rl.Policy`. An argument `features`
@@ -200,7 +190,6 @@ def brax(
     A `Signal` feature reaches `sys` and functions as its value at the beginning of the step.
 
     **Returns:** a `Brax` system; one episode is one simulation.
-
     **Raises:** `MissingExtra` without brax, or with one that is too old; `UnknownNameError` for an
     unknown environment, backend or part; `ValueError` for a part that the backend does not read,
     and numbers that do not fit; once the system is traced, for a policy, a state or signals that
@@ -227,15 +216,19 @@ def brax(
     shared = loop_options(
         dt, policy, policy_memory, features, configure, initial, signals, delays, "sys", "env"
     )
-    locations = {f: system_location(env, path, name) for f, path in shared["features"].items()}
+    locations = {
+        f: brax_model.system_location(env, path, name) for f, path in shared["features"].items()
+    }
     if isinstance(initial, Mapping):
         if not hasattr(env, "pipeline_init"):
             raise ValueError(
                 f"{name} has no pipeline_init: initial must be a function (env, features, key) -> "
                 "State"
             )
-        shared["initial"] = {f: joint_location(env, path, name) for f, path in initial.items()}
-    check_parts_are_read(env, name, locations)
+        shared["initial"] = {
+            f: brax_model.joint_location(env, path, name) for f, path in initial.items()
+        }
+    brax_model.check_parts_are_read(env, name, locations)
     return Brax(
         **{**shared, "features": locations},
         env=env,
@@ -263,11 +256,11 @@ def _make(name: str, backend: str | None, options: dict[str, object]) -> Any:
         if backend not in BACKENDS:
             raise unknown_name("backend", backend, BACKENDS)
         options["backend"] = backend
-    with explain_errors(None, name, "construction", backend):
+    with brax_model.explain_errors(None, name, "construction", backend):
         return envs.get_environment(name, **options)
 
 
-def _check_env(env: Env, name: str) -> None:
+def _check_env(env: brax_model.Env, name: str) -> None:
     """Refuse anything that is not an environment, or one that resets itself."""
     for part in ("reset", "step", "action_size"):
         if not hasattr(type(env), part) and not hasattr(env, part):
@@ -291,7 +284,7 @@ def _check_env(env: Env, name: str) -> None:
         inner = vars(inner).get("env") if hasattr(inner, "__dict__") else None
 
 
-def _moment(state: Env, name: str) -> Moment:
+def _moment(state: brax_model.Env, name: str) -> Moment:
     missing = [part for part in ("obs", "reward", "done") if not hasattr(state, part)]
     if missing:
         raise ValueError(

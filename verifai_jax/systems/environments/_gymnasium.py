@@ -28,6 +28,7 @@ from verifai_jax.systems.base import KnownSignals
 from verifai_jax.systems.blackbox._blackbox import BlackBox, PooledBlackBox, blackbox
 from verifai_jax.systems.channels import Channels, Link, Passing
 from verifai_jax.systems.delays import NO_DELAY, Delay, DelayOption, as_delay
+from verifai_jax.systems.environments import episode_signals
 from verifai_jax.systems.environments.episode import (
     Moment,
     check_features,
@@ -35,16 +36,6 @@ from verifai_jax.systems.environments.episode import (
     first_memory,
     policy_that_sees,
     sampling_period,
-)
-from verifai_jax.systems.environments.episode_signals import (
-    as_arrays,
-    check_signals_option,
-    entry_form,
-    host_policy_function,
-    named_entries,
-    names_of_entries,
-    read_signals,
-    single_picture,
 )
 from verifai_jax.systems.environments.spaces import (
     DERIVED,
@@ -120,7 +111,10 @@ class EpisodeFunction:
         finally:
             if callable(close := getattr(drawing._env, "close", None)):
                 close()
-        return {k: single_picture(image, self.name) for k, image in drawing._drawn.items()}
+        return {
+            k: episode_signals.single_picture(image, self.name)
+            for k, image in drawing._drawn.items()
+        }
 
     def __repr__(self) -> str:
         return self.name
@@ -304,10 +298,10 @@ class EpisodeFunction:
         """Return the forms of observations and actions; the names are those of `signals`."""
         env = self.environment
         observation, action = (
-            jax.tree.map(entry_form, getattr(env, f"{name}_space").sample())
+            jax.tree.map(episode_signals.entry_form, getattr(env, f"{name}_space").sample())
             for name in ("observation", "action")
         )
-        names = names_of_entries(self.signals)
+        names = episode_signals.names_of_entries(self.signals)
         return Passing(observation, action, self.period, self.steps * self.period, names)
 
     def with_links(self, links: tuple[Link, ...]) -> "EpisodeFunction":
@@ -318,7 +312,7 @@ class EpisodeFunction:
         self, env: Env, observation: object, features: Mapping[str, Any], time: float
     ) -> Fitted:
         if self._decide is None:
-            self._decide = host_policy_function(self.policy)
+            self._decide = episode_signals.host_policy_function(self.policy)
         sees = policy_that_sees(self.policy) is not None
         options = {"features": features_at(features, time)} if sees else {}
         if self._memory is None:
@@ -342,12 +336,12 @@ class EpisodeFunction:
         features: Mapping[str, Any],
     ) -> dict[str, np.ndarray]:
         custom = callable(self.signals)
-        seen = as_arrays(observation)
+        seen = episode_signals.as_arrays(observation)
         if isinstance(seen, Mapping | tuple) and not custom:
-            seen = named_entries(seen)
-        taken = as_arrays(action) if custom else np.zeros(())
+            seen = episode_signals.named_entries(seen)
+        taken = episode_signals.as_arrays(action) if custom else np.zeros(())
         moment = Moment(env, seen, np.asarray(reward, float), np.array(False))
-        samples = read_signals(self.signals, moment, taken, features, {}, self.name)
+        samples = episode_signals.read_signals(self.signals, moment, taken, features, {}, self.name)
         if not custom:
             read, samples = samples, {}
             for name, value in read.items():
@@ -377,7 +371,6 @@ def gymnasium(
     """Make a black box from an environment of Gymnasium and a policy.
 
     **Arguments:**
-
     - `env`: the id of a registered environment, or a function that makes one; it is called once in
       each process.
     - `policy`: `observation -> action`, or an object with a method `act` that is one, such as an
@@ -406,10 +399,8 @@ def gymnasium(
       reaches the environment, as libraries do in training; False passes it on. Either way the run
       counts it and says so among its notes. Whatever else is no action of the action space is an
       error of its row.
-
     **Returns:** a black box, with `workers` one in processes of its own; one episode is one
     simulation.
-
     **Raises:** `MissingExtra` without Gymnasium; `ValueError` for options that do not fit; when the
     problem is checked, `UnknownNameError` for an attribute that the environment lacks.
     """
@@ -419,14 +410,14 @@ def gymnasium(
             raise unknown_name("environment of Gymnasium", env, package.registry)
     elif not callable(env):
         raise ValueError(f"env must be an id or a function that makes one; got {env!r}")
-    decide = host_policy_function(policy, compiled=False)
+    decide = episode_signals.host_policy_function(policy, compiled=False)
     if policy_that_sees(policy) is not None:
         decide = functools.partial(decide, features=None)
     check_called_with("policy", decide, ("observation",))
     check_called_with("configure", configure, ("env", "features"))
     check_called_with("reset", reset, ("env", "features", "seed"))
     check_count("steps", steps)
-    check_signals_option(signals, "env")
+    episode_signals.check_signals_option(signals, "env")
     if not isinstance(clip, bool):
         raise ValueError(f"clip is True or False; got {clip!r}")
     bindings = features if isinstance(features, Mapping) else {name: name for name in features}

@@ -15,12 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
-from verifai_jax.core.errors import (
-    check_names,
-    require,
-    suggests_options,
-    unknown_name,
-)
+from verifai_jax.core.errors import check_names, require, suggests_options, unknown_name
 from verifai_jax.systems.base import Features
 from verifai_jax.systems.delays import DelayOption
 from verifai_jax.systems.environments.episode import Moment, step_count, used_inputs, vector_action
@@ -28,14 +23,12 @@ from verifai_jax.systems.environments.policy_loop import PolicyLoop, check_versi
 from verifai_jax.systems.pytree_checks import check_like, outline
 
 OLDEST = (1, 0, 1)
-
 Env: TypeAlias = Any
 """A `gymnax` Environment; gymnax is an optional package, so its types cannot be imported here."""
 Params: TypeAlias = Any
 """The parameters of an environment, a dataclass of its own."""
 Space: TypeAlias = Any
 """A space of `gymnax.environments.spaces`."""
-
 # Parameters that gymnax stores but that follow from others; it does not recompute them.
 DERIVED: dict[str, dict[str, Callable[[Any], Any]]] = {
     "CartPole-v1": {
@@ -78,7 +71,6 @@ class Gymnax(PolicyLoop):
         return _as_action(action, self.env.action_space(self.params), self.name)
 
     def _configured(self, features: Features) -> Params:
-        """Return the environment's parameters under the features of an instant."""
         params = self.params
         if self.features:
             fields = {field: features[name] for name, field in self.features.items()}
@@ -131,7 +123,6 @@ def gymnax(
     """Make a system `(features, key) -> Trace` from an environment of gymnax and a policy.
 
     **Arguments:**
-
     - `env`: the id of a registered environment, or an `Environment` of your own.
     - `policy`: `observation -> action`, or `(observation, key) -> action` for a random one; a
       function, or an object with a method `act`, such as an `rl.Policy`. An argument `features`
@@ -161,7 +152,6 @@ def gymnax(
     Environments that support gradients are asked for them; differentiating any other raises.
 
     **Returns:** a `Gymnax` system; one episode is one simulation.
-
     **Raises:** `MissingExtra` without gymnax, or with one that is too old; `UnknownNameError` for
     an unknown environment or parameter; `ValueError` for numbers that do not fit, and, once the
     system is traced, for a policy, a state or signals that do not.

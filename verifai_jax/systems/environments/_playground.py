@@ -40,7 +40,6 @@ class Playground(Brax):
 
     @property
     def reverse_hint(self) -> str:
-        """A sentence on why derivatives in reverse mode may not exist."""
         return f"{self.name}: MJX's constraint solver loops until it converges"
 
     def _configured(self, features: Features) -> Any:
@@ -116,7 +115,6 @@ def playground(
     """Make a system `(features, key) -> Trace` from an environment of MuJoCo Playground.
 
     **Arguments:**
-
     - `env`: the name of an environment, or an `MjxEnv` of your own without training wrappers.
     - `policy`: `observation -> action`, or `(observation, key) -> action` for a random one; a
       function, or an object with a method `act`, such as what `vj.policy` returns.
@@ -138,9 +136,7 @@ def playground(
       left out.
     - `observation_delay`, `action_delay`: steps after which the policy sees an observation, and
       after which its action takes effect: a number, or `{feature: greatest number}`.
-
     **Returns:** a `Playground` system; one episode is one simulation.
-
     **Raises:** `MissingExtra` without Playground; `UnknownNameError` for an unknown environment or
     path; `ValueError` for an environment whose assets are not installed, for forces and controls
     in `bind`, and for numbers that do not fit.

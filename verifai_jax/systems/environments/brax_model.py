@@ -27,7 +27,6 @@ Env: TypeAlias = Any
 """A `brax.envs.Env`; Brax is an optional package, so its types cannot be imported here."""
 BraxSystem: TypeAlias = Any
 """A `brax.System`, or a part of one."""
-
 # Arrays of MuJoCo by the beginnings of their names, and what their rows are called after.
 _ROWS = {
     "body_": "mjOBJ_BODY",

@@ -104,10 +104,7 @@ def rollout(episode: Episode, key: Seed) -> Trace:
 
 
 def fold(
-    episode: Episode,
-    key: Seed,
-    carry: Carry,
-    update: Callable[[Carry, dict[str, Array]], Carry],
+    episode: Episode, key: Seed, carry: Carry, update: Callable[[Carry, dict[str, Array]], Carry]
 ) -> tuple[Carry, Int[Array, ""]]:
     """Apply `carry = update(carry, sample)` to the samples of `rollout` without storing them.
 
@@ -203,13 +200,11 @@ def policy_function(policy: object, memory: PyTree = None) -> Decide:
     """Return a user's policy as `decide(observation, memory, key, features) -> (action, memory)`.
 
     **Arguments:**
-
     - `policy`: a function of the observation, or of `(observation, key)` for a random one; or an
       object with a method `act` that is one, such as `rl.Policy`. It is given a key if that many
       arguments have no default, and the features of the instant if one is called `features`.
     - `memory`: the memory of a policy with memory at first. It is then called with `(observation,
       memory)` or `(observation, memory, key)` and returns `(action, memory)`.
-
     **Raises:** `ValueError` for something that cannot be called so.
     """
     act = getattr(policy, "act", None)

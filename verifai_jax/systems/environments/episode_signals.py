@@ -61,8 +61,6 @@ def check_signals_option(signals: object, state: str = "state") -> None:
     """Refuse a `signals=` option that `read_signals` could not use.
 
     - `state`: what a function gets first, as text.
-
-    **Raises:** `ValueError`.
     """
     if signals is None:
         return

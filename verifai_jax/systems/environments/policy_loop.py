@@ -79,12 +79,6 @@ class PolicyLoop(System):
         carry: Carry,
         update: Callable[[Carry, dict[str, Array]], Carry],
     ) -> tuple[Carry, Int[Array, ""]]:
-        """Simulate, and let `carry = update(carry, sample)` take in each sample; none is stored.
-
-        After an early end the last valid sample repeats until the last step.
-
-        **Returns:** the last carry, and the status.
-        """
         return fold(self._episode(features), key, carry, update)
 
     def _configured(self, features: Features) -> Any:
@@ -146,10 +140,6 @@ class PolicyLoop(System):
         )
 
     def check(self, features: Features) -> None:
-        """Refuse features that do not exist, or that nothing would read.
-
-        **Raises:** `UnknownNameError`, `ValueError`.
-        """
         starts = self.initial if isinstance(self.initial, Mapping) else {}
         read = [name for link in self.links for name in link.features]
         check_features(
@@ -181,7 +171,6 @@ class PolicyLoop(System):
         return Passing(observation, action, self.dt, self.duration, names)
 
     def with_links(self, links: tuple[Link, ...]) -> "PolicyLoop":
-        """Return the same loop with faults in it."""
         return replace(self, links=joined(self.links, links))
 
 
@@ -200,10 +189,8 @@ def loop_options(
     """Check the options that all environments have, and return them as `PolicyLoop` takes them.
 
     **Arguments:**
-
     - `delays`: the delays of observations and of actions.
     - `configured`, `started`: what `configure`, and a function `initial`, is called with first.
-
     **Raises:** `ValueError` for an option that cannot be used.
     """
     seconds = sampling_period(dt)

@@ -43,11 +43,7 @@ def check_space(space: Space, name: str, delayed: bool) -> None:
     """Refuse an action space for which no action can be checked, before anything is simulated.
 
     **Arguments:**
-
-    - `name`: the name of the environment.
     - `delayed`: whether actions arrive late, so that one has to stand for none.
-
-    **Raises:** `ValueError`.
     """
     if space is None:
         raise ValueError(f"{name} has no action_space, by which the policy's actions are checked")
@@ -108,10 +104,8 @@ def fit(space: Space, action: object, clip: bool = True) -> Fitted:
     """Return an action in the form that the environment takes.
 
     **Arguments:**
-
     - `clip`: whether what lies outside the bounds of a Box is set to the nearest bound, as training
       libraries do, or passed on. Either way `outside` says so.
-
     **Raises:** `Misfit` for a value that is not an action of the space.
     """
     kind = kind_of(space)

@@ -31,10 +31,8 @@ from verifai_jax.systems.fmu.library import FMUError, Instance
 
 if TYPE_CHECKING:
     import pandas as pd
-
 Controller: TypeAlias = Callable[[float, dict[str, float], Features], Mapping[str, float]]
 """From time, outputs by name and features to inputs by name."""
-
 _instances: dict[tuple[Path, bool, str], Instance] = {}
 """Instances of this process, which the next simulation resets and uses again."""
 
@@ -51,7 +49,6 @@ class FMUSimulation:
     controller: Controller | None
     reuse: bool
     description: Description = field(repr=False)
-
     exact_step = True
     """The steps belong to the FMU and its controller."""
 
@@ -194,7 +191,6 @@ def fmu(
     trust.
 
     **Arguments:**
-
     - `file`: the FMU.
     - `duration`: seconds of a simulation.
     - `dt`: seconds between two samples, which is the step of communication.
@@ -210,9 +206,7 @@ def fmu(
       FMU cannot save its state; False for an FMU whose reset forgets something.
     - `exchange`: whether its equations are integrated here, by model exchange; when left out only
       those of an FMU without a solver of its own.
-
     **Returns:** the system.
-
     **Raises:** `FileNotFoundError`; `ValueError` for a file that is no such FMU, without a binary
     for this machine, for variables that do not exist, and times out of range.
     """
@@ -266,13 +260,10 @@ def fmu_ranges(
     """Return the ranges that an FMU declares of variables, for `Box(low, high)`.
 
     **Arguments:**
-
     - `file`: the FMU.
     - `names`: parameters, start values or inputs.
     - `around`: share of the start value to both sides, for variables without a range, such as 0.2.
-
     **Returns:** the low and the high end for each name.
-
     **Raises:** `ValueError` for a variable without a range, if `around` is left out or it has no
     start value; as `fmu`.
     """

@@ -140,10 +140,8 @@ def read_description(file: str | Path, exchange: bool | None = None) -> Descript
     """Read the description of an FMU.
 
     **Arguments:**
-
     - `exchange`: whether its model exchange is meant; its co-simulation, if it has one, when left
       out.
-
     **Raises:** `FileNotFoundError`; `ValueError` for a file that is no FMU of FMI 2 or 3, lacks
     what is meant, or declares a document type.
     """

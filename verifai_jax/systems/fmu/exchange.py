@@ -49,7 +49,6 @@ class ExchangeInstance(Instance):
     _running = _sized = False
 
     def begin(self, values: Mapping[str, float], duration: float) -> None:
-        """Set start values, and initialize; after an earlier simulation the instance is reset."""
         self._running = False
         super().begin(values, duration)
         self._running, self._ended = True, False
@@ -79,7 +78,6 @@ class ExchangeInstance(Instance):
         self._sized = True
 
     def set(self, values: Mapping[str, float]) -> None:
-        """Set variables by name; a change of an input is an event."""
         if self._running:
             if all(self._inputs.get(name) == value for name, value in values.items()):
                 return

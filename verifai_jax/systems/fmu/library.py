@@ -28,7 +28,6 @@ C_TYPES: dict[str, Any] = {
 """C types of the values; Boolean is one byte in FMI 3."""
 MESSAGES = 5
 """Last messages of an FMU that an error repeats."""
-
 Logger2 = ctypes.CFUNCTYPE(None, c_void_p, c_char_p, c_int, c_char_p, c_char_p)
 Logger3 = ctypes.CFUNCTYPE(None, c_void_p, c_int, c_char_p, c_char_p)
 
@@ -63,10 +62,8 @@ class Instance:
     """An instance of an FMU; `begin` may be called again after a simulation.
 
     **Arguments:**
-
     - `description`: the description of the FMU.
     - `folder`: where the FMU is unpacked.
-
     **Raises:** `FMUError` where the binary cannot be loaded or does not make an instance.
     """
 

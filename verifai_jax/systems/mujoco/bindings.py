@@ -29,14 +29,12 @@ from verifai_jax.systems.mujoco.part_paths import GEOM_MASS, Location, locate
 
 STATE = ("qpos", "qvel", "act", "mocap_pos", "mocap_quat")
 APPLIED = ("ctrl", "xfrc_applied", "qfrc_applied")
-
 # Parameters from which `mj_setConst` derives others.
 _DERIVED_FROM = {
     *("body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat"),
     *("jnt_pos", "jnt_axis", "dof_armature", "tendon_armature", "tendon_stiffness"),
     *("geom_size", "geom_pos", "geom_quat", "site_pos", "site_quat", "actuator_gear"),
 }
-
 Bound = Mapping[str, "str | Scaled | Sequence[str | Scaled]"]
 
 

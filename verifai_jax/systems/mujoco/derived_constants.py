@@ -23,7 +23,6 @@ from verifai_jax.systems.mujoco.part_paths import GEOM_MASS, MjModel
 
 _PLANE, _HFIELD, _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = range(7)
 _SHAPES = (_SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX)
-
 Leaves = dict[str, Float[Array, "..."]]
 
 
@@ -53,11 +52,9 @@ def bodies_of_geoms(
     A model without a spec, and a body with an explicit `<inertial>`, keep their inertia.
 
     **Arguments:**
-
     - `model`: with the spec that it came from.
     - `changed`: numbers of geoms of another size or in another location.
     - `massive`: numbers of geoms with another mass, and the paths that say so.
-
     **Raises:** `ValueError` for a body whose inertia cannot be computed here (meshes, shells), and
     for the mass of a geom that its body's does not come from.
     """

@@ -31,7 +31,6 @@ from verifai_jax.systems.pytree_checks import (
 
 Features = Mapping[str, Any]
 Signals = Mapping[str, str | Callable[..., Any]] | Callable[..., Mapping[str, Any]]
-
 HUGE = 1e10
 """MuJoCo's `mjMAXVAL`: it calls a larger state unstable, and takes a larger control for zero."""
 

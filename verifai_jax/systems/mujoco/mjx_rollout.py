@@ -55,12 +55,9 @@ def rollout(loop: Loop, features: Features, key: Seed) -> Trace:
         qacc_warmstart=jnp.zeros_like(start["qvel"]),
         sensordata=blank.sensordata,
     )
-
     progress = loop.initial_progress(features, key)
     arrays = {name: jnp.zeros(shape, physics.qpos.dtype) for name, shape in loop.shapes.items()}
-    form: Sample = jax.eval_shape(
-        lambda: loop.sample(jnp.int32(0), arrays, progress, features)[0],
-    )
+    form: Sample = jax.eval_shape(lambda: loop.sample(jnp.int32(0), arrays, progress, features)[0])
 
     def step(
         physics: Physics,
@@ -120,9 +117,7 @@ def rollout(loop: Loop, features: Features, key: Seed) -> Trace:
     # Reverse mode keeps the state at each sample, and does a control period again for what is
     # between: memory does not grow with the substeps.
     (physics, progress), signals = jax.lax.scan(
-        jax.checkpoint(sample, prevent_cse=False),
-        (physics, progress),
-        jnp.arange(loop.periods + 1),
+        jax.checkpoint(sample, prevent_cse=False), (physics, progress), jnp.arange(loop.periods + 1)
     )
     ends = loop.terminate is not None
     status = jnp.where(progress.finite, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE))
@@ -277,11 +272,7 @@ def _cure(model: Model) -> str:
 
 
 _CURES = (
-    (
-        "spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON",
-        "solver",
-        "mjtSolver.mjSOL_NEWTON",
-    ),
+    ("spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON", "solver", "mjtSolver.mjSOL_NEWTON"),
     (
         "spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST",
         "integrator",

@@ -61,13 +61,11 @@ def load(
     """Read and compile a model.
 
     **Arguments:**
-
     - `source`: the path of an MJCF file, its text, an `mujoco.MjSpec`, or an `mujoco.MjModel`.
     - `contacts`: paths `contact/GEOM` and `contact/GEOM/GEOM`, for which a sensor is added after
       the model's own.
     - `keyframe`: name or number of the keyframe that simulations begin with.
     - `options`: fields of the model's options to set, where they are not None.
-
     **Raises:** `MissingExtra` without MuJoCo; `FileNotFoundError`; `ValueError` for text that is
     no model, for contacts of an `MjModel`, which takes no more sensors, and for a keyframe that
     the model lacks.

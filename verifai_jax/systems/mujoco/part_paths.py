@@ -17,7 +17,6 @@ from verifai_jax.core.errors import require, unknown_name
 
 MjModel: TypeAlias = Any
 """A `mujoco.MjModel`; MuJoCo is an optional package, so its types cannot be imported here."""
-
 # Where the numbers of one element lie in an array: at its id, its degrees of freedom, its part of
 # qpos, or in some columns of its row.
 _BODY = {name: f"body_{name}" for name in ("mass", "inertia", "pos", "quat", "ipos", "iquat")}
@@ -43,7 +42,6 @@ _OPTION = ("gravity", "wind", "magnetic", "density", "viscosity", "impratio")
 KINDS = ("body", "joint", "geom", "site", "actuator", "tendon", "equality", "pair")
 GEOM_MASS = "geom_mass"
 """The masses of geoms, `[ngeom]`, of which MuJoCo keeps only what they add up to in their body."""
-
 # What can be set, in addition to parameters of the model: the state at time 0, and what acts on it.
 _INPUTS = {
     "body": ("force", "torque"),
@@ -61,7 +59,6 @@ _FIELDS = {
     "equality": _EQUALITY,
     "pair": _PAIR,
 }
-
 # What can be read of a state, by kind: the name in a path, and that in MjData.
 _READINGS = {
     "joint": {"qpos": "qpos", "qvel": "qvel"},

@@ -91,12 +91,6 @@ class MuJoCo(System):
         return found
 
     def why_slow_to_compile(self, gradient: bool) -> str:
-        """Say why MJX compiles this model for minutes, and what is cheaper; empty if it is quick.
-
-        **Arguments:**
-
-        - `gradient`: whether derivatives are compiled too.
-        """
         compiled = self.loop.compiled
         stages = compiled.opt.integrator == 1  # Runge-Kutta
         if self.backend != "mjx" or not (stages or gradient) or not has_constraints(compiled):
@@ -121,7 +115,6 @@ class MuJoCo(System):
         return self.loop.passing()
 
     def with_links(self, links: tuple[Link, ...]) -> "MuJoCo":
-        """Return the same loop with faults in it."""
         return replace(self, loop=replace(self.loop, links=joined(self.loop.links, links)))
 
     @property
@@ -134,16 +127,11 @@ class MuJoCo(System):
         return "native" if has_constraints(self.loop.compiled) else "mjx"
 
     def why_not(self, backend: str) -> str | None:
-        """Return the reason why an engine cannot simulate this model; None if it can."""
         if backend not in BACKENDS:
             raise unknown_name("backend", backend, (*BACKENDS, "auto"))
         return None if backend == "native" else why_not(self.loop.bindings)
 
     def with_backend(self, name: str) -> "MuJoCo":
-        """Return the same system on one engine, or on `"auto"`.
-
-        **Raises:** `UnknownNameError`; `ValueError` with the reason where the engine cannot.
-        """
         if name != "auto" and (reason := self.why_not(name)) is not None:
             raise ValueError(f"backend {name!r} is not possible: {reason}")
         return replace(
@@ -179,12 +167,6 @@ class MuJoCo(System):
         return reverse_hint(self.loop.compiled) or ""
 
     def check(self, features: Features) -> None:
-        """Refuse features that the system does not fit; nothing compiles.
-
-        - `features`: as `jax.ShapeDtypeStruct`, or values.
-
-        **Raises:** `ValueError`.
-        """
         self.loop.check(set_durations(features, self.duration))
 
     def abstract(self, features: Features) -> Trace:
@@ -213,7 +195,6 @@ class MuJoCo(System):
         return jax.eval_shape(trace, features)
 
     def may_draw(self, features: Features) -> bool:
-        """Return whether the state at time 0, or a fault, depends on the key."""
         if any(link.draws for link in self.loop.links):
             return True
         features, key = (
@@ -265,7 +246,6 @@ def mujoco(
     """Make a system `(features, key) -> Trace` from a MuJoCo model and a controller.
 
     **Arguments:**
-
     - `model`: the path of an MJCF file, its text, an `mujoco.MjSpec` or an `mujoco.MjModel`.
     - `duration`: in seconds, a multiple of `control_period`.
     - `control_period`: seconds between two runs of the controller, a multiple of the model's
@@ -291,9 +271,7 @@ def mujoco(
     - `action_delay`: control periods after which a decision of the controller takes effect, or the
       feature that says so with the greatest that it may be, `{"latency": 5}`. Until the first one
       does, the control is the keyframe's, or zero.
-
     **Returns:** a `MuJoCo` system.
-
     **Raises:** `MissingExtra` without MuJoCo; `FileNotFoundError`; `ValueError` for a model that
     does not compile, times that do not fit, and paths that are not in the model.
     """
@@ -324,11 +302,7 @@ def mujoco(
     if delay.max_steps and controller is None:
         raise ValueError("action_delay needs a controller; got none")
     loaded = load(
-        model,
-        contacts,
-        keyframe,
-        iterations=solver_iterations,
-        ls_iterations=ls_iterations,
+        model, contacts, keyframe, iterations=solver_iterations, ls_iterations=ls_iterations
     )
     timestep = float(loaded.compiled.opt.timestep)
     loop = Loop(

@@ -45,7 +45,6 @@ def ode(
     """Make a system `(features, key) -> Trace` from equations of motion, with a fixed step.
 
     **Arguments:**
-
     - `dynamics(time, state, control, features) -> derivative`: d state / d time, in the form of the
       state; `time` in seconds; `control` is None without a controller. A `Signal` that is held
       keeps its value within a step; a piece that begins within one begins with the next.
@@ -75,10 +74,8 @@ def ode(
       is 0.
     - `switches`: jumps of the state, such as an impact or a change of the mode, at instants found
       within the step; see `vj.blocks.Switch`.
-
     **Returns:** an `Ode`. The status of its trace is `NONFINITE` if the state became NaN or
     infinite.
-
     **Raises:** `ValueError` for times that do not fit, an unknown method, and functions of other
     arguments; once the system is traced, for functions whose results do not fit together.
     """

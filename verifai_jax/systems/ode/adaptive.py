@@ -26,13 +26,11 @@ def adaptive(
     needs tolerances of 1e-6 or more.
 
     **Arguments:**
-
     - `solver`: the name of a solver of diffrax: `"Tsit5"` and `"Dopri8"` where the equations are
       not stiff, `"Kvaerno3"` and `"Kvaerno5"` (implicit) where they are.
     - `rtol`, `atol`: relative and absolute tolerance of a step's error.
     - `max_steps`: the maximum number of steps of diffrax in one step of `ode`; what needs more
       becomes `NONFINITE`.
-
     **Raises:** `MissingExtra` without diffrax, `UnknownNameError` for an unknown solver, and
     `ValueError` for tolerances that are not positive.
     """

@@ -117,7 +117,6 @@ class Ode(System):
         return Passing(state, control, period, self.duration)
 
     def with_links(self, links: tuple[Link, ...]) -> "Ode":
-        """Return the same loop with faults in it."""
         return replace(self, links=joined(self.links, links))
 
     def fold(
@@ -127,12 +126,6 @@ class Ode(System):
         carry: Carry,
         update: Callable[[Carry, dict[str, Array]], Carry],
     ) -> tuple[Any, Int[Array, ""]]:
-        """Simulate, and let `carry = update(carry, sample)` take in each sample; none is stored.
-
-        After an early end the last valid sample comes again, until the end of the duration.
-
-        **Returns:** the last carry, and the status.
-        """
         features = set_durations(features, self.duration)
         rollout = _Rollout(self, features, key)
         return rollout.fold(as_floating(self.initial(features, key), "initial"), carry, update)

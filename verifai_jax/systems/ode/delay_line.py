@@ -31,7 +31,6 @@ class DelayLine:
 
     # JAX rebuilds the class with placeholders and with batches, which have other shapes.
     __no_type_check__ = True
-
     values: Float[Array | np.ndarray, "n *shape"]
     latest: Float[Array | np.ndarray, ""]
     period: float = field(metadata={"static": True})
@@ -64,12 +63,10 @@ def delay_line(value: Any, *, longest: float, period: float) -> DelayLine:
     """Make a line that has had one value until time 0.
 
     **Arguments:**
-
     - `value`: a number or an array.
     - `longest`: seconds back at most; what is older has the value of that time.
     - `period`: seconds between two samples: `dt` for a line that `update` pushes, the control
       period for one in a controller's memory. A delay shorter than it reads the newest sample.
-
     **Raises:** `ValueError` for seconds that are not positive, and a value that is not a number.
     """
     for name, seconds in (("longest", longest), ("period", period)):

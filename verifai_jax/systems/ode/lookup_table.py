@@ -33,20 +33,17 @@ class LookupTable:
     breakpoint the derivative is that of the line after it.
 
     **Arguments:**
-
     - `axes_and_values`: the increasing breakpoints of each argument, at least two of each, and
       last the values, of shape `[len(axis), ...]` by `[len(axis), ...]` and so on. Axes after
       these make a table of vectors.
     - `beyond`: `"clip"` has the value at the end of an axis beyond it, `"extrapolate"` goes on
       along the last line.
-
     **Raises:** `ValueError` for breakpoints that do not increase, values that are not finite or of
     another shape, and an unknown `beyond`.
     """
 
     # JAX rebuilds the class with placeholders and with batches, which have other shapes.
     __no_type_check__ = True
-
     axes: tuple[tuple[float, ...], ...] = field(metadata={"static": True})
     values: Float[Array | np.ndarray, "*grid"]
     beyond: str = field(default="clip", metadata={"static": True})

@@ -23,7 +23,6 @@ Inputs: TypeAlias = tuple[PyTree, PyTree]
 """The control and the features of a step."""
 BISECTIONS = 12
 """Halvings of the step on a cubic through its ends; one of Newton's steps follows."""
-
 SHORT = 20
 """Operations of the dynamics up to which XLA compiles the stages of `rk4` written out; where there
 are more, a loop over the stages compiles faster."""
@@ -37,7 +36,6 @@ class Switch:
     derivative of the simulation is that of the hybrid system, not of one whose instants stay.
 
     **Arguments:**
-
     - `guard(time, state, features) -> number`: the switch happens where it was positive and is so
       no more. A guard that is not positive at first waits until it has been.
     - `reset(time, state, features) -> state`: the state from there on.
@@ -64,10 +62,8 @@ def hysteresis(on: Any, value: Any, low: Any, high: Any) -> Any:
     """Return the next mode of a switch with hysteresis: 1 from `high` on, 0 below `low`.
 
     **Arguments:**
-
     - `on`: the mode now, 0 or 1, which stays between the two.
     - `low`, `high`: where the mode changes; numbers, or traced.
-
     **Raises:** `ValueError` for numbers with `low` above `high`.
     """
     if is_number(low) and is_number(high) and low > high:
@@ -97,7 +93,6 @@ def switched_step(
     JAX traces the dynamics as often for many switches as for one.
 
     **Arguments:**
-
     - `dynamics(time, state, inputs) -> derivative`.
     - `inputs`: the control and the features, which guards and resets are given.
 
@@ -150,13 +145,11 @@ class _Step:
         still = replace(still, time=_still(time), dt=_still(dt))
         share, first, slope, course = still.located(_still(end), happens)
         reached = self.advance(self.derivative, time, self.state, share * dt)
-
         # The instant moves with all that the guard there depends on, and the state with it.
         value = _chosen(first, self.guards(time + share * dt, reached))
         moves = (value - _still(value)) / slope
         share = share - moves
         reached = jax.tree.map(lambda leaf, rate: leaf - rate * moves, reached, course)
-
         instant = time + share * dt
         jumped = self.reset(first, instant, reached)
         rest = self.advance(self.derivative, instant, jumped, (1 - share) * dt)

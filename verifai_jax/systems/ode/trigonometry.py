@@ -20,25 +20,28 @@ class _Coefficients(NamedTuple):
       quadrant number are exact, also where multiplication and subtraction are not fused (Cody and
       Waite, Software Manual for the Elementary Functions, 1980).
     - `largest`: the greatest angle, whose quadrant number is below 2^16, or 2^20 in float64.
+    - `shift`: 1.5 times the power of two from which on all numbers are whole: the last bits of
+      its sum with a whole number are those of the whole number.
     - `sine`, `cosine`: minimax polynomials on [-pi/4, pi/4].
     """
 
     half_pi: tuple[Any, ...]
     largest: Any
+    shift: Any
     sine: tuple[Any, ...]
     cosine: tuple[Any, ...]
 
     @classmethod
     def of(cls, dtype: Any, *groups: tuple[float, ...]) -> "_Coefficients":
-        half_pi, (largest,), sine, cosine = [tuple(map(dtype, group)) for group in groups]
-        return cls(half_pi, largest, sine, cosine)
+        half_pi, (largest, shift), *more = [tuple(map(dtype, group)) for group in groups]
+        return cls(half_pi, largest, shift, *more)
 
 
 # Parts of pi / 2 of eight bits; polynomials by S. Moshier, Cephes 2.2, sinf.c.
 _SINGLE = _Coefficients.of(
     np.float32,
     (1.5703125, 4.825592041015625e-4, 1.2665987014770508e-6, 9.92093629470503e-10),
-    (1e5,),
+    (1e5, 1.5 * 2**23),
     (-1.6666654611e-1, 8.3321608736e-3, -1.9515295891e-4),
     (4.166664568298827e-2, -1.388731625493765e-3, 2.44331571e-5),
 )
@@ -49,7 +52,7 @@ _DOUBLE = _Coefficients.of(
         1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624871116645580e-21,
         8.47842766036889956997e-32,
     ),
-    (1e6,),
+    (1e6, 1.5 * 2**52),
     (
         -1.66666666666666307295e-1, 8.33333333332211858878e-3, -1.98412698295895385996e-4,
         2.75573136213857245213e-6, -2.50507477628578072866e-8, 1.58962301576546568060e-10,
@@ -69,9 +72,7 @@ def sin_cos(
     """Return `(sin(angle), cos(angle))`, faster than two calls.
 
     **Arguments:**
-
     - `angle`: in radians, of any shape.
-
     **Returns:** values within 1.2e-7 of the true ones for angles of at most 1e5, NaN beyond; in
     float64 within 2.3e-16 for angles of at most 1e6; in any other precision those of `jnp.sin`
     and `jnp.cos`.
@@ -90,7 +91,9 @@ def sin_cos(
     square = rest * rest
     sine = rest + rest * square * _polynomial(numbers.sine, square)
     cosine = 1 - own(0.5) * square + square * square * _polynomial(numbers.cosine, square)
-    turn = quadrant.astype(jnp.int32)
+    # A conversion would look for what no integer holds; beyond `largest` all is NaN in any case.
+    bits = np.dtype(f"int{8 * angle.dtype.itemsize}")
+    turn = jax.lax.bitcast_convert_type(quadrant + numbers.shift, bits)
     swapped = (turn & 1) != 0
     sin = jnp.where(swapped, cosine, sine)
     cos = jnp.where(swapped, sine, cosine)

@@ -29,7 +29,6 @@ from verifai_jax.systems.remote.connection import Batch, File, Rules, server_con
 from verifai_jax.systems.remote.server import Server
 
 log = logging.getLogger("verifai_jax.remote")
-
 MAX_BYTES = 16 << 20
 """Bytes of one message of a client, unless `remote` is given another limit."""
 MAX_MEMORY = 256 << 20
@@ -75,7 +74,6 @@ class Remote(System):
         return max(1, len(self.clients))
 
     def abstract(self, features: Features) -> Trace | None:
-        """Return the form of the traces, if it is given."""
         return self.rules.declared.abstract()
 
     def __call__(self, features: Features, key: Seed = None) -> Trace:
@@ -158,7 +156,6 @@ def remote(
     """Make a system that programs simulate which connect to this one.
 
     **Arguments:**
-
     - `host`: the address to listen at; this machine only when left out, `"localhost"` by IPv4 and
       IPv6. Anything else needs a token.
     - `port`: 0 for any that is free, see `Remote.address`.
@@ -177,9 +174,7 @@ def remote(
     - `max_bytes`: the maximum number of bytes of one message from a client.
     - `max_memory`: bytes of unfinished messages of all clients together, at least `max_bytes`;
       beyond it the client whose message began first is sent away, and may come back.
-
     **Returns:** a `Remote`, which listens once it is needed, or in a `with` statement.
-
     **Raises:** `ValueError` for options out of range, an address beyond this machine without a
     token, files that are no certificate; when it is first needed, `OSError` for a port that is
     taken.

@@ -276,7 +276,6 @@ def keep_alive(sock: socket.socket) -> None:
 
 
 log = logging.getLogger("verifai_jax.remote")
-
 REMINDER = 10.0
 """Seconds without a client until the log says so; then twice as long, up to 60."""
 
@@ -319,10 +318,8 @@ def server_context(certificate: File, private_key: File | None) -> ssl.SSLContex
     """Return the settings of a server that shows a certificate.
 
     **Arguments:**
-
     - `certificate`: a PEM file with the certificate, and those between it and its authority.
     - `private_key`: a PEM file with its key; the same file when None. The key is not encrypted.
-
     **Raises:** `ValueError` for files that are not there, or hold no such thing.
     """
     for name, file in (("certificate", certificate), ("private_key", private_key)):

@@ -23,7 +23,6 @@ from verifai_jax.systems.remote import connection, wire
 from verifai_jax.systems.remote.connection import Absence, Batch, Client, Point, Rules, keep_alive
 
 log = logging.getLogger("verifai_jax.remote")
-
 TICK = 0.1
 """Seconds between two checks of timeouts."""
 MAX_LOGGED = 20
@@ -238,7 +237,6 @@ class Server(threading.Thread):
         """Tell a client why, and close the connection when it has had time to read it.
 
         **Arguments:**
-
         - `retry`: whether it may come back.
         """
         if client.leaving:

@@ -24,7 +24,6 @@ from verifai_jax.core.waveform import is_waveform
 
 PROTOCOL = 1
 DTYPES = ("<f8", "<f4", "<i8", "<i4", "<i2", "|i1", "|u1", "|b1")
-
 _LENGTH = struct.Struct(">I")
 
 

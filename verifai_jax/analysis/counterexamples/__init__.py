@@ -1,0 +1,30 @@
+"""Studies of a counterexample: whether it is real, how little it takes, and why."""
+
+from typing import TYPE_CHECKING
+
+from verifai_jax.core.lazy import attach
+
+if TYPE_CHECKING:
+    from verifai_jax.analysis.counterexamples._confirm import confirm as confirm
+    from verifai_jax.analysis.counterexamples._explain import Explained as Explained
+    from verifai_jax.analysis.counterexamples._explain import Influence as Influence
+    from verifai_jax.analysis.counterexamples._explain import explain as explain
+    from verifai_jax.analysis.counterexamples._replay_counterexamples import (
+        CorpusReplay as CorpusReplay,
+    )
+    from verifai_jax.analysis.counterexamples._replay_counterexamples import (
+        replay_counterexamples as replay_counterexamples,
+    )
+    from verifai_jax.analysis.counterexamples._shrink import shrink as shrink
+    from verifai_jax.analysis.counterexamples.corpus import CorpusError as CorpusError
+    from verifai_jax.analysis.counterexamples.corpus import (
+        SavedCounterexample as SavedCounterexample,
+    )
+    from verifai_jax.analysis.counterexamples.corpus import (
+        save_counterexamples as save_counterexamples,
+    )
+    from verifai_jax.analysis.counterexamples.shrunk import Shrunk as Shrunk
+    from verifai_jax.evaluation.confirmations import Confirmation as Confirmation
+    from verifai_jax.evaluation.confirmations import Confirmations as Confirmations
+
+__getattr__, __dir__, __all__ = attach(__name__)

@@ -1,0 +1,82 @@
+"""The items, such as events, that nominal has, for a failure: before all else.
+
+    u = remove_items(candidates, u)                     # a failing point, often of fewer items
+
+What is not there cannot be wrong, and has no values that somebody would have to understand. So
+items go that nominal does not have, and those come back that it has. Up to
+`EXHAUSTIVE` items all subsets are tried; of more of them runs, pairs and single ones, repeatedly
+(delta debugging: Zeller and Hildebrandt, Simplifying and isolating failure-inducing input, IEEE
+Transactions on Software Engineering 28(2), 2002).
+"""
+
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from verifai_jax.analysis.counterexamples.candidates import Candidates
+from verifai_jax.core.programs import power_of_two
+
+EXHAUSTIVE = 8
+"""Items of which all subsets are tried."""
+
+
+def remove_items(candidates: Candidates, u: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
+    """Take items away from a failing point, or put nominal's back, as long as it fails.
+
+    **Arguments:**
+    - `candidates`: simulates, and remembers what failed.
+    **Returns:** the failing point with the least difference in items from nominal that was found.
+    """
+    nominal = candidates.nominal
+    while candidates.left > 0 and (own := nominal.items(u[None])[0]):
+        points = nominal.restored(u)
+        present = _present(candidates, u)
+        drops = np.zeros((0, nominal.space.items), bool)
+        for removed in item_sets(present):
+            row = np.zeros((1, nominal.space.items), bool)
+            row[0, removed] = True
+            drops = np.concatenate([drops, row])
+        if len(drops):
+            points = np.concatenate([points, _without(candidates, u, drops)])
+        points = points[nominal.items(points) < own]
+        points = points[np.argsort(nominal.items(points), kind="stable")]
+        rho, failing = candidates(points)
+        if not failing.any():
+            return u
+        items = nominal.items(points)
+        # The fewest items, and of those the failure that is the surest.
+        u = points[np.lexsort((rho, items, ~failing))[0]]
+    return u
+
+
+def _present(candidates: Candidates, u: Float[np.ndarray, " d"]) -> Int[np.ndarray, " k"]:
+    """Return the indices of the items that are present: removing one changes the point."""
+    single = np.eye(candidates.nominal.space.items, dtype=bool)
+    changed = np.any(_without(candidates, u, single) != candidates.nominal.settle(u[None]), axis=1)
+    return np.flatnonzero(changed)
+
+
+def _without(
+    candidates: Candidates, u: Float[np.ndarray, " d"], drops: Bool[np.ndarray, "n items"]
+) -> Float[np.ndarray, "n d"]:
+    nominal, count = candidates.nominal, len(drops)
+    # Powers of two, so that few shapes are compiled.
+    padded = np.zeros((power_of_two(count), drops.shape[1]), bool)
+    padded[:count] = drops
+    points = np.repeat(u[None].astype(np.float32), len(padded), axis=0)
+    return nominal.settle(np.asarray(nominal.space.without_items(points, padded)))[:count]
+
+
+def item_sets(present: Int[np.ndarray, " k"]) -> list[list[int]]:
+    """Return sets of items to take away, all of them together among them."""
+    removed = present.tolist()
+    count = len(removed)
+    if count <= EXHAUSTIVE:
+        return [list(chosen) for n in range(count, 0, -1) for chosen in combinations(removed, n)]
+    runs = [
+        removed[begin : begin + length]
+        for length in range(count, 0, -1)
+        for begin in range(0, count - length + 1, max(1, length // 4))
+    ]
+    return runs + [list(pair) for pair in combinations(removed, 2)]

@@ -1,8 +1,0 @@
-"""Problems as tests: the corpus of counterexamples is replayed, then a budget is spent."""
-
-from verifai_jax.checking._test import Session as Session
-from verifai_jax.checking._test import session as session
-from verifai_jax.checking._test import test as test
-from verifai_jax.checking.check import Check as Check
-from verifai_jax.checking.check import CheckOutcome as CheckOutcome
-from verifai_jax.checking.check import CounterexampleFound as CounterexampleFound

@@ -1,7 +1,0 @@
-"""Paired comparison of problems: which of two controllers fails more often, on the same samples."""
-
-from verifai_jax.comparison._compare import compare as compare
-from verifai_jax.comparison._transfer import transfer as transfer
-from verifai_jax.comparison.result import Compared as Compared
-from verifai_jax.comparison.result import Comparison as Comparison
-from verifai_jax.comparison.result import Transfer as Transfer

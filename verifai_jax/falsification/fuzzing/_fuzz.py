@@ -1,0 +1,80 @@
+"""Fuzzing with a model: what may happen is a feature space, what has happened guides the search.
+
+    run = fuzz(problem, budget=20_000)                  # in addition to the formulas: finite, ended
+    run = fuzz(space=space, system=simulate, ranges={"speed": (0, 60)})       # without any formula
+    print(run); run.coverage; run.corpus; vj.shrink(run)
+
+It is a falsification with `search.Coverage`, which mutates simulations that did something new. What
+counts as new: transitions of an `Automaton` and pairs of them, cells of signals, and the clause of
+the formulas that is nearest to breaking.
+"""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.trace import Trace
+from verifai_jax.falsification import falsify
+from verifai_jax.falsification.fuzzing.implicit import with_implicit
+from verifai_jax.falsification.fuzzing.run import FuzzRun, as_fuzz_run
+from verifai_jax.features import Domain, FeatureSpace
+from verifai_jax.problem.problem import Problem
+from verifai_jax.search import Coverage, Search
+
+
+@suggests_options
+@shows_progress("fuzzing")
+def fuzz(
+    problem: Problem | None = None,
+    budget: int = 10_000,
+    *,
+    space: FeatureSpace | Mapping[str, Domain] | None = None,
+    system: Callable[..., Trace] | None = None,
+    name: str = "fuzz",
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+    cells: Mapping[str, tuple[float, float, int]] | None = None,
+    search: Search | None = None,
+    batch: int | None = None,
+    seed: int = 0,
+    max_seconds: float | None = None,
+    stop_after: int | None = None,
+    folder: str | Path | None = None,
+    precision: str = "float32",
+    backend: str | None = None,
+    confirm: bool = True,
+    progress: bool | None = None,
+    target: str | None = None,
+    keep_going: bool = False,
+) -> FuzzRun:
+    """Look for failures by covering what can happen, with or without formulas.
+
+    **Arguments:**
+    - `problem`: a problem with formulas; or none, with `space` and `system` in its place.
+    - `budget`: simulations at most.
+    - `space`, `system`: what varies and what is simulated, where there is no formula. A simulation
+      then fails if it raises, hangs, has a signal that is not finite or one outside its range.
+    - `name`: the name of the run, where there is no problem.
+    - `ranges`: signal -> `(low, high)`: within which it must stay.
+    - `cells`: signal -> `(low, high, how many)`: cells of behaviour to cover, of all these signals
+      together. When left out those of the problem's `behaviour`, or each signal with a range is cut
+      in four, where these are few.
+    - `search`: another search; `search.Coverage` when left out.
+    - all other arguments: as in `falsify`.
+
+    With formulas a simulation that raises or hangs has a status and no verdict, as in `falsify`;
+    `run.failures` has these rows too.
+
+    **Returns:** the run: `run.coverage` says what was covered of how much, `run.corpus` has the
+    rows that extended it, and `run.problem` the implicit properties.
+    **Raises:** `ValueError` for ranges or cells that are none, both or neither of a problem and a
+    space with a system; as `falsify`.
+    """
+    checked = with_implicit(problem, space, system, ranges or {}, cells, name)
+    run = falsify(
+        checked, Coverage() if search is None else search, budget,
+        batch=batch, seed=seed, max_seconds=max_seconds, stop_after=stop_after, folder=folder,
+        precision=precision, backend=backend, confirm=confirm, progress=progress, target=target,
+        keep_going=keep_going,
+    )  # fmt: skip
+    return as_fuzz_run(run)

@@ -1,0 +1,197 @@
+"""Failure modes and effects of faults: each alone, and in pairs where neither fails alone.
+
+print(fmea(problem, [vj.faults.Dropout("gyro", onset=vj.Box(0, 3), duration=vj.Box(0, 1))]))
+
+All faults are features of one problem, so that one program simulates every row; all but the
+faults of a row are off.
+"""
+
+import itertools
+import math
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from verifai_jax.analysis.counterexamples import confirm
+from verifai_jax.core.checks import check_count, check_fraction, is_number
+from verifai_jax.core.errors import check_names, suggests_options
+from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.store.cache import locked_cache
+from verifai_jax.evaluation.backends import resolved
+from verifai_jax.falsification import load, simulate
+from verifai_jax.falsification.run import Run
+from verifai_jax.faults.failure_table.effects import Found, effect_of
+from verifai_jax.faults.failure_table.result import FailureTable
+from verifai_jax.faults.failure_table.rows import Rows
+from verifai_jax.faults.fault import AtMost, Fault, FaultFeatures
+from verifai_jax.problem.problem import Problem
+
+if TYPE_CHECKING:
+    from verifai_jax.core.executors import Executor
+
+
+@suggests_options
+@shows_progress("tabling the faults of")
+def fmea(
+    problem: Problem,
+    faults: Sequence[Fault] = (),
+    *,
+    rate: float | Mapping[str, float] | None = None,
+    mission_time: float | None = None,
+    samples: int = 512,
+    budget: int = 2000,
+    pairs: bool = True,
+    confidence: float = 0.95,
+    seed: int = 0,
+    folder: str | Path | None = None,
+    executor: "Executor | None" = None,
+    target: str | None = None,
+    progress: bool | None = None,
+) -> FailureTable:
+    """Make the failure table of a system: what each fault does, and how probable that is.
+
+    **Arguments:**
+
+    - `problem`: a problem, whose own features stay nominal.
+    - `faults`: the faults of `vj.faults`, in addition to those that the problem has. Each has to
+      have a number at which it is off, such as `duration=vj.Box(0, 2)`.
+    - `rate`: occurrences in an hour, of each fault or by its name; `mission_time` in hours. A fault
+      then happens with probability `1 - exp(-rate * mission_time)`, one independent of the other.
+      Without them probabilities are those given that it happens.
+    - `samples`: of each fault, and of each pair, from the prior of its numbers.
+    - `budget`: the budget of the search for a failure where no sample fails, and of the estimate
+      where few do; 0 for neither.
+    - `pairs`: whether pairs are tried of those faults that never fail alone.
+    - `confidence`: the confidence of each interval.
+    - `seed`: the seed of everything that is drawn at random.
+    - `folder`: that keeps the counterexamples as a run, and what is simulated: a table that was cut
+      off goes on there.
+    - `executor`: whose workers simulate, as in `falsify`.
+    - `target`: `FILE.py:NAME` of the problem with its faults, for the commands that replay.
+    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+
+    **Returns:** the table, the most probable failure first.
+
+    **Raises:** `ValueError` for no fault, one that cannot be off, rates out of range or without a
+    mission time; as `Problem.with_faults`.
+    """
+    started = time.perf_counter()
+    faulty = problem.with_faults(*faults) if faults else problem
+    known = _faults_of(faulty)
+    rates = _rates(rate, mission_time, known)
+    check_fraction("confidence", confidence)
+    check_count("samples", samples)
+    for name, count in (("budget", budget), ("seed", seed)):
+        check_count(name, count, 0)
+    faulty = resolved(faulty, batch=samples, budget=samples * len(known)).problem
+    faulty.check()
+    work = {
+        "problem": faulty.name,
+        "features": {name: repr(domain) for name, domain in faulty.space.domains.items()},
+        "formulas": {name: str(formula) for name, formula in faulty.formulas.items()},
+        "samples": samples, "budget": budget, "seed": seed,
+    }  # fmt: skip
+    effects = []
+    with locked_cache(folder, "fmea") as cache:
+        cache.claim(work, faulty.sources())
+        rows = Rows(faulty, known, cache, seed, executor)
+        healthy = not rows("healthy", rows.nominal.u[None])[0][0]
+        found = [rows.try_out((name,), samples, budget) for name in known]
+        if pairs:
+            safe = [each.faults[0] for each in found if not len(each.candidates)]
+            both = [rows.try_out(pair, samples, 0) for pair in itertools.combinations(safe, 2)]
+            found += [each for each in both if len(each.candidates)]
+        starts = itertools.accumulate((len(each.candidates) for each in found), initial=0)
+        found = [each._replace(first=first) for each, first in zip(found, starts, strict=False)]
+        run, verdicts = _run_of(rows, found, folder, target), {}
+        if run is not None:
+            again = confirm(run, max_rows=len(run.table), progress=False)
+            verdicts = dict(zip(again.numbers.tolist(), again.verdict.tolist(), strict=True))
+        for each in found:
+            happens = [] if rates is None else [rates[name] * mission_time for name in each.faults]
+            chance = math.prod(-math.expm1(-number) for number in happens)
+            numbers = (chance * rows.probability(each, confidence, budget)).tolist()
+            within = dict(zip(("low", "high", "probability"), numbers, strict=True))
+            effect = effect_of(run, each, known, verdicts)
+            effects.append(replace(effect, occurrence=chance, **within))
+    effects.sort(key=lambda effect: (-effect.fails, -effect.probability, effect.faults))
+    return FailureTable(
+        faulty.name, tuple(effects), run, rates, mission_time, confidence, bool(healthy),
+        time.perf_counter() - started,
+    )  # fmt: skip
+
+
+def _run_of(
+    rows: Rows, found: list[Found], folder: str | Path | None, target: str | None
+) -> Run | None:
+    """Simulate the candidates of all faults as one run; None without any."""
+    points = [each.candidates for each in found if len(each.candidates)]
+    if not points:
+        return None
+    space = rows.problem.space
+    given = space.features_at(np.asarray(rows.nominal.settle(np.concatenate(points))))
+    frame = pd.DataFrame(space.rows(given))
+    if folder is None:
+        return simulate(rows.problem, frame, seed=rows.seed, progress=False)
+    path = Path(folder) / "counterexamples"
+    if rows.cache.note("counterexamples") is None:
+        # A run that was cut off is made again: it takes seconds.
+        shutil.rmtree(path, ignore_errors=True)
+        simulate(rows.problem, frame, seed=rows.seed, folder=path, target=target, progress=False)
+        rows.cache.note("counterexamples", len(frame))
+    return load(path, rows.problem)
+
+
+def _faults_of(problem: Problem) -> dict[str, Fault]:
+    """Return the faults of a problem by name.
+
+    **Raises:** `ValueError` for none, and for one that cannot be off.
+    """
+    known: dict[str, Fault] = {}
+    for name, domain in problem.space.domains.items():
+        if not isinstance(domain, FaultFeatures):
+            continue
+        if domain.fault is None:
+            raise ValueError(f"fmea takes faults one by one; {name!r} is {AtMost.__name__}")
+        fault = domain.fault
+        weakest = {number: fault.weakest(number) for number in fault.domains}
+        if weakest.get("duration") != 0 and weakest.get(fault.severity) != fault.off:
+            at = ", ".join(f"{number} {value:zg}" for number, value in weakest.items())
+            raise ValueError(
+                f"fault {name!r} cannot be off, at its weakest ({at}) neither: let it be short, "
+                "with duration=vj.Box(0, ...)"
+            )
+        known[name] = fault
+    if not known:
+        raise ValueError(
+            f"problem {problem.name!r} has no faults that vary: give fmea(problem, faults), each "
+            "with a domain such as duration=vj.Box(0, 1)"
+        )
+    return known
+
+
+def _rates(
+    rate: float | Mapping[str, float] | None, mission_time: float | None, known: Mapping[str, Fault]
+) -> Mapping[str, float] | None:
+    if (rate is None) != (mission_time is None):
+        got = f"({rate=}, {mission_time=})"
+        raise ValueError(f"rate (in an hour) and mission_time (in hours) go together; got {got}")
+    if rate is None:
+        return None
+    rates = dict(rate) if isinstance(rate, Mapping) else dict.fromkeys(known, rate)
+    check_names("fault", rates, known)
+    for name in known:
+        if not is_number(rates.get(name)) or not 0 <= rates[name] < np.inf:
+            raise ValueError(
+                f"rate of fault {name!r} must be a number of occurrences in an hour, 0 or more; "
+                f"got {rates.get(name)!r}"
+            )
+    if not is_number(mission_time) or not 0 <= mission_time < np.inf:
+        raise ValueError(f"mission_time must be a number of hours; got {mission_time!r}")
+    return rates

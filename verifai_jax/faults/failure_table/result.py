@@ -1,0 +1,190 @@
+"""The result of `fmea`: a row for each fault, and for each pair that fails where neither does."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from verifai_jax.core.atomic_files import replacing
+from verifai_jax.core.errors import check_names
+from verifai_jax.core.figure import Drawn
+from verifai_jax.core.lazy import lazy_import
+from verifai_jax.core.notebook import InNotebook, frame_html
+from verifai_jax.core.text import format_percent, format_seconds
+from verifai_jax.falsification.run import Run
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """The effect of a fault, or of a pair of faults.
+
+    - `faults`: their names.
+    - `fails`: whether any simulation with it, and without another fault, breaks the property.
+    - `failures`, `simulations`: the samples of the fault's prior that `probability` rests on.
+    - `severity`: the least at which one does, by the name of the number; empty if none does.
+    - `row`: the row of the counterexample in the run of the table; None if there is none.
+    - `verdict`: the verdict of the confirmation of that counterexample, see `vj.confirm`.
+    - `broken`: the name of the formula.
+    - `delay`: seconds from the onset to the violation.
+    - `shown_by`: the signal that differs first from the same simulation without the fault;
+      `shown_after` seconds from the onset.
+    - `occurrence`: probability that it happens in a mission.
+    - `probability`, `low`, `high`: of a mission that fails by it, with the interval.
+    - `command`: what simulates the counterexample again.
+    """
+
+    faults: tuple[str, ...]
+    fails: bool
+    failures: int
+    simulations: int
+    severity: Mapping[str, float] = field(default_factory=dict)
+    row: int | None = None
+    verdict: str = ""
+    broken: str = ""
+    delay: float = math.nan
+    shown_by: str = ""
+    shown_after: float = math.nan
+    occurrence: float = 1.0
+    probability: float = math.nan
+    low: float = 0.0
+    high: float = 1.0
+    command: str = ""
+
+    @property
+    def name(self) -> str:
+        """The names of the faults, as one."""
+        return " + ".join(self.faults)
+
+    @property
+    def severity_text(self) -> str:
+        """The lowest severities at which it fails."""
+        return ", ".join(f"{name} {value:z.4g}" for name, value in self.severity.items())
+
+    @property
+    def confirmed(self) -> bool:
+        """True if the counterexample failed in every closer replay."""
+        return self.verdict == "confirmed"
+
+    def __str__(self) -> str:
+        chance = f"{self.probability:z.2g} ({self.low:z.2g} to {self.high:z.2g})"
+        if not self.fails:
+            return f"{chance}, no failure in {self.simulations:,} samples"
+        if self.row is None:
+            return f"{chance}, fails under few random keys"
+        after, shown = (format_seconds(each, 3) for each in (self.delay, self.shown_after))
+        shows = f";\n    {self.shown_by} shows it after {shown}" if self.shown_by else ""
+        return (
+            f"{chance}, {self.verdict}\n    from {self.severity_text}; breaks {self.broken} "
+            f"{after} after the onset{shows}"
+        )
+
+
+COLUMNS = {
+    "fails": "fails", "severity": "severity_text", "property": "broken",
+    "onset_to_violation": "delay", "shown_by": "shown_by", "shown_after": "shown_after",
+    "occurrence": "occurrence", "probability": "probability", "low": "low", "high": "high",
+    "verdict": "verdict", "replay": "command",
+}  # fmt: skip
+"""Columns of the table, each with the attribute of an effect that it shows."""
+
+
+@dataclass(frozen=True, eq=False)
+class FailureTable(Drawn, InNotebook):
+    """Faults and their effects, the most probable failure first; made by `fmea`.
+
+    - `name`: the name of the problem.
+    - `effects`: the rows.
+    - `run`: the counterexamples as a run, for `replay`, `explain` and `confirm`; None if no fault
+      fails.
+    - `rate`: the rate of each fault, in an hour; `mission_time`: in hours; None for probabilities
+      of a failure given that the fault happens.
+    - `confidence`: the confidence of each interval.
+    - `healthy`: whether the nominal features without a fault keep the property.
+    - `seconds`: wall-clock time.
+    """
+
+    _picture = "failure_table", "plot_failure_table"
+    """The probability of each row with its interval."""
+
+    name: str
+    effects: tuple[Effect, ...]
+    run: Run | None = field(repr=False)
+    rate: Mapping[str, float] | None
+    mission_time: float | None
+    confidence: float
+    healthy: bool
+    seconds: float
+
+    def __iter__(self) -> Iterator[Effect]:
+        return iter(self.effects)
+
+    def __len__(self) -> int:
+        return len(self.effects)
+
+    def __getitem__(self, name: str) -> Effect:
+        """Return the row of a fault, or of a pair: `table["gyro_bias + motor_stuck"]`.
+
+        **Raises:** `UnknownNameError` for a fault that has none.
+        """
+        check_names("row of the failure table", [name], [each.name for each in self.effects])
+        return next(each for each in self.effects if each.name == name)
+
+    @property
+    def table(self) -> "pd.DataFrame":
+        """A row for each effect, by name."""
+        import pandas as pd
+
+        rows = [[getattr(each, name) for name in COLUMNS.values()] for each in self.effects]
+        names = pd.Index([each.name for each in self.effects], name="fault")
+        return pd.DataFrame(rows, index=names, columns=list(COLUMNS))
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write the table to a file.
+
+        **Raises:** `OSError` that names the file, for whatever the file system refuses.
+        """
+        with replacing(path) as partial:
+            self.table.to_csv(partial)
+
+    def replay(self, name: str) -> Any:
+        """Simulate the counterexample of a row again, and keep the trace.
+
+        **Raises:** `UnknownNameError`; `ValueError` for a row without a counterexample.
+        """
+        effect = self[name]
+        if effect.row is None or self.run is None:
+            raise ValueError(f"{name} has no counterexample: nothing failed with it")
+        return self.run.replay(effect.row)
+
+    def report(self, path: str | Path, **options: Any) -> Path:
+        """Write the evidence report on the table as HTML, and its claims as JSON.
+
+        **Arguments:**
+
+        - `path`: the path of the HTML file, which is returned.
+        - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`.
+        """
+        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
+
+    def __str__(self) -> str:
+        failing = [each for each in self.effects if each.fails]
+        what = "in a mission" if self.rate is not None else "given that it happens"
+        lines = [
+            f"{self.name}: {len(failing)} of {len(self.effects)} faults and pairs break the "
+            f"property; probabilities {what}, {format_percent(self.confidence)} intervals; "
+            f"{self.seconds:z.0f} s"
+        ]
+        width = max((len(each.name) for each in self.effects), default=0)
+        lines += [f"  {each.name:<{width}}  {each}" for each in self.effects]
+        if not self.healthy:
+            lines.append("  note: the nominal features break the property without any fault")
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+    def _notebook_parts(self) -> Iterator[str]:
+        yield frame_html(self.table)

@@ -1,0 +1,148 @@
+"""Simulations for a failure table: samples of faults, searches, and the least that still fails."""
+
+import zlib
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from verifai_jax.analysis.counterexamples.nominal import Nominal
+from verifai_jax.core.store.cache import Cache
+from verifai_jax.estimation import estimate
+from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.falsification import falsify
+from verifai_jax.faults.failure_table.effects import Found
+from verifai_jax.faults.fault import Fault
+from verifai_jax.problem.dependence import depends_on_key
+from verifai_jax.problem.problem import Problem
+from verifai_jax.statistics.binomial import clopper_pearson
+
+if TYPE_CHECKING:
+    from verifai_jax.core.executors import Executor
+
+LEVELS = 33
+"""Severities of one line at once; two lines, one within the other, tell a thousandth apart."""
+FOLLOWED = 6
+"""Failing samples of a fault whose severity is lowered."""
+FEW = 10
+"""Failing samples below which importance sampling or splitting estimates the probability."""
+TRIED = 32
+"""Failing samples that are simulated again beside the lowered ones: at the edge of failure another
+step, or another random key, may decide otherwise."""
+Points = Float[np.ndarray, "n d"]
+
+
+class Rows:
+    """Simulations of one problem with all faults; what was simulated before is remembered."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        faults: Mapping[str, Fault],
+        cache: Cache,
+        seed: int,
+        executor: "Executor | None",
+    ) -> None:
+        self.problem, self.faults, self.cache = problem, faults, cache
+        self.rng, self.seed, self.executor = np.random.default_rng(seed), seed, executor
+        self.nominal = Nominal.of(problem)
+        self.groups: dict[str, Int[np.ndarray, " k"]] = dict(self.nominal.groups)
+        self.draws = depends_on_key(problem)
+        self._evaluate = Evaluator(problem, 512, seed=seed, executor=executor)
+        self._count = 0
+
+    def coordinate(self, fault: str, number: str) -> int:
+        """Return the coordinate of a number of a fault."""
+        return int(self.groups[fault][list(self.faults[fault].domains).index(number)])
+
+    def __call__(self, what: str, points: Points) -> tuple[np.ndarray, np.ndarray]:
+        """Simulate points; return which violate the property, and which have a verdict."""
+        points = self.nominal.settle(points)
+        first, self._count = self._count, self._count + len(points)
+
+        def simulated() -> dict[str, np.ndarray]:
+            verdicts = self._evaluate(points, first=first)
+            return {"violated": verdicts.violated, "proper": verdicts.proper}
+
+        known = self.cache.remember(f"{what}/{zlib.crc32(points.tobytes())}", simulated)
+        return known["violated"], known["proper"]
+
+    def try_out(self, names: tuple[str, ...], samples: int, budget: int) -> Found:
+        """Sample a fault or a pair, search where nothing fails, and lower what fails."""
+        points = np.repeat(self.nominal.u[None], samples, axis=0)
+        for name in names:
+            points[:, self.groups[name]] = self.rng.random((samples, len(self.groups[name])))
+        violated, proper = self(f"samples/{'+'.join(names)}", points)
+        failing = points[violated]
+        if not len(failing) and budget:
+            failing = self._searched(names, budget)
+        if len(failing):
+            failing = self._lowered(names, failing)
+        return Found(names, failing, int(violated.sum()), int((~proper).sum()), samples)
+
+    def probability(self, found: Found, confidence: float, budget: int) -> Float[np.ndarray, "3"]:
+        """Return the interval and the probability of a failure, given that the faults happen."""
+        rate = clopper_pearson(found.failures, found.simulations, confidence, found.without)
+        enough = not len(found.candidates) or found.failures >= FEW
+        if enough or not budget or len(found.faults) > 1:
+            return np.array([rate.low, rate.high, rate.estimate])
+
+        def estimated() -> dict[str, np.ndarray]:
+            seen = estimate(
+                self.problem.only(*found.faults), budget=10 * budget, confidence=confidence,
+                seed=self.seed, progress=False, executor=self.executor,
+            )  # fmt: skip
+            chance = rate.estimate if seen.probability is None else seen.probability
+            return {"interval": np.array([seen.low, seen.high, chance])}
+
+        name = f"estimate/{'+'.join(found.faults)}/{confidence}"
+        return self.cache.remember(name, estimated)["interval"]
+
+    def _searched(self, names: Sequence[str], budget: int) -> Points:
+        """Return failing points that a search finds where no sample fails."""
+
+        def searched() -> dict[str, np.ndarray]:
+            run = falsify(
+                self.problem.only(*names), "cross_entropy", budget, seed=self.seed, confirm=False,
+                progress=False, executor=self.executor,
+            )  # fmt: skip
+            worst = run.table.counterexamples.sort_values("rho").head(FOLLOWED)
+            points = self.problem.space.points(worst) if len(worst) else self.nominal.u[None][:0]
+            return {"points": np.asarray(points, np.float32)}
+
+        return self.cache.remember(f"search/{'+'.join(names)}", searched)["points"]
+
+    def _lowered(self, names: Sequence[str], failing: Points) -> Points:
+        """Return failing points, first those with a severity as low as they still fail at."""
+        home, faults = self.nominal.u, self.faults
+        index = np.array([self.coordinate(name, faults[name].grade) for name in names])
+
+        def ordered(points: Points) -> Points:
+            away = np.abs(points[:, index] - home[index]).sum(axis=1)
+            return points[np.argsort(away, kind="stable")]
+
+        failing = ordered(failing)
+        longest = failing[:FOLLOWED].copy()
+        for name in names:
+            if "duration" in faults[name].domains and faults[name].grade != "duration":
+                # With the longest duration they may fail at less.
+                longest[:, self.coordinate(name, "duration")] = 1.0
+        starts = np.unique(np.concatenate([failing[:FOLLOWED], longest]), axis=0)
+        away = (starts[:, index] - home[index])[:, None]
+        low, high = np.zeros(len(starts)), np.ones(len(starts))
+        fails = np.zeros(len(starts), bool)
+        for turn in range(2):
+            shares = low[:, None] + (high - low)[:, None] * np.linspace(0, 1, LEVELS)
+            points = np.repeat(starts[:, None], LEVELS, axis=1)
+            points[:, :, index] = home[index] + shares[:, :, None] * away
+            label = f"severity/{'+'.join(names)}/{turn}"
+            violated = self(label, points.reshape(-1, len(home)))[0].reshape(-1, LEVELS)
+            fails, first = np.any(violated, axis=1), np.argmax(violated, axis=1)
+            each = np.arange(len(starts))
+            high = np.where(fails, shares[each, first], high)
+            low = np.where(fails, shares[each, np.maximum(first - 1, 0)], low)
+        starts[:, index] = home[index] + high[:, None] * away[:, 0]
+        # Where chance decides, a few failing points are tried many times.
+        tried = np.resize(failing, (8 * TRIED, len(home))) if self.draws else failing[:TRIED]
+        return np.concatenate([ordered(starts[fails]), tried])

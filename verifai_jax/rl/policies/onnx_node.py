@@ -1,0 +1,72 @@
+"""One operation of a graph of ONNX, and what its operators have in common."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from verifai_jax.rl.policies.errors import PolicyError
+
+Value: TypeAlias = Array
+"""A value of a graph. Where it is known before the observation, an array of NumPy takes its place,
+which has the same operations."""
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """One operation of a graph.
+
+    - `operator`, `name`: as the file has them.
+    - `inputs`, `outputs`: names of values; an input that is left out is empty.
+    - `attributes`: plain values, arrays, and subgraphs as `(nodes, outputs)`.
+    - `opset`: version of the operators.
+    """
+
+    operator: str
+    name: str
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    attributes: Mapping[str, Any]
+    opset: int
+
+    def __str__(self) -> str:
+        return f"node {self.name!r} ({self.operator})"
+
+    def get(self, name: str, default: Any) -> Any:
+        """Return an attribute, or its default."""
+        return self.attributes.get(name, default)
+
+    def refuse(self, what: object, why: str) -> None:
+        """Raise `PolicyError` if there is what the operators here do not have."""
+        if np.any(what):  # pyright: ignore[reportArgumentType, reportCallIssue]
+            raise PolicyError(f"{self} {why}")
+
+
+def known(*values: Value | None) -> bool:
+    """Return whether values do not depend on the observation: they are arrays of NumPy."""
+    return all(isinstance(v, np.ndarray | np.generic) for v in values)
+
+
+def module(*values: Value) -> Any:
+    """Return NumPy where all values are its arrays, otherwise JAX's."""
+    return np if known(*values) else jnp
+
+
+def static(node: Node, value: Value) -> tuple[int, ...]:
+    """Return numbers that say a shape, axes or indices.
+
+    **Raises:** `PolicyError` where they depend on the observation.
+    """
+    node.refuse(not known(value), "has a shape that depends on the observation")
+    return tuple(int(n) for n in np.ravel(value))
+
+
+def static_axes(node: Node, given: Value | None) -> tuple[int, ...] | None:
+    """Return axes, an attribute in old operator sets and an input in new ones."""
+    if given is not None:
+        return static(node, given) or None
+    axes = node.get("axes", None)
+    return None if axes is None else tuple(axes)

@@ -1,0 +1,70 @@
+"""A Scenic program by its text and options, which other processes can compile for themselves."""
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from verifai_jax.systems.scenic.compilation import Compiled, compile_program
+from verifai_jax.systems.scenic.sampling import Sampling
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Text and options of a program, with which any process can compile it.
+
+    - `program`: path or code.
+    - `planar`: Scenic's `mode2D`.
+    - `params`: names and values of overridden parameters.
+    - `model`, `scenario`: as `scenic` takes them.
+    """
+
+    program: str
+    planar: bool
+    params: tuple[tuple[str, Any], ...]
+    model: str | None
+    scenario: str | None
+
+    @classmethod
+    def of(
+        cls,
+        program: str | Path,
+        planar: bool,
+        params: Mapping[str, Any],
+        model: str | None,
+        scenario: str | None,
+    ) -> "Recipe":
+        """Return a recipe that holds in any process, wherever it stands."""
+        text = str(program)
+        if "\n" not in text and Path(text).is_file():
+            text = str(Path(text).resolve())
+        return cls(text, planar, tuple(params.items()), model, scenario)
+
+    def compiled(self) -> tuple[Compiled, Sampling]:
+        """Return the program as this process has compiled it, once."""
+        return compiled_recipe(_Key(self))
+
+
+class _Key:
+    """A recipe by its identity where its parameters cannot be hashed."""
+
+    def __init__(self, recipe: Recipe) -> None:
+        self.recipe = recipe
+        self._text = repr(recipe)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Key) and other._text == self._text
+
+    def __hash__(self) -> int:
+        return hash(self._text)
+
+
+@functools.lru_cache(maxsize=8)
+def compiled_recipe(key: _Key) -> tuple[Compiled, Sampling]:
+    """Compile the program of a recipe; the last ones are kept."""
+    recipe = key.recipe
+    compiled = compile_program(
+        recipe.program, recipe.planar, dict(recipe.params), recipe.model, recipe.scenario
+    )
+    return compiled, Sampling(compiled)

@@ -1,0 +1,8 @@
+"""Problems as tests: the corpus of counterexamples is replayed, then a budget is spent."""
+
+from verifai_jax.testing.checking._test import Session as Session
+from verifai_jax.testing.checking._test import session as session
+from verifai_jax.testing.checking._test import test as test
+from verifai_jax.testing.checking.check import Check as Check
+from verifai_jax.testing.checking.check import CheckOutcome as CheckOutcome
+from verifai_jax.testing.checking.check import CounterexampleFound as CounterexampleFound

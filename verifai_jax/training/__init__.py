@@ -1,0 +1,1 @@
+"""Training against failures: sweeps of configurations, hardening of a policy, augmented data."""

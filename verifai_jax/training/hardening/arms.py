@@ -1,0 +1,138 @@
+"""The policies of hardening, stage by stage: one arm with counterexamples, one with the prior.
+
+arms = TaskArms(study, values, stages, seed, cache, ("hardened", "randomised"), configured, mixture)
+arms.mix(1, [mixture, prior])
+arms.policies(1)                                    # trained up to the second stage, or cached
+
+Arms share the training seed, so that up to the first stage they are one training, and afterwards
+take the same number of environment steps, wherever an episode begins.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import jax
+import numpy as np
+
+from verifai_jax.core.store.cache import Cache
+from verifai_jax.rl.batched_training import BatchedTraining, Configuration
+from verifai_jax.training.hardening.mixture import HardeningError, Mixture, MixtureTask
+from verifai_jax.training.sweeps.clock import Clock
+from verifai_jax.training.sweeps.function_runs import FunctionRuns
+from verifai_jax.training.sweeps.study import Study
+from verifai_jax.training.sweeps.training_runs import RunCheckpoint
+
+STARTS = 4096
+"""Episodes that a function gets to train on: enough that each of 256 neighbourhoods has some."""
+
+AVERAGED = 4
+"""Weights that are averaged over the second half of a round's training: those of the last update
+alone fail, and return, more or less by chance. Source: Izmailov et al., Averaging weights leads to
+wider optima and better generalization, UAI 2018."""
+
+
+@dataclass(eq=False)
+class Arms:
+    """Trainings that go on stage by stage.
+
+    - `stages`: steps at the end of each; `names`: of the arms.
+    """
+
+    study: Study
+    values: Mapping[str, object]
+    stages: Sequence[int]
+    seed: int
+    cache: Cache
+    names: Sequence[str]
+
+
+@dataclass(eq=False)
+class TaskArms(Arms):
+    """Trainings of a task, by one compiled program."""
+
+    configured: Configuration
+    mixture: MixtureTask
+
+    def __post_init__(self) -> None:
+        self.configured.check()
+        trainer = self.study.trainer
+        untrained = trainer.untrained_policy(trainer.algorithm_name(self.values))
+        self._form = jax.tree.structure(untrained)
+        one = replace(self.configured, task=self.mixture, steps=self.stages[-1])
+        self._batch = BatchedTraining([one] * len(self.names))
+        self._mixes: dict[int, Sequence[Mixture]] = {}
+        self._reached = -1
+
+    def mix(self, stage: int, mixtures: Sequence[Mixture]) -> None:
+        """Say, for each arm, what the episodes are drawn from on the way to a stage."""
+        self._mixes[stage] = mixtures
+
+    def policies(self, stage: int) -> list[Any]:
+        """Return the policy of each arm at a stage, trained if it is not cached."""
+        names = [f"training/{stage}/{arm}" for arm in self.names]
+        stored = [self.cache.get(name) for name in names]
+        if any(arrays is None for arrays in stored):
+            # A training that was cut off is repeated from its beginning, with the same numbers.
+            leaves = [self._train(at) for at in range(self._reached + 1, stage + 1)][-1]
+            self.cache.put(
+                {
+                    name: {f"{i:03d}": np.asarray(leaf) for i, leaf in enumerate(each)}
+                    for name, each in zip(names, leaves, strict=True)
+                }
+            )
+            stored = [self.cache.get(name) for name in names]
+        known = cast("list[dict[str, np.ndarray]]", stored)
+        return [jax.tree.unflatten(self._form, [a[n] for n in sorted(a)]) for a in known]
+
+    def _train(self, stage: int) -> list[list[np.ndarray]]:
+        """Train up to a stage; return the weights of each arm, averaged from the first round on."""
+        for number, mixture in enumerate(self._mixes.get(stage, ())):
+            self._batch.change_task(number, replace(self.mixture, mixture=mixture))
+        numbers, end = range(len(self.names)), self.stages[stage]
+        middle = (self.stages[stage - 1] + end) / 2
+        policies = []
+        for steps in np.linspace(end, middle, AVERAGED, endpoint=False)[::-1] if stage else [end]:
+            for _ in self._batch.advance(dict.fromkeys(numbers, int(steps))):
+                pass
+            policies.append([jax.tree.leaves(self._batch.policy(number)) for number in numbers])
+        self._reached = stage
+        by_arm = zip(*policies, strict=True)
+        return [[np.mean(each, axis=0) for each in zip(*arm, strict=True)] for arm in by_arm]
+
+
+@dataclass(eq=False)
+class FunctionArms(Arms):
+    """Trainings by a function, which gets the features that its episodes begin with."""
+
+    def __post_init__(self) -> None:
+        study, trainer = self.study, replace(self.study.trainer, steps=self.stages[-1])
+        staged = Study(study.name, study.space, trainer, study.problem, self.stages[:-1])
+        self._runs = FunctionRuns(staged, self.cache, Clock(study.name, None, False))
+        for number, arm in enumerate(self.names):
+            self._runs.add(self.values, self.seed)
+            run = self._runs.runs[number]
+            self._runs.runs[number] = replace(run, key=f"{run.key}-{arm}")
+
+    def mix(self, stage: int, mixtures: Sequence[Mixture]) -> None:
+        """Draw, for each arm, the episodes on the way to a stage."""
+        for number, mixture in enumerate(mixtures):
+            key = jax.random.fold_in(jax.random.key(self.seed), stage)
+            own, points = jax.vmap(mixture.episode)(*jax.random.split(key, (2, STARTS)))
+            features = jax.tree.map(np.asarray, mixture.space.features_at(np.asarray(points)))
+            self._runs.starts[number] = [
+                None if is_own else jax.tree.map(lambda leaf, i=i: leaf[i], features)
+                for i, is_own in enumerate(np.asarray(own))
+            ]
+
+    def policies(self, stage: int) -> list[Any]:
+        """Return the policy of each arm at a stage, trained if it is not cached."""
+        numbers = range(len(self._runs.runs))
+        self._runs.train(numbers, stage, further=True)
+        for error in self._runs.errors.values():
+            raise HardeningError(f"{self._runs.study.trainer.name} does not train: {error}")
+        return [self.checkpoint(number, stage).policy for number in numbers]
+
+    def checkpoint(self, number: int, stage: int) -> RunCheckpoint:
+        """Return an arm at a stage that it has reached."""
+        return cast(RunCheckpoint, self._runs.checkpoint(number, stage))

@@ -1,0 +1,143 @@
+"""Failures of a stage's policy, as points around which it is trained next.
+
+found = collect(problem, failing, earlier, seed=3, added=64, table=512, shrunk=4)
+found.points, found.sources                 # [n, d], and for each where it comes from
+found.kept                                  # which earlier points stay
+
+Failures of the certificate and of its attack, and earlier points, are simulated together with
+samples of the prior; that table has rules, and failures of it are shrunk. Failing samples come
+first: they fail as often as the policy does, where the attack's are of the worst kind, which may be
+one that no policy can master.
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float
+
+from verifai_jax.analysis import rules
+from verifai_jax.analysis.counterexamples import shrink
+from verifai_jax.falsification import falsify
+from verifai_jax.problem.problem import Problem
+from verifai_jax.search import PointList
+from verifai_jax.training.hardening.mixture import NARROW, RADIUS, neighbourhoods
+
+SHRINKING = 300
+"""Simulations to shrink a counterexample: a near failure is wanted, not the nearest."""
+AROUND, THIN = 8, 0.25
+"""Samples around each point, and the share of failing ones below which its neighbourhood is narrow:
+few episodes of a wide one would show what fails."""
+PRIOR = 4096
+"""Samples of the prior of which those within the rules are kept."""
+
+
+class Collected(NamedTuple):
+    """Points of the unit cube to train around.
+
+    - `points`: `[n, d]`, new ones.
+    - `radii`: `[n]`, of their neighbourhoods.
+    - `sources`: the origin of each: `"sample"`, `"counterexample"`, `"shrunk"` or `"rule"`.
+    - `kept`: which earlier points stay: those that still fail, and as many others as points fail.
+    - `simulations`: spent to confirm and shrink.
+    """
+
+    points: Float[np.ndarray, "n d"]
+    radii: Float[np.ndarray, " n"]
+    sources: np.ndarray
+    kept: Bool[np.ndarray, " m"]
+    simulations: int
+
+
+def collect(
+    problem: Problem,
+    failing: pd.DataFrame,
+    earlier: Float[np.ndarray, "m d"],
+    *,
+    seed: int,
+    added: int,
+    table: int,
+    shrunk: int,
+) -> Collected:
+    """Confirm failures, and make the points to train around of them.
+
+    **Arguments:**
+
+    - `problem`: the problem of the policy.
+    - `failing`: rows that fail, the worst first; `earlier`: points of the rounds before.
+    - `seed`, `table`: the seed and the number of samples of the prior.
+    - `added`: the maximum number of points.
+    - `shrunk`: counterexamples that are shrunk, where the problem says what is nominal.
+    """
+    space, points, sources = problem.space, [np.zeros((0, problem.space.dim), np.float32)], []
+    if not len(failing):
+        kept = np.ones(len(earlier), bool)
+        return Collected(points[0], np.zeros(0), np.zeros(0, np.str_), kept, 0)
+
+    def add(found: Float[np.ndarray, "n d"], source: str) -> None:
+        points.append(np.asarray(found, np.float32))
+        sources.extend([source] * len(found))
+
+    # From the worst to the mildest: the worst ones alone are often of one kind.
+    spread = np.unique(np.linspace(0, len(failing) - 1, added).astype(int))
+    sampled = np.asarray(space.points_at(space.sample(jax.random.key(seed), table)))
+    tried = np.concatenate([earlier, sampled, space.points(failing.iloc[spread])])
+    run = falsify(problem, PointList(tried), len(tried), seed=seed, progress=False)
+    end_if_interrupted(run.stopped)
+    simulations, confirmed = run.simulations, run.table.counterexamples
+    if shrunk and len(confirmed):
+        worst = np.linspace(0, len(confirmed) - 1, shrunk).astype(int)
+        for row in confirmed.sort_values("rho").index[np.unique(worst)]:
+            try:
+                small = shrink(run, int(row), budget=SHRINKING, others=False, progress=False)
+            except ValueError:
+                continue  # No nominal features, or a failure of its own random key alone.
+            end_if_interrupted(small.stopped)
+            add(small.u[None], "shrunk")
+            simulations += small.simulations
+    if len(confirmed):
+        drawn = space.rows(space.sample(jax.random.key(seed + 1), PRIOR))
+        prior = pd.DataFrame({name: np.asarray(column) for name, column in drawn.items()})
+        try:
+            within = prior.loc[rules(run).matches(prior)].iloc[: added // 4]
+        except ValueError:
+            within = prior.iloc[:0]  # Nothing or everything fails, so that there is no rule.
+        if len(within):
+            add(space.points(within), "rule")
+    rows = np.asarray(confirmed.index, int)
+    fails = np.isin(np.arange(len(tried)), rows)
+    first, last = len(earlier), len(earlier) + table
+    add(tried[rows[(rows >= first) & (rows < last)]][: added // 2], "sample")
+    add(tried[rows[rows >= last]][: max(added - len(sources), 0)], "counterexample")
+    kept = fails[:first]
+    passing = np.flatnonzero(~kept)
+    kept[passing[max(len(passing) - int(kept.sum()) - len(sources), 0) :]] = True
+    centres = np.concatenate(points)
+    radii, spent = _radii(problem, centres, seed)
+    return Collected(centres, radii, np.array(sources, np.str_), kept, simulations + spent)
+
+
+def _radii(
+    problem: Problem, centres: Float[np.ndarray, "n d"], seed: int
+) -> tuple[Float[np.ndarray, " n"], int]:
+    """Return how far failures reach around points, and the simulations that it took to see it."""
+    space, count = problem.space, len(centres)
+    low, high = (np.repeat(ends, AROUND, 0) for ends in neighbourhoods(space, centres, RADIUS))
+    points = low + np.random.default_rng(seed).random(low.shape) * (high - low)
+    possible = np.asarray(jax.vmap(space.accepts)(space.features_at(points)))
+    run = falsify(
+        problem, PointList(points[possible]), int(possible.sum()), seed=seed, confirm=False,
+        progress=False,
+    )  # fmt: skip
+    end_if_interrupted(run.stopped)
+    fails = np.zeros(len(points), bool)
+    fails[np.flatnonzero(possible)[np.asarray(run.table.violating.index, int)]] = True
+    thin = fails.reshape(count, AROUND).mean(axis=1) < THIN
+    return np.where(thin, NARROW, RADIUS), run.simulations
+
+
+def end_if_interrupted(stopped: str | None) -> None:
+    """Raise again the Ctrl-C that a result ended early by: part of it is no round's number."""
+    if stopped == "interrupted":
+        raise KeyboardInterrupt

@@ -1,0 +1,84 @@
+"""The clock of a sweep: seconds of each stage, the time limit, and a progress bar.
+
+with Clock("mine", max_seconds=600, show=None) as clock, clock.stage(TRAINING, 10, "steps"):
+    clock.advance(1)
+    clock.check()                                   # raises OutOfTime
+clock.seconds["training"]
+"""
+
+import contextlib
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+
+from verifai_jax.core.progress import ProgressBar
+
+TRAINING, COMPILING, CERTIFYING = "training", "compiling", "certifying"
+"""Stages of a sweep, as its result names them."""
+
+
+class OutOfTime(Exception):
+    """An error for a stage whose seconds are over."""
+
+
+class Clock:
+    """Times the stages of a sweep, as a context manager.
+
+    `seconds` are the seconds spent in each stage; compilation is not counted in training.
+
+    **Arguments:**
+    - `name`: the name of the sweep, before the progress bar.
+    - `max_seconds`: after which `check` raises `OutOfTime`; None for no limit.
+    - `show`: whether to draw a bar; None draws one on a terminal and in a notebook.
+    """
+
+    def __init__(self, name: str, max_seconds: float | None, show: bool | None) -> None:
+        self.name, self._bar = name, ProgressBar(show)
+        self.seconds: dict[str, float] = defaultdict(float)
+        self._began = time.perf_counter()
+        self._until = None if max_seconds is None else self._began + max_seconds
+        self._limit = self._until
+
+    def __enter__(self) -> "Clock":
+        self._bar.__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.__exit__()
+
+    @contextlib.contextmanager
+    def stage(self, name: str, total: float, unit: str, share: float = 1.0) -> Iterator[None]:
+        """Time the statements inside as a stage.
+
+        **Arguments:**
+        - `name`: the name of the stage.
+        - `total`: units of work in it, and `unit`, their name.
+        - `share`: the share of `max_seconds`, after which the stage is out of time.
+        """
+        began, compiling = time.perf_counter(), self.seconds[COMPILING]
+        if self._until is not None:
+            self._limit = self._began + share * (self._until - self._began)
+        self._bar.begin(f"{self.name}: {name}", total, unit)
+        try:
+            yield
+        finally:
+            compiled = self.seconds[COMPILING] - compiling
+            self.seconds[name] += time.perf_counter() - began - compiled
+            self._bar.end()
+
+    def advance(self, amount: float, figures: str = "") -> None:
+        """Count further units of the present stage as done, and show `figures` next to the bar."""
+        self._bar.advance(amount, figures)
+
+    def show(self, done: float, total: float, figures: str) -> None:
+        """Set the units that are done and their total, which may have changed."""
+        self._bar.update(done, total, figures)
+
+    def count_compilation(self, seconds: float) -> None:
+        """Count seconds of the present stage as compilation."""
+        self.seconds[COMPILING] += max(0.0, seconds)
+
+    def check(self) -> None:
+        """Raise `OutOfTime` where the seconds of this stage are over."""
+        if self._limit is not None and time.perf_counter() >= self._limit:
+            raise OutOfTime

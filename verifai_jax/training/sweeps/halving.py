@@ -1,0 +1,56 @@
+"""Successive halving: at each checkpoint only the best configurations continue to train.
+
+    sweep(study, configurations=64, halving=Halving(reduction=3))
+
+Source: Jamieson and Talwalkar, Non-stochastic best arm identification and hyperparameter
+optimization (2016), figure 1; Li et al., A system for massively parallel hyperparameter tuning
+(2020), section 3.1, whose asynchronous form gains nothing where all trainings run on one machine.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from verifai_jax.core.errors import check_names
+
+RETURN, SAFETY = "return", "safety"
+"""Criteria of halving."""
+
+
+@dataclass(frozen=True)
+class Halving:
+    """Successive halving: keep the best 1/reduction of the configurations at each checkpoint.
+
+    **Arguments:**
+    - `reduction`: greater than 1; of so many configurations one continues, rounded up.
+    - `by`: the criterion. `"return"` is the nominal return at the checkpoint; `"safety"` is the
+      failure rate of the closed loop in a few simulations, then the worst robustness, then the
+      return.
+    **Raises:** `ValueError` for a reduction of 1 or less; `UnknownNameError` for another criterion.
+    """
+
+    reduction: float = 3.0
+    by: str = RETURN
+
+    def __post_init__(self) -> None:
+        number = isinstance(self.reduction, int | float) and not isinstance(self.reduction, bool)
+        if not (number and 1 < self.reduction < math.inf):
+            raise ValueError(f"reduction must be greater than 1; got {self.reduction!r}")
+        check_names("criterion of halving", [self.by], (RETURN, SAFETY))
+
+    def survivors(self, configurations: int) -> int:
+        """Return the number of configurations that continue."""
+        return math.ceil(configurations / self.reduction)
+
+    def select(self, objective: Mapping[int, float]) -> list[int]:
+        """Choose the configurations that continue.
+
+        **Arguments:**
+        - `objective`: the objective of each configuration, by its number; the least is best, and
+          NaN is worst.
+        **Returns:** numbers of the configurations, in ascending order; of equal ones the first
+        continue.
+        """
+        count = self.survivors(len(objective))
+        values = {n: math.inf if math.isnan(value) else value for n, value in objective.items()}
+        return sorted(sorted(values, key=lambda n: (values[n], n))[:count])

@@ -1,0 +1,129 @@
+"""The order of preference among the rows of a sweep's table, and tables derived from it."""
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from verifai_jax.statistics.confidence_sequences import verdict_kind
+from verifai_jax.statistics.pareto import fronts
+
+if TYPE_CHECKING:
+    import pandas as pd
+FULL = 0.01
+"""Part of the span of nominal returns within which a return counts as full."""
+_WORST_FIRST = ("unsafe", "undecided")
+
+
+def is_safe(table: "pd.DataFrame") -> Bool[np.ndarray, " rows"]:
+    """Return True for rows with the verdict `safe@p`."""
+    return (table["verdict"].astype(str).map(verdict_kind) == "safe").to_numpy(bool)
+
+
+def preference_order(table: "pd.DataFrame") -> Int[np.ndarray, " certified"]:
+    """Return the indices of the rows with a certificate, the most preferable first.
+
+    Safe ones come before others, by their nominal return; the others by the upper end of their
+    failure probability. Then the lower failure rate, then fewer environment steps.
+    """
+    safe, high = is_safe(table), table["failure_high"].to_numpy(np.float64)
+    returned = np.nan_to_num(table["nominal_return"].to_numpy(np.float64), nan=-np.inf)
+    keys = (
+        table["steps"].to_numpy(np.float64),
+        np.where(safe, high, -returned),
+        np.nan_to_num(table["failure_rate"].to_numpy(np.float64), nan=np.inf),
+        np.where(safe, -returned, high),
+        ~safe,
+    )
+    order = np.lexsort(keys)
+    return order[np.isfinite(high)[order]]
+
+
+def pareto_fronts(table: "pd.DataFrame") -> Int[np.ndarray, " rows"]:
+    """Return the number of each row's Pareto front, 0 for the first.
+
+    Rows are compared by nominal return, the upper end of the failure probability, and environment
+    steps. -1 for a row without a return or a certificate.
+    """
+    columns = (-table["nominal_return"], table["failure_high"], table["steps"])
+    return fronts(np.stack([np.asarray(column, np.float64) for column in columns], axis=1))
+
+
+def full_return_threshold(table: "pd.DataFrame") -> float:
+    """Return the nominal return from which on a policy has learnt the task.
+
+    It is the best of the table less one hundredth of the span of all; NaN for a table without any.
+    """
+    returned = table["nominal_return"].to_numpy(np.float64)
+    returned = returned[np.isfinite(returned)]
+    if not len(returned):
+        return float("nan")
+    return float(returned.max() - FULL * np.ptp(returned))
+
+
+def last_checkpoints(table: "pd.DataFrame") -> "pd.DataFrame":
+    """Return the rows at the last checkpoint of each training."""
+    last = table.groupby(["configuration", "seed"])["steps"].transform("max")
+    return table.loc[table["steps"] == last]
+
+
+def group_by_configuration(table: "pd.DataFrame", hyperparameters: Sequence[str]) -> "pd.DataFrame":
+    """Return one row for each configuration: its trainings at their last checkpoints, together."""
+    import pandas as pd
+
+    names = [name for name in hyperparameters if name != "steps"]
+    rank_of = {int(i): rank for rank, i in enumerate(table.index[preference_order(table)])}
+    rows: list[dict[str, Any]] = []
+    for number, part in table.groupby("configuration", sort=True):
+        last = last_checkpoints(part)
+        ranked = [int(i) for i in part.index if int(i) in rank_of]
+        best = min(ranked, key=rank_of.__getitem__, default=-1)
+        rows.append(
+            {
+                "configuration": number,
+                "steps": last["steps"].max(),
+                **{name: last[name].iloc[0] for name in names},
+                "seeds": len(last),
+                "seeds_safe": int(is_safe(last).sum()),
+                "verdict": _worst_verdict(last),
+                "nominal_return": last["nominal_return"].mean(),
+                "failure_rate": last["failure_rate"].mean(),
+                "failure_rate_worst": last["failure_rate"].max(),
+                "failure_high": last["failure_high"].max(skipna=False),
+                "training_seconds": last["training_seconds"].sum(),
+                "status": _join_statuses(last["status"]),
+                "best_row": best,
+                "best_steps": table.loc[best, "steps"] if best >= 0 else -1,
+                "best_verdict": table.loc[best, "verdict"] if best >= 0 else "",
+            }
+        )
+    return pd.DataFrame(rows).set_index("configuration") if rows else pd.DataFrame()
+
+
+def return_safety_correlation(table: "pd.DataFrame") -> float:
+    """Return Spearman's rank correlation of nominal return and safety, one less the failure rate.
+
+    NaN for fewer than three rows that have both, or where one of them is the same for all.
+    """
+    pairs = table.loc[:, ["nominal_return", "failure_rate"]].dropna()
+    if len(pairs) < 3 or (pairs.nunique() < 2).any():
+        return float("nan")
+    ranks = pairs.rank()
+    return -float(np.corrcoef(ranks["nominal_return"], ranks["failure_rate"])[0, 1])
+
+
+def _worst_verdict(rows: "pd.DataFrame") -> str:
+    verdicts: Any = rows["verdict"].astype(str)
+    for verdict in _WORST_FIRST:
+        if (verdicts == verdict).any():
+            return verdict
+    if is_safe(rows).all():
+        return str(verdicts.iloc[0])
+    # A seed without a certificate leaves the configuration undecided.
+    return "undecided" if is_safe(rows).any() else ""
+
+
+def _join_statuses(statuses: Iterable[object]) -> str:
+    """Write the different statuses of trainings, one word if they are equal."""
+    return ", ".join(dict.fromkeys(str(status) for status in statuses))

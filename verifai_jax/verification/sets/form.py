@@ -1,0 +1,433 @@
+"""Sets of real numbers, one for each box of a batch: affine forms within intervals.
+
+    x = Form.leaf(low, high, symbol, symbols, np.float32)    # a feature between its ends
+    y = add(x, product(x, x))
+    low, high = y.bounds()                                    # [boxes, *shape] each
+
+A form is `centre + sum_i slopes[i] symbol_i + [-radius, radius]`, met with `[low, high]` where an
+operation knows an interval of its own. Each symbol lies in [-1, 1]: the first are the features of
+the box, so that what depends on them stays correlated through a whole simulation; others belong
+to a `Frame` of a loop (`frames.py`). In a box of width w the radius is of the order of w squared.
+
+Each set contains the number in real arithmetic and the number that a computer gets: every result is
+widened by the rounding of its type, by numbers below the smallest normal one, which XLA takes for
+zero, and becomes unbounded where it may overflow. An interval without both ends stands for
+everything, NaN included; all operations keep that. Bounds are computed in double precision, whose
+own rounding is covered by what results are widened by.
+
+Sources: L. de Figueiredo and J. Stolfi, Affine arithmetic: concepts and applications, Numerical
+Algorithms 37 (2004); S. Rump, INTLAB, 1999.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import DTypeLike
+
+Reals = np.ndarray
+"""Numbers of double precision, `[boxes, *shape]`; `[1, *shape]` if they are those of all boxes."""
+SLACK = 2.0**-45
+"""Share of a number by which a result is widened for the rounding of its own bounds."""
+
+
+class Rounding(NamedTuple):
+    """The rounding of a type of real numbers: its unit, its smallest and its greatest number."""
+
+    unit: float
+    smallest: float
+    highest: float
+
+
+@cache
+def rounding(dtype: DTypeLike) -> Rounding:
+    """Return the rounding of a type, with a margin for that of the bounds themselves."""
+    info = jnp.finfo(dtype)
+    unit = float(info.eps) / 2 * 1.01
+    return Rounding(max(unit, 2 * SLACK), float(info.tiny), float(info.max))
+
+
+class Frame(NamedTuple):
+    """Symbols after those of the features: of a step of a loop, or of a layer of a network.
+
+    - `number`: greater than those of frames made before.
+    - `first`, `stop`: its symbols among all.
+    - `outer`: the frame of the symbols before them that are not features either; None without.
+    - `of_layer`: whether it is that of a layer.
+    """
+
+    number: int
+    first: int
+    stop: int
+    outer: "Frame | None" = None
+    of_layer: bool = False
+
+
+class Form:
+    """A set of arrays for each box; see the module's docstring.
+
+    - `centre`, `radius`: `[boxes, *shape]`.
+    - `slopes`: `[symbols, boxes, *shape]`; None for a set that depends on no symbol.
+    - `size`: a bound of the absolute value.
+    - `low`, `high`: an interval of its own; None without one.
+    - `frame`: the frame of the symbols that are not features; None without them.
+    - `dtype`: the type in which the simulation computes it.
+    """
+
+    __slots__ = (
+        "_bounds", "_spread", "centre", "dtype", "frame", "high", "low", "radius", "size", "slopes",
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        centre: Reals,
+        slopes: Reals | None,
+        radius: Reals,
+        size: Reals,
+        dtype: np.dtype,
+        low: Reals | None = None,
+        high: Reals | None = None,
+        frame: Frame | None = None,
+    ) -> None:
+        self.centre, self.slopes, self.radius, self.size = centre, slopes, radius, size
+        self.dtype, self.low, self.high = dtype, low, high
+        self.frame = frame if slopes is not None else None
+        self._bounds: tuple[Reals, Reals] | None = None
+        self._spread: Reals | None = None
+
+    @classmethod
+    def constant(cls, value: np.ndarray, dtype: np.dtype) -> "Form":
+        """Return one array that all boxes share."""
+        exact = np.asarray(value).astype(dtype).astype(np.float64)[None]
+        return cls.between(exact, exact, dtype)
+
+    @classmethod
+    def between(cls, low: Reals, high: Reals, dtype: np.dtype) -> "Form":
+        """Return intervals; ends that are NaN stand for everything."""
+        kind = rounding(dtype)
+        low, high = overflown(low, high, kind.highest)
+        # What is below the smallest normal number may be taken for zero.
+        low = np.where((low > 0) & (low < kind.smallest), 0.0, low)
+        high = np.where((high < 0) & (high > -kind.smallest), 0.0, high)
+        bounded = np.isfinite(low) & np.isfinite(high)
+        centre = np.where(bounded, low / 2 + high / 2, 0.0)
+        radius = np.where(bounded, np.maximum(high - centre, centre - low), np.inf)
+        size = np.maximum(np.abs(low), np.abs(high))
+        radius = np.where((radius > 0) & bounded, radius + SLACK * size, radius)
+        return cls(centre, None, radius, size, dtype, low, high)
+
+    @classmethod
+    def leaf(cls, low: Reals, high: Reals, symbols: Reals, dtype: np.dtype) -> "Form":
+        """Return numbers between ends, each of which is the value of one symbol, or of none.
+
+        **Arguments:**
+        - `low`, `high`: `[boxes, *shape]`.
+        - `symbols`: `[symbols, *shape]`, 1 where a number is that symbol's, 0 elsewhere.
+        """
+        whole = cls.between(low, high, dtype)
+        slopes = symbols[:, None] * np.where(np.isfinite(whole.radius), whole.radius, 0.0)
+        own = np.any(symbols != 0, axis=0)[None] & np.isfinite(whole.radius)
+        radius = np.where(own, SLACK * whole.size, whole.radius)
+        return cls(whole.centre, slopes, radius, whole.size, dtype, whole.low, whole.high)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the array."""
+        return self.centre.shape[1:]
+
+    @property
+    def spread(self) -> Reals:
+        """The greatest distance from the centre that the affine form allows."""
+        spread = self._spread
+        if spread is None:
+            spread = self.radius
+            if self.slopes is not None:
+                spread = np.abs(self.slopes).sum(0) + spread
+            self._spread = spread
+        return spread
+
+    def bounds(self) -> tuple[Reals, Reals]:
+        """Return the ends of the set: what the affine form and the interval have in common."""
+        if self._bounds is None:
+            if self.slopes is None and self.low is not None and self.high is not None:
+                self._bounds = self.low, self.high
+                return self._bounds
+            spread = self.spread
+            low, high = self.centre - spread, self.centre + spread
+            if self.low is not None and self.high is not None:
+                # Without bounds on either side the interval says whether NaN is possible.
+                low, high = np.maximum(low, self.low), np.minimum(high, self.high)
+            self._bounds = low, high
+        return self._bounds
+
+    def moved(self, move: Callable[[np.ndarray, int], np.ndarray]) -> "Form":
+        """Return the same numbers elsewhere; `move(array, leading)` moves arrays."""
+        return Form(
+            move(self.centre, 1), None if self.slopes is None else move(self.slopes, 2),
+            move(self.radius, 1), move(self.size, 1), self.dtype,
+            None if self.low is None else move(self.low, 1),
+            None if self.high is None else move(self.high, 1), self.frame,
+        )  # fmt: skip
+
+    def of_type(self, dtype: np.dtype) -> "Form":
+        """Return the same numbers as those of another type, in which they are exact."""
+        ends = self.low, self.high
+        return Form(self.centre, self.slopes, self.radius, self.size, dtype, *ends, self.frame)
+
+    def forget(self, where: np.ndarray) -> None:
+        """Let it be everything at some numbers."""
+        if not np.any(where):
+            return
+        self._bounds = self._spread = None
+        for name, value in (
+            ("centre", 0.0), ("slopes", 0.0), ("radius", np.inf), ("size", np.inf),
+            ("low", -np.inf), ("high", np.inf),
+        ):  # fmt: skip
+            if getattr(self, name) is not None:
+                setattr(self, name, np.where(where, value, getattr(self, name)))
+
+    def unframed(self, keep: Callable[[Frame], bool] = lambda frame: False) -> "Form":
+        """Return a set without the symbols of inner frames, which become part of the radius.
+
+        **Arguments:**
+        - `keep`: whether to keep a frame, with all outside of it; none of them when left out.
+        """
+        frame, count = self.frame, None
+        while frame is not None and not keep(frame):
+            frame, count = frame.outer, frame.first
+        if count is None or self.slopes is None:
+            return self
+        radius = self.radius + np.abs(self.slopes[count:]).sum(0) + SLACK * self.size
+        ends = self.low, self.high
+        return Form(self.centre, self.slopes[:count], radius, self.size, self.dtype, *ends, frame)
+
+
+def overflown(low: Reals, high: Reals, highest: float) -> tuple[Reals, Reals]:
+    """Return an interval that is unbounded where its numbers may be beyond the greatest one."""
+    low = np.where(np.isnan(low) | (low < -highest), -np.inf, low)
+    high = np.where(np.isnan(high) | (high > highest), np.inf, high)
+    # What is beyond it for certain is an infinity to the machine, and a number in real arithmetic.
+    low = np.where((low > highest) & (low < np.inf), highest, low)
+    return low, np.where((high < -highest) & (high > -np.inf), -highest, high)
+
+
+def unknown(low: Reals, high: Reals) -> Reals:
+    """Return where a set is everything, NaN included."""
+    return (low == -np.inf) & (high == np.inf)
+
+
+def rounded(
+    centre: Reals,
+    slopes: Reals | None,
+    radius: Reals,
+    size: Reals,
+    dtype: np.dtype,
+    ends: tuple[Reals, Reals] | None = None,
+    frame: Frame | None = None,
+    units: float = 1.0,
+    exact: bool = False,
+) -> Form:
+    """Return the result of an operation, widened by its rounding.
+
+    **Arguments:**
+    - `ends`: an interval of the result, not widened yet.
+    - `units`: error of the operation in units of rounding.
+    - `exact`: whether the result is never rounded, such as that of a maximum.
+    """
+    kind = rounding(dtype)
+    share, absolute = (SLACK, 0.0) if exact else (kind.unit * units, kind.smallest)
+    radius = radius + (share * size + absolute)
+    low, high = (None, None) if ends is None else ends
+    if low is not None and high is not None and not exact:
+        low, high = low - share * np.abs(low), high + share * np.abs(high)
+        low = np.where(np.abs(low) < kind.smallest, np.where(low < 0, -kind.smallest, 0.0), low)
+        high = np.where(np.abs(high) < kind.smallest, np.where(high > 0, kind.smallest, 0.0), high)
+    form = Form(centre, slopes, radius, size, dtype, low, high, frame)
+    if not size.max(initial=0.0) + radius.max(initial=0.0) <= kind.highest / 2:
+        # What may overflow, or is NaN, is unbounded.
+        wild = ~(size + radius <= kind.highest)
+        if low is not None and high is not None:
+            low, high = overflown(low, high, kind.highest)
+        form.forget(wild)
+        form.low, form.high = low, high
+    return form
+
+
+def alike(forms: Sequence[Form]) -> tuple[list[Form], Frame | None, int]:
+    """Return forms without frames that the newest among them is not within; and its symbols."""
+    frame = max((f.frame for f in forms if f.frame is not None), default=None)
+    around, known = frame, set[int]()
+    while around is not None:
+        known.add(around.number)
+        around = around.outer
+    forms = [f.unframed(lambda each: each.number in known) for f in forms]
+    return forms, frame, max((0 if f.slopes is None else len(f.slopes) for f in forms), default=0)
+
+
+def padded(form: Form, count: int) -> Reals:
+    """Return slopes along so many symbols, zero along those that a form does not depend on."""
+    if form.slopes is None:
+        return np.zeros((count, *(1,) * form.centre.ndim))
+    missing = count - len(form.slopes)
+    if not missing:
+        return form.slopes
+    return np.pad(form.slopes, ((0, missing), *((0, 0),) * form.centre.ndim))
+
+
+def joint_slopes(a: Form, b: Form, first: Reals | float, second: Reals | float) -> Reals | None:
+    """Return the slopes of `first * a + second * b`, of forms of one frame."""
+    if a.slopes is None:
+        return None if b.slopes is None else b.slopes * second
+    if b.slopes is None:
+        return a.slopes * first
+    count = max(len(a.slopes), len(b.slopes))
+    return padded(a, count) * first + padded(b, count) * second
+
+
+def add(a: Form, b: Form, sign: float = 1.0) -> Form:
+    """Return `a + b`, or `a - b` for the sign -1."""
+    (a, b), frame, _ = alike([a, b])
+    slopes = joint_slopes(a, b, 1.0, sign)
+    centre = a.centre + b.centre if sign > 0 else a.centre - b.centre
+    form = rounded(centre, slopes, a.radius + b.radius, a.size + b.size, a.dtype, None, frame)
+    if a.low is None or b.low is None:
+        return form
+    (low, high), (first, last) = a.bounds(), b.bounds()
+    if sign < 0:
+        first, last = -last, -first
+    ends = _sum_end(low, first, a.dtype, -1), _sum_end(high, last, a.dtype, 1)
+    form.low, form.high = overflown(*ends, rounding(a.dtype).highest)
+    return form
+
+
+def _sum_end(one: Reals, other: Reals, dtype: np.dtype, side: int) -> Reals:
+    """Return the end of a sum of intervals, widened by rounding only where there is any."""
+    kind = rounding(dtype)
+    end = one + other
+    back = end - one
+    # Knuth's error of the sum: it is zero where the sum is exact.
+    exact = (one - (end - back)) + (other - back) == 0
+    if dtype.itemsize < 8:
+        exact &= end.astype(dtype).astype(np.float64) == end
+    small = (end != 0) & (np.abs(end) < kind.smallest)
+    widened = np.where(exact & ~small, end, end + side * (kind.unit * np.abs(end) + kind.smallest))
+    # A sum of numbers of one sign has that sign, or is zero.
+    signed = (one * side <= 0) & (other * side <= 0)
+    return np.where(signed, side * np.minimum(side * widened, 0.0), widened)
+
+
+def negative(a: Form) -> Form:
+    """Return `-a`, which is exact."""
+    slopes = None if a.slopes is None else -a.slopes
+    low = None if a.high is None else -a.high
+    high = None if a.low is None else -a.low
+    return Form(-a.centre, slopes, a.radius, a.size, a.dtype, low, high, a.frame)
+
+
+def is_point(a: Form) -> bool:
+    """Return whether a set is one array of exact numbers."""
+    return a.slopes is None and not a.radius.any()
+
+
+def scaled(a: Form, by: Reals) -> Form:
+    """Return `a` times exact finite numbers."""
+    slopes = None if a.slopes is None else a.slopes * by
+    size, scale = a.size * np.abs(by), np.abs(by)
+    ends = None
+    if a.low is not None and a.high is not None:
+        one, other = a.low * by, a.high * by
+        ends = np.minimum(one, other), np.maximum(one, other)
+    # Times 0, 1, 2, 4 ... nothing is rounded.
+    exact = bool(((np.frexp(scale)[0] == 0.5) & (scale >= 1) | (scale == 0)).all())
+    return rounded(
+        a.centre * by, slopes, a.radius * scale, size, a.dtype, ends, a.frame, exact=exact
+    )
+
+
+def interval_product(a: Form, b: Form) -> tuple[Reals, Reals]:
+    """Return the interval of a product; everything where zero may meet an infinity."""
+    (low, high), (first, last) = a.bounds(), b.bounds()
+    ends = low * first, low * last, high * first, high * last
+    lowest = np.minimum(np.minimum(ends[0], ends[1]), np.minimum(ends[2], ends[3]))
+    highest = np.maximum(np.maximum(ends[0], ends[1]), np.maximum(ends[2], ends[3]))
+    bad = np.isnan(lowest)
+    # An interval with zero inside and one without an end: none of the four products is NaN.
+    for ours, theirs in (((low, high), (first, last)), ((first, last), (low, high))):
+        bad |= (ours[0] <= 0) & (ours[1] >= 0) & ~(np.isfinite(theirs[0]) & np.isfinite(theirs[1]))
+    return np.where(bad, -np.inf, lowest), np.where(bad, np.inf, highest)
+
+
+def product(a: Form, b: Form) -> Form:
+    """Return `a * b` of different forms."""
+    for one, other in ((a, b), (b, a)):
+        if is_point(one) and np.isfinite(one.centre).all():
+            return scaled(other, one.centre)
+    (a, b), frame, _ = alike([a, b])
+    ends = interval_product(a, b)
+    size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+    slopes = joint_slopes(a, b, b.centre, a.centre)
+    centre = a.centre * b.centre
+    radius = np.abs(a.centre) * b.radius + np.abs(b.centre) * a.radius + a.spread * b.spread
+    if a.slopes is not None and b.slopes is not None:
+        # The square of a symbol lies in [0, 1], not in [-1, 1].
+        count = min(len(a.slopes), len(b.slopes))
+        squares = a.slopes[:count] * b.slopes[:count]
+        centre = centre + squares.sum(0) / 2
+        radius = radius - np.abs(squares).sum(0) / 2
+    slack = (np.abs(a.centre) + a.spread) * (np.abs(b.centre) + b.spread) * SLACK
+    return rounded(centre, slopes, radius + slack, size, a.dtype, ends, frame)
+
+
+def total(a: Form, axes: Sequence[int]) -> Form:
+    """Return the sum over axes, whatever the order in which it is computed."""
+    lead = tuple(axis + 1 for axis in axes)
+    count = max(int(np.prod([a.centre.shape[axis] for axis in lead], dtype=np.int64)), 1)
+    slopes = None if a.slopes is None else a.slopes.sum(tuple(axis + 2 for axis in axes))
+    size, ends = a.size.sum(lead), None
+    if a.low is not None and a.high is not None:
+        margin = rounding(a.dtype).unit * count * size
+        low, high = a.low.sum(lead) - margin, a.high.sum(lead) + margin
+        # Numbers of one sign add up to one of that sign.
+        low = np.where((a.low >= 0).all(lead), np.maximum(low, 0), low)
+        ends = low, np.where((a.high <= 0).all(lead), np.minimum(high, 0), high)
+        ends = overflown(*ends, rounding(a.dtype).highest)
+    return rounded(
+        a.centre.sum(lead), slopes, a.radius.sum(lead), size, a.dtype, ends, a.frame, units=count
+    )
+
+
+def joined(one: Form, other: Form) -> Form:
+    """Return a set that contains two: their hull, with the mean of their slopes."""
+    (a, b), frame, _ = alike([one, other])
+    gap = joint_slopes(a, b, 0.5, -0.5)
+    apart = np.abs(a.centre - b.centre) / 2
+    if gap is not None:
+        apart = apart + np.abs(gap).sum(0)
+    radius = apart + np.maximum(a.radius, b.radius)
+    (low, high), (first, last) = a.bounds(), b.bounds()
+    return rounded(
+        a.centre / 2 + b.centre / 2, joint_slopes(a, b, 0.5, 0.5), radius,
+        np.maximum(a.size, b.size), a.dtype, (np.minimum(low, first), np.maximum(high, last)),
+        frame, exact=True,
+    )  # fmt: skip
+
+
+def chosen(masks: Sequence[np.ndarray], cases: Sequence[Form]) -> Form:
+    """Return for each number the case whose mask holds; exactly one does."""
+    cases, frame, count = alike(cases)
+
+    def pick(arrays: Sequence[np.ndarray]) -> np.ndarray:
+        picked = arrays[-1]
+        for mask, array in zip(masks[-2::-1], arrays[-2::-1], strict=True):
+            picked = np.where(mask, array, picked)
+        return picked
+
+    slopes = pick([padded(case, count) for case in cases]) if count else None
+    ends = [case.bounds() for case in cases]
+    return Form(
+        pick([c.centre for c in cases]), slopes, pick([c.radius for c in cases]),
+        pick([c.size for c in cases]), cases[0].dtype, pick([low for low, _ in ends]),
+        pick([high for _, high in ends]), frame,
+    )  # fmt: skip
