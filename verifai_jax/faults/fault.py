@@ -6,7 +6,7 @@ Each number is fixed, or a domain, which makes it a feature of the problem.
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from typing import Any, ClassVar, NamedTuple, TypeAlias, dataclass_transform
 
 import jax.numpy as jnp
@@ -20,9 +20,9 @@ Number: TypeAlias = float | Domain
 Vector: TypeAlias = Float[Array | np.ndarray, " n"]
 
 
-def number(low: float = -math.inf, high: float = math.inf, **default: float) -> Any:
+def number(low: float = -math.inf, high: float = math.inf, default: Any = MISSING) -> Any:
     """Return the field of a number of a fault, which has to lie between two ends."""
-    return field(metadata={"ends": (low, high)}, **default)
+    return field(metadata={"ends": (low, high)}, default=default)
 
 
 class Moment(NamedTuple):
@@ -58,14 +58,11 @@ class FaultFeatures(Struct):
     fault: "Fault | None"
 
     def __init__(
-        self,
-        fields: Mapping[str, Domain],
-        nominal: Mapping[str, PyTree],
-        fault: "Fault | None" = None,
+        self, fields: Mapping[str, Domain], nominal: PyTree, fault: "Fault | None" = None
     ) -> None:
         super().__init__(fields)
-        object.__setattr__(self, "_nominal", dict(nominal))
-        object.__setattr__(self, "fault", fault)
+        for name, value in (("_nominal", nominal), ("fault", fault)):
+            object.__setattr__(self, name, value)
 
     @property
     def nominal(self) -> dict[str, PyTree]:
@@ -188,14 +185,9 @@ class Fault:
 class AtMost:
     """Several faults of which at most `count` happen in one simulation.
 
-    They are chosen by the feature `name`, whose entries are each the name of a fault or `none`,
-    equally likely.
-
-    **Arguments:**
-
-    - `count`: the number of faults in one simulation.
-    - `faults`: the faults that are chosen from.
-    - `name`: the name of the feature.
+    - `count`: the number of faults in one simulation; `faults`: those that are chosen from.
+    - `name`: the name of the feature that chooses, whose entries are each the name of a fault or
+      `none`, equally likely.
 
     **Raises:** `ValueError` for a count that is not positive, and for things that are no faults.
     """

@@ -65,8 +65,8 @@ def fmea(
       then happens with probability `1 - exp(-rate * mission_time)`, one independent of the other.
       Without them probabilities are those given that it happens.
     - `samples`: of each fault, and of each pair, from the prior of its numbers.
-    - `budget`: the budget of the search for a failure where no sample fails, and of the estimate
-      where few do; 0 for neither.
+    - `budget`: the budget of the search for a failure where no sample fails, and half of that of
+      the estimate where few do; 0 for neither.
     - `pairs`: whether pairs are tried of those faults that never fail alone.
     - `confidence`: the confidence of each interval.
     - `seed`: the seed of everything that is drawn at random.
@@ -114,8 +114,8 @@ def fmea(
             again = confirm(run, max_rows=len(run.table), progress=False)
             verdicts = dict(zip(again.numbers.tolist(), again.verdict.tolist(), strict=True))
         for each in found:
-            happens = [] if rates is None else [rates[name] * mission_time for name in each.faults]
-            chance = math.prod(-math.expm1(-number) for number in happens)
+            known_rates = [] if rates is None else [rates[name] for name in each.faults]
+            chance = math.prod(-math.expm1(-one * (mission_time or 0.0)) for one in known_rates)
             numbers = (chance * rows.probability(each, confidence, budget)).tolist()
             within = dict(zip(("low", "high", "probability"), numbers, strict=True))
             effect = effect_of(run, each, known, verdicts)

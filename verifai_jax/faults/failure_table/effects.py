@@ -41,25 +41,20 @@ class Found(NamedTuple):
 
 
 def effect_of(
-    run: Run | None,
-    found: Found,
-    faults: Mapping[str, Fault],
-    verdicts: Mapping[int, str],
+    run: Run | None, found: Found, faults: Mapping[str, Fault], verdicts: Mapping[int, str]
 ) -> Effect:
     """Return what is known of a fault or a pair, without probabilities.
 
     **Arguments:**
 
-    - `run`: with the candidates as rows.
+    - `run`: with the candidates as rows; `verdicts`: of the confirmation, by row.
     - `faults`: all of them by name.
-    - `verdicts`: the verdicts of the confirmation, by row.
     """
     effect = Effect(found.faults, len(found.candidates) > 0, found.failures, found.simulations)
     rows = range(found.first, found.first + len(found.candidates))
     # The first that is confirmed; without one, the first that fails at all.
-    tried = sorted(
-        (row for row in rows if row in verdicts), key=lambda r: verdicts[r] != "confirmed"
-    )
+    known = [row for row in rows if row in verdicts]
+    tried = sorted(known, key=lambda row: verdicts[row] != "confirmed")
     if run is None or run.problem is None or not tried:
         return effect
     again, space = run.replay(tried[0]), run.problem.space
@@ -75,16 +70,11 @@ def effect_of(
     shown_by, shown = _first_difference(again.trace, without.trace)
     numbers = [f"{name}.{faults[name].grade}" for name in found.faults]
     return replace(
-        effect,
-        row=tried[0],
-        severity={number: float(columns[number]) for number in numbers},
-        verdict=verdicts[tried[0]],
-        broken=again.worst,
-        delay=_violation(again, onset) - max(onset, 0.0),
-        shown_by=shown_by,
-        shown_after=shown - max(onset, 0.0),
-        command=_command(run, tried[0]),
-    )
+        effect, row=tried[0], severity={number: float(columns[number]) for number in numbers},
+        verdict=verdicts[tried[0]], broken=again.worst,
+        delay=_violation(again, onset) - max(onset, 0.0), shown_by=shown_by,
+        shown_after=shown - max(onset, 0.0), command=_command(run, tried[0]),
+    )  # fmt: skip
 
 
 def _violation(again: Replay, onset: float) -> float:

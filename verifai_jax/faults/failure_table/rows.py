@@ -90,7 +90,7 @@ class Rows:
 
         def estimated() -> dict[str, np.ndarray]:
             seen = estimate(
-                self.problem.only(*found.faults), budget=10 * budget, confidence=confidence,
+                self.problem.only(*found.faults), budget=2 * budget, confidence=confidence,
                 seed=self.seed, progress=False, executor=self.executor,
             )  # fmt: skip
             chance = rate.estimate if seen.probability is None else seen.probability
@@ -144,5 +144,7 @@ class Rows:
             low = np.where(fails, shares[each, np.maximum(first - 1, 0)], low)
         starts[:, index] = home[index] + high[:, None] * away[:, 0]
         # Where chance decides, a few failing points are tried many times.
-        tried = np.resize(failing, (8 * TRIED, len(home))) if self.draws else failing[:TRIED]
+        others = any(fault.draws for fault in faults.values())
+        draws = self.draws and (not others or any(faults[name].draws for name in names))
+        tried = np.resize(failing, (8 * TRIED, len(home))) if draws else failing[:TRIED]
         return np.concatenate([ordered(starts[fails]), tried])

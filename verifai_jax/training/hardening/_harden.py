@@ -54,9 +54,9 @@ ROUND, FINAL, COMPARED, ATTACK, RETURNS = range(5)
 CERTIFIED = ("failures", "simulations", "failure_rate", "failure_low", "failure_high", "verdict",
              "attack_failures", "cost")  # fmt: skip
 """Columns of a certificate that the table has."""
-OWN_STEP, MOST_OWN = 0.25, 0.75
-"""Share of episodes that become the task's own in a round after which an arm does not keep the
-return, and that cease to be after one that does; and how many are its own at most."""
+OWN_STEP, OWN_LIMIT = 0.25, 0.75
+"""Share of episodes that become the task's own after a round that does not keep the return, and
+cease to be after one that does; and how many are its own at most."""
 TABLE, SHRUNK = 512, 4
 """Uniform samples beside the counterexamples of a round, and counterexamples that are shrunk."""
 
@@ -161,8 +161,8 @@ def harden(
     - `samples`, `attack`, `attack_simulations`: of each certificate, as in `certify`.
     - `added`: points to train around that a round adds at most.
     - `own`, `failing`: shares of episodes that are the task's own, and that begin near failures,
-      those of the prior included that fail anyway; the others are of the prior. As long as return
-      is lost, more are the task's own.
+      those of the prior included that fail anyway; the others are of the prior. After a
+      round that loses return, more are the task's own, and fewer again after one that does not.
     - `tolerance`: share of the first policy's return that may be lost.
     - `episodes`: the number of episodes of the task itself, the same for all policies, that measure
       returns.
@@ -286,7 +286,8 @@ class Work:
             )  # fmt: skip
             return {name: np.asarray(value) for name, value in found._asdict().items()}
 
-        found = Collected(**self.cache.remember(f"collected/{stage}", compute))
+        known: dict[str, Any] = self.cache.remember(f"collected/{stage}", compute)
+        found = Collected(**known)
         self.points, self.radii = (
             np.concatenate([one[found.kept], new])[-CAPACITY:]
             for one, new in ((self.points, found.points), (self.radii, found.radii))
@@ -299,7 +300,7 @@ class Work:
         rate, mixtures = certificates[0].rate.estimate if certificates[0].rate else 0.0, []
         for arm, count in zip(self.arms_named, (len(self.points), 0), strict=False):
             change = -OWN_STEP if self._keeps_return(arm, stage) else OWN_STEP
-            own = self.own[arm] = max(plan.own, min(self.own[arm] + change, MOST_OWN))
+            own = self.own[arm] = max(plan.own, min(self.own[arm] + change, OWN_LIMIT))
             # The more of the prior fails, the more of its episodes begin at failures anyway.
             wanted = plan.failing * (1 - own) / max(1 - plan.own, 1e-9)
             failing = min(max((wanted - (1 - own) * rate) / max(1 - rate, 1e-9), 0.0), wanted)

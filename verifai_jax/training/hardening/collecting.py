@@ -86,9 +86,9 @@ def collect(
     run = falsify(problem, PointList(tried), len(tried), seed=seed, progress=False)
     end_if_interrupted(run.stopped)
     simulations, confirmed = run.simulations, run.table.counterexamples
-    if shrunk and len(confirmed):
-        worst = np.linspace(0, len(confirmed) - 1, shrunk).astype(int)
-        for row in confirmed.sort_values("rho").index[np.unique(worst)]:
+    if len(confirmed):
+        worst = np.unique(np.linspace(0, len(confirmed) - 1, shrunk).astype(int))
+        for row in confirmed.sort_values("rho").index[worst]:
             try:
                 small = shrink(run, int(row), budget=SHRINKING, others=False, progress=False)
             except ValueError:
@@ -96,7 +96,6 @@ def collect(
             end_if_interrupted(small.stopped)
             add(small.u[None], "shrunk")
             simulations += small.simulations
-    if len(confirmed):
         drawn = space.rows(space.sample(jax.random.key(seed + 1), PRIOR))
         prior = pd.DataFrame({name: np.asarray(column) for name, column in drawn.items()})
         try:
@@ -114,7 +113,7 @@ def collect(
     passing = np.flatnonzero(~kept)
     kept[passing[max(len(passing) - int(kept.sum()) - len(sources), 0) :]] = True
     centres = np.concatenate(points)
-    radii, spent = _radii(problem, centres, seed)
+    radii, spent = _radii(problem, centres, seed) if len(centres) else (np.zeros(0), 0)
     return Collected(centres, radii, np.array(sources, np.str_), kept, simulations + spent)
 
 
@@ -126,10 +125,8 @@ def _radii(
     low, high = (np.repeat(ends, AROUND, 0) for ends in neighbourhoods(space, centres, RADIUS))
     points = low + np.random.default_rng(seed).random(low.shape) * (high - low)
     possible = np.asarray(jax.vmap(space.accepts)(space.features_at(points)))
-    run = falsify(
-        problem, PointList(points[possible]), int(possible.sum()), seed=seed, confirm=False,
-        progress=False,
-    )  # fmt: skip
+    found = PointList(points[possible])
+    run = falsify(problem, found, int(possible.sum()), seed=seed, confirm=False, progress=False)
     end_if_interrupted(run.stopped)
     fails = np.zeros(len(points), bool)
     fails[np.flatnonzero(possible)[np.asarray(run.table.violating.index, int)]] = True

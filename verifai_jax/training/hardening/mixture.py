@@ -58,8 +58,7 @@ def neighbourhoods(
 class Mixture:
     """Points of the unit cube of a space, from the prior and from neighbourhoods.
 
-    - `shares`: the shares of episodes that are the task's own, from the prior, and from
-      neighbourhoods.
+    - `shares`: of episodes that are the task's own, from the prior, and from neighbourhoods.
     - `low`, `high`: `[neighbourhoods, d]`, boxes of the unit cube; the first `count` of them count.
     """
 
@@ -86,7 +85,7 @@ class Mixture:
             shares = (shares[0], shares[1] + shares[2], 0.0)
         ends = np.zeros((2, CAPACITY, space.dim), np.float32)
         ends[:, :count] = neighbourhoods(space, centres, radii)
-        return cls(space, np.asarray(shares, np.float32), *ends, count)
+        return cls(space, np.asarray(shares, np.float32), ends[0], ends[1], count)
 
     def draw(self, key: Key[Array, ""]) -> Float[Array, " d"]:
         """Draw a point of the unit cube, from the prior or from a neighbourhood."""
@@ -97,8 +96,7 @@ class Mixture:
         tries = 1 if self.space.where is None else TRIES
         u = jax.random.uniform(point_key, (tries, self.space.dim))
         low, high = (jnp.asarray(ends)[index] for ends in (self.low, self.high))
-        inside = low + u * (high - low)
-        points = jnp.where(near, inside, u)
+        points = jnp.where(near, low + u * (high - low), u)
         if tries == 1:
             return points[0]
         accepted = jax.vmap(lambda point: self.space.accepts(self.space.unflatten(point)))(points)
