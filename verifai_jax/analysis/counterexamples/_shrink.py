@@ -35,7 +35,7 @@ from verifai_jax.analysis.counterexamples.selection import (
     select_others,
     select_row,
 )
-from verifai_jax.analysis.counterexamples.shrunk import LogDensities, Shrunk, Step, _plain
+from verifai_jax.analysis.counterexamples.shrunk import LogDensities, Shrunk, Step
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options, unknown_name
 from verifai_jax.core.keys import run_keys
@@ -43,6 +43,7 @@ from verifai_jax.core.progress import shows_progress
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.run import Run
 from verifai_jax.features.density import log_density
+from verifai_jax.features.domain import as_scalar
 from verifai_jax.problem.problem import Problem
 
 ORDERS = ("count", "distance", "likelihood")
@@ -437,7 +438,7 @@ def _changed(nominal: Nominal, u: Float[np.ndarray, " d"]) -> dict[str, tuple[An
         if column is None and names:
             column = columns[names[i]]
         values = (nominal.u[i], u[i]) if column is None else column
-        changed[name] = (None if nominal.lacks[i] else _plain(values[0]), _plain(values[1]))
+        changed[name] = (None if nominal.lacks[i] else as_scalar(values[0]), as_scalar(values[1]))
     return changed
 
 
