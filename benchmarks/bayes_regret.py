@@ -7,7 +7,8 @@ fails. The regret is what the lowest robustness of all simulations lies above 10
 verdict (NaN) in half of the space. The plain process is written here with NumPy and SciPy: Matern
 5/2, length scales by the greatest evidence from three starts, expected improvement maximized from
 the best of 2000 points by L-BFGS-B, one point a round; rows without a verdict it has with the
-greatest value so far. Its regrets are kept in a folder, since it takes long.
+greatest value so far. Its regrets are kept in a folder, since it takes long; much less with
+`OPENBLAS_NUM_THREADS=1` in the environment, as its matrices are small.
 """
 
 import argparse

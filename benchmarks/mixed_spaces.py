@@ -15,6 +15,7 @@ import verifai_jax as vj
 
 DOORS, RECIPE_LIMIT, CAPPED, QUEUE = 0.938, 3.3, 0.2, 27.86
 TERRACE, MENU_LIMIT, HEAT_LIMIT, DECOY, YARD = 1.85, 2.752, 1.0, 0.1684, 0.066
+BRAKES, DIAL, ROSTER = 259.25, 0.0519, 0.4808
 SINGLE = np.random.default_rng(47).normal(size=(5, 4))
 PAIRED = 0.6 * np.random.default_rng(48).normal(size=(4, 4, 4))
 COURSES = np.random.default_rng(50).normal(size=(4, 7))
@@ -204,6 +205,31 @@ def yard(features, key):
     return _steps(YARD - jnp.clip(far, 0.0, 0.3))
 
 
+def brakes(features, key):
+    """The metres missing to stop, in halves, on one of four roads with one of three tyres."""
+    grip = jnp.array([0.9, 0.7, 0.5, 0.25])[features["road"]]
+    grip *= jnp.array([1.0, 0.85, 0.7])[features["tyre"]]
+    braking = features["speed"] ** 2 / (2 * 9.81 * grip) * (1 + 0.05 * features["riders"])
+    left = features["gap"] - features["speed"] * (0.3 + features["delay"]) - braking
+    return _steps(-jnp.floor(2 * left) / 2)
+
+
+def dial(features, key):
+    """Eight flags that are the digits of a number, and a second number that has to match it."""
+    flags = jnp.stack([features[f"on{i}"] * 1.0 for i in range(8)])
+    number = flags @ 2.0 ** jnp.arange(8) / 255
+    far = jnp.hypot(number - 0.62, 0.5 * (features["a"] - number**2)) + 0.1 * features["b"]
+    return _steps(DIAL - far)
+
+
+def roster(features, key):
+    """Five shifts of five people; what counts is how many meet, and how tired they are."""
+    who = jnp.stack([features[f"shift{i}"] for i in range(5)])
+    meet = jnp.sum((who[:, None] == who[None]) & (jnp.arange(5)[:, None] < jnp.arange(5)))
+    tired = jnp.sum(jnp.abs(who - jnp.array([0, 3, 1, 4, 2]))) / 10
+    return _steps(features["a"] + 0.5 * features["b"] * features["a"] - 0.3 * meet - tired - ROSTER)
+
+
 def _box(count: int) -> dict[str, vj.Box]:
     return {f"u{i}": vj.Box(0, 1) for i in range(count)}
 
@@ -283,6 +309,18 @@ FRESH = {
         vj.Problem("decoy", _box(3) | _flags(1), decoy, "always out < 0"),
         vj.Problem("yard", {"x": vj.DiscreteBox(0, 39), "y": vj.DiscreteBox(0, 39),
                             "heading": vj.Box(0, 1)}, yard, "always out < 0"),
+        vj.Problem(
+            "brakes",
+            {"road": vj.Categorical(0, 1, 2, 3), "tyre": vj.Categorical(0, 1, 2),
+             "riders": vj.DiscreteBox(1, 5), "speed": vj.Box(5, 30), "gap": vj.Box(20, 90),
+             "delay": vj.Box(0, 1)},
+            brakes, f"always out < {BRAKES}",
+        ),
+        vj.Problem("dial", {"a": vj.Box(0, 1), "b": vj.Box(0, 1), **_flags(8)}, dial,
+                   "always out < 0"),
+        vj.Problem("roster", {"a": vj.Box(0, 1), "b": vj.Box(0, 1)}
+                   | {f"shift{i}": vj.Categorical(*range(5)) for i in range(5)},
+                   roster, "always out < 0"),
     )
 }  # fmt: skip
 """Those that nothing was tuned to."""
@@ -311,5 +349,8 @@ SHARES = {
     "digits": 4.8e-3,
     "decoy": 1.0e-2,
     "yard": 3.0e-3,
+    "brakes": 3.1e-3,
+    "dial": 3.0e-3,
+    "roster": 1.0e-2,
 }
 """Of 400 000 samples; those of `FRESH` of 200 000."""

@@ -13,8 +13,8 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax.core.revisions import load_at_revision
+from verifai_jax.core.source_collection import files_of_model, scan
 from verifai_jax.core.source_objects import is_user_file
-from verifai_jax.core.source_scan import files_of_model, scan
 from verifai_jax.core.sources import Sources, file_hash, list_changes
 from verifai_jax.core.targets import load_target
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.programs import ProgramCache, Slot
+from verifai_jax.core.compilation import ProgramCache, Slot
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.evaluation.verdicts import Verdicts, trace_verdict, violations
 

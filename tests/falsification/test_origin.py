@@ -9,7 +9,7 @@ import pytest
 import verifai_jax as vj
 from verifai_jax import search as searches
 from verifai_jax.falsification.no_rate import what_lies_between
-from verifai_jax.falsification.origin import Origin, origin_of
+from verifai_jax.falsification.running import Origin, origin_of
 
 OTHERS = {
     "first": "rows were given",

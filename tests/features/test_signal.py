@@ -19,7 +19,7 @@ from verifai_jax.features import (
     Signal,
     Struct,
 )
-from verifai_jax.features.points import features_of_rows
+from verifai_jax.features.point_maps import features_of_rows
 from verifai_jax.systems.ode import ode
 from verifai_jax.testing import check_domain
 

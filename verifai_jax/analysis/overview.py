@@ -37,7 +37,6 @@ from verifai_jax.falsification.table import ErrorTable
 MIN_FAILURES = 4
 MAX_TO_CLUSTER = 2000
 MAX_NAMED = 6
-MAX_REPRESENTATIVES = 6
 TITLES = {
     "failures": "Failures",
     "rules": "Where it fails",

@@ -4,8 +4,12 @@
     ask(state)                                          # waits until it is compiled, and calls it
     describe_compilation()                              # "compiling the search, 3 s"
     while_compiling(import_matplotlib)                  # at the first long wait, or never
+    ENGINES: Slot[EngineMode, Engine] = Slot("engines")
+    engine = problem.programs.get(ENGINES, mode, lambda: Engine(problem, *mode))
 
-What a program computes does not depend on when it was compiled, so neither do results.
+What a program computes does not depend on when it was compiled, so neither do results. What is
+compiled for an object is kept and freed with it, in a slot that fixes the types of keys and values.
+Each shape compiles a program of its own, so numbers of rows become powers of two.
 
 XLA spends most of its time on making a program fast. One that runs a few dozen times is done sooner
 with less of that (`XlaOptimization`): it is compiled in a half to a fifth of the time.
@@ -14,17 +18,73 @@ with less of that (`XlaOptimization`): it is compiled in a half to a fifth of th
 import gc
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Generic, Literal, TypeVar, cast
 
 import jax
 import numpy as np
 
 from verifai_jax.core.cores import available_cores
 from verifai_jax.core.devices import enable_compile_cache
+
+K = TypeVar("K", bound=Hashable)
+V = TypeVar("V")
+
+
+@dataclass(frozen=True)
+class Slot(Generic[K, V]):
+    """A kind of cached value, by name; `K` is the type of its keys and `V` that of its values."""
+
+    name: str
+
+
+class ProgramCache:
+    """Values by slot and key, which are kept with the object that has the cache."""
+
+    def __init__(self) -> None:
+        self._slots: dict[str, dict[Hashable, object]] = {}
+
+    def get(self, slot: Slot[K, V], key: K, make: Callable[[], V]) -> V:
+        """Return the value of this key, which `make` makes the first time.
+
+        What `make` raises is raised, and nothing is kept.
+        """
+        values = self._slots.setdefault(slot.name, {})
+        if key not in values:
+            values[key] = make()
+        return cast(V, values[key])
+
+    def peek(self, slot: Slot[K, V], key: K) -> V | None:
+        """Return the value of this key, or None before it is made."""
+        return cast("V | None", self._slots.get(slot.name, {}).get(key))
+
+    def clear(self) -> None:
+        """Forget everything, so that its memory can be freed."""
+        self._slots.clear()
+
+
+def power_of_two(count: int) -> int:
+    """Return the least power of two that is at least `count`, and at least 1."""
+    return 1 << max(count - 1, 0).bit_length()
+
+
+def pad_rows(rows: Any, count: int | None = None) -> np.ndarray:
+    """Return rows followed by copies of the last one.
+
+    **Arguments:**
+    - `rows`: an array `[n, ...]`; an empty one stays as it is.
+    - `count`: rows of the result, at least `n`; the next power of two when left out.
+    """
+    rows = np.asarray(rows)
+    missing = (power_of_two(len(rows)) if count is None else count) - len(rows)
+    if not missing:
+        return rows
+    return np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)])
+
 
 XlaOptimization = Literal["most", "little", "least"]
 """How much XLA does to make a program fast on a processor. `little` computes what `most` does, on

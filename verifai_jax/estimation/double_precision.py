@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from verifai_jax.core.compilation import Slot
 from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.precision import in_precision
-from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator, Sent
 from verifai_jax.evaluation.kept_work import present_part

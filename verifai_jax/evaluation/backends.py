@@ -5,23 +5,31 @@
 
 A gradient needs a backend that JAX can trace. Without one the faster backend is taken, as measured
 on this machine with this problem, unless the run is over before a compiler would be; the
-run notes what was chosen, and why.
+run notes what was chosen, and why. `engines_for` has the problem in other engines, by which a
+failure is to be confirmed, too.
 """
 
 import time
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import jax
 import numpy as np
 
+from verifai_jax.core.compilation import Slot
+from verifai_jax.core.errors import check_names
 from verifai_jax.core.keys import run_keys
-from verifai_jax.core.programs import Slot
 from verifai_jax.core.text import format_error
+from verifai_jax.core.trace import Trace
+from verifai_jax.evaluation.confirmations import ENGINE
 from verifai_jax.evaluation.engine import Engine, engine_for
 from verifai_jax.problem.problem import Problem
+from verifai_jax.systems.base import System
 
 if TYPE_CHECKING:
     from verifai_jax.evaluation.host_engine import HostEngine
+
 MIN_BUDGET = 64
 """Simulations below which nothing is compiled, or measured: either takes longer than they do."""
 WORTH_MEASURING = 30.0
@@ -128,3 +136,53 @@ def _speed(engine: "Engine | HostEngine", problem: Problem, batch: int) -> float
         if best > 2.0:
             break  # One batch is enough to know a slow simulator.
     return batch / best
+
+
+OtherEngine: TypeAlias = System | Callable[..., Trace] | Problem | str
+Engines: TypeAlias = OtherEngine | Sequence[str] | Mapping[str, OtherEngine] | None
+"""What `engines_for` reads."""
+
+
+def engines_for(problem: Problem, engines: Engines) -> dict[str, Problem]:
+    """Return the problem in other engines, by the names of their checks.
+
+    **Arguments:**
+    - `problem`: on the backend that it ran on.
+    - `engines`: another system for the same features and signals, a problem with one, the name of a
+      backend of its system, `"all"` for all other backends that are installed; several names, or
+      several of these by name.
+    **Raises:** `ValueError` without such a backend; `UnknownNameError` for other features.
+    """
+    if engines is None:
+        return {}
+    if isinstance(engines, str):
+        engines = (engines,)
+    if isinstance(engines, Sequence):
+        system = problem.system
+        if not system.backends:
+            raise ValueError(
+                f"the system of problem {problem.name!r} has no backends; an engine must be a "
+                f"system or a Problem, got {', '.join(map(repr, engines))}"
+            )
+        if tuple(engines) == ("all",):
+            others = [name for name in system.backends if name != system.backend]
+            engines = [name for name in others if not system.why_not(name)]
+            if not engines:
+                why = "; ".join(f"{name}: {system.why_not(name)}" for name in others)
+                raise ValueError(f"problem {problem.name!r} has no other engine here: {why}")
+        engines = {name: name for name in engines}
+    named = engines if isinstance(engines, Mapping) else {"the other engine": engines}
+    return {f"{ENGINE}{name}": _in_engine(problem, engine) for name, engine in named.items()}
+
+
+def _in_engine(problem: Problem, engine: OtherEngine) -> Problem:
+    if isinstance(engine, str):
+        other = problem.on_backend(engine)
+    else:
+        system: Any = engine.system if isinstance(engine, Problem) else engine
+        if isinstance(engine, Problem):
+            check_names("feature of the engine", engine.space.columns, problem.space.columns)
+            check_names("feature", problem.space.columns, engine.space.columns)
+        other = replace(problem, system=system)
+    other.check()
+    return other

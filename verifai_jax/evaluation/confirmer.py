@@ -26,6 +26,7 @@ from jaxtyping import Float, Int
 
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import in_precision
+from verifai_jax.evaluation.backends import Engines, engines_for
 from verifai_jax.evaluation.confirmation_rules import decide, hold_to_run, lowest_failing
 from verifai_jax.evaluation.confirmations import (
     EXACT_STEP,
@@ -37,7 +38,6 @@ from verifai_jax.evaluation.confirmations import (
     describe_check,
     engines_of,
 )
-from verifai_jax.evaluation.other_engines import Engines, engines_for
 from verifai_jax.evaluation.resimulate import (
     LANES,
     ONE_BY_ONE,

@@ -20,11 +20,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
 
-from verifai_jax.core.compilation import Compilation, XlaOptimization, compile_soon, tracing
+from verifai_jax.core.compilation import (
+    Compilation,
+    Slot,
+    XlaOptimization,
+    compile_soon,
+    pad_rows,
+    tracing,
+)
 from verifai_jax.core.fingerprint import as_traced, fingerprint
 from verifai_jax.core.keys import as_key
 from verifai_jax.core.precision import in_precision
-from verifai_jax.core.programs import Slot, pad_rows
 from verifai_jax.core.remembered import is_kept, lower_or_recall, remembered_as
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.layout import Layout

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from verifai_jax.core.compilation import power_of_two
 from verifai_jax.core.keys import run_keys
-from verifai_jax.core.programs import power_of_two
 from verifai_jax.core.progress import count_done
 from verifai_jax.evaluation.engine import FIRST, Engine, Wanted, engine_for
 from verifai_jax.evaluation.guidance import NOTHING, Guidance

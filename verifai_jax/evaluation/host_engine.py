@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Integer, Key, PyTree
 
+from verifai_jax.core.compilation import pad_rows, power_of_two
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.precision import in_precision
-from verifai_jax.core.programs import pad_rows, power_of_two
 from verifai_jax.core.text import storable
 from verifai_jax.core.trace import Status, Trace, without_wrapping
 from verifai_jax.core.user_errors import format_user_error

@@ -20,10 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Key, PyTree, UInt32
 
+from verifai_jax.core.compilation import Slot
 from verifai_jax.core.devices import enable_compile_cache
 from verifai_jax.core.keys import as_key, simulation_key
 from verifai_jax.core.precision import in_precision, reproducible_settings
-from verifai_jax.core.programs import Slot
 from verifai_jax.core.progress import count_done
 from verifai_jax.core.text import format_error
 from verifai_jax.core.trace import Status

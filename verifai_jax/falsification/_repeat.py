@@ -20,12 +20,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.checks import check_options
+from verifai_jax.core.compilation import Slot
 from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.precision import in_precision, reproducible_settings
-from verifai_jax.core.programs import Slot
 from verifai_jax.core.progress import count_done, say_done, shows_progress
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine

@@ -27,10 +27,9 @@ from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.kept_work import present
 from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.verdicts import Verdicts
-from verifai_jax.falsification.columns import import_tables
+from verifai_jax.falsification.columns import import_tables, rows_of, without_failure
 from verifai_jax.falsification.counts import Tally
 from verifai_jax.falsification.learning import Batch, Learning
-from verifai_jax.falsification.rows import rows_of, without_failure
 from verifai_jax.falsification.run_folder import write_checkpoint
 from verifai_jax.falsification.simulations import MEASURED, Simulations
 from verifai_jax.falsification.table import ErrorTable

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from verifai_jax import search as searches
 from verifai_jax._version import __version__
@@ -26,7 +26,6 @@ from verifai_jax.core.text import one_line
 from verifai_jax.core.user_errors import explain_user_error, format_user_error
 from verifai_jax.evaluation.backends import Choice
 from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
-from verifai_jax.falsification.origin import origin_of
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.run_folder import write_record
 from verifai_jax.falsification.silent_mistakes import cut_short_note, nominal_note, notes_after
@@ -37,6 +36,22 @@ from verifai_jax.search import Search
 
 if TYPE_CHECKING:
     from verifai_jax.statistics.stopping import StoppingRule
+
+Origin = Literal["prior", "first", "given", "sequence", "coverage", "learned"]
+"""Where rows come from: as the points of a search (`search/base.py`), and `"first"` for samples of
+the prior after rows that were given."""
+
+
+def origin_of(search: Search, first: int) -> Origin:
+    """Return where the rows of a run come from.
+
+    **Arguments:**
+
+    - `search`: the search of the run.
+    - `first`: number of rows that were given before the search proposed any.
+    """
+    return "first" if first and search.samples_prior else search.origin
+
 
 RAISES = "an error of every simulation"
 """What has stopped a run whose first simulations all raise."""

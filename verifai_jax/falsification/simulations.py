@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.programs import power_of_two
+from verifai_jax.core.compilation import power_of_two
 from verifai_jax.evaluation.engine import Wanted
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.guidance import Guidance

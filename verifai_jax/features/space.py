@@ -26,8 +26,7 @@ from verifai_jax.features.custom import Distribution
 from verifai_jax.features.domain import Domain, Numbers, Row
 from verifai_jax.features.fixed import Fixed
 from verifai_jax.features.plain import from_plain, to_plain
-from verifai_jax.features.point_maps import PointMaps
-from verifai_jax.features.points import features_of_rows, nudged
+from verifai_jax.features.point_maps import PointMaps, features_of_rows, nudged
 
 if TYPE_CHECKING:
     import pandas as pd

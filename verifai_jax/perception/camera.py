@@ -10,7 +10,6 @@ linear, or linear and a norm of linear ones: a sum of a column and a row. That m
 """
 
 import dataclasses
-import math
 from typing import NamedTuple, TypeAlias, TypeVar, dataclass_transform
 
 import jax
@@ -224,6 +223,3 @@ def facing(position: Vector, target: Vector) -> dict[str, Array]:
     """
     x, y, z = vector(target) - vector(position)
     return {"yaw": jnp.arctan2(y, x), "pitch": jnp.arctan2(z, jnp.hypot(x, y))}
-
-
-STRAIGHT_DOWN = -math.pi / 2

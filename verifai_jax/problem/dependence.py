@@ -28,9 +28,9 @@ from jax.interpreters import ad
 from jaxtyping import Array, Key, PyTree
 
 from verifai_jax.core import fingerprint
+from verifai_jax.core.compilation import Slot
 from verifai_jax.core.jaxprs import CALLS, called
 from verifai_jax.core.precision import truncate_silently
-from verifai_jax.core.programs import Slot
 from verifai_jax.problem.problem import Problem
 
 

@@ -18,12 +18,12 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.checks import check_name
+from verifai_jax.core.compilation import ProgramCache, Slot
 from verifai_jax.core.errors import missing_name
 from verifai_jax.core.fingerprint import alone_only, describe_step
 from verifai_jax.core.lazy import lazy_import
 from verifai_jax.core.notebook import InNotebook, text_html
 from verifai_jax.core.precision import truncate_silently
-from verifai_jax.core.programs import ProgramCache, Slot
 from verifai_jax.core.source_collection import made_here, sources_of
 from verifai_jax.core.sources import Maker, Sources
 from verifai_jax.core.text import is_control, printable

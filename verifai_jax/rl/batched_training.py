@@ -24,13 +24,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Integer, PyTree
 
+from verifai_jax.core.compilation import power_of_two
 from verifai_jax.core.devices import (
     Device,
     enable_compile_cache,
     split_sharding,
     spread_over_devices,
 )
-from verifai_jax.core.programs import power_of_two
 from verifai_jax.rl.algorithm import Algorithm, AlgorithmState, check_fit
 from verifai_jax.rl.policy import Policy
 from verifai_jax.rl.task.task import Task

@@ -17,10 +17,9 @@ import pandas as pd
 from verifai_jax.analysis.counterexamples.selection import Row
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.progress import shows_progress
-from verifai_jax.evaluation.backends import resolved
+from verifai_jax.evaluation.backends import Engines, resolved
 from verifai_jax.evaluation.confirmations import Confirmation, Confirmations, Repetitions
 from verifai_jax.evaluation.confirmer import Confirmer
-from verifai_jax.evaluation.other_engines import Engines
 from verifai_jax.falsification.run import Run
 
 BLOCK = 128

@@ -13,13 +13,9 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from verifai_jax.analysis.counterexamples import likelier, selection
 from verifai_jax.analysis.counterexamples.candidates import Candidates
 from verifai_jax.analysis.counterexamples.fixed_key import fix_key, note_on_key
-from verifai_jax.analysis.counterexamples.likelier import (
-    draw_around_elite,
-    exchange_cells,
-    shift_in_time,
-)
 from verifai_jax.analysis.counterexamples.minimize_count import (
     grow,
     minimize_count,
@@ -28,14 +24,7 @@ from verifai_jax.analysis.counterexamples.minimize_count import (
 from verifai_jax.analysis.counterexamples.minimize_distance import minimize_distance
 from verifai_jax.analysis.counterexamples.nominal import Likeliest, Nominal
 from verifai_jax.analysis.counterexamples.remove_items import remove_items
-from verifai_jax.analysis.counterexamples.selection import (
-    Row,
-    columns_at,
-    problem_of,
-    select_others,
-    select_row,
-)
-from verifai_jax.analysis.counterexamples.shrunk import LogDensities, Shrunk, Step, _plain
+from verifai_jax.analysis.counterexamples.shrunk import LogDensities, Shrunk, Step
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options, unknown_name
 from verifai_jax.core.keys import run_keys
@@ -43,6 +32,7 @@ from verifai_jax.core.progress import shows_progress
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.run import Run
 from verifai_jax.features.density import log_density
+from verifai_jax.features.domain import as_scalar
 from verifai_jax.problem.problem import Problem
 
 ORDERS = ("count", "distance", "likelihood")
@@ -60,7 +50,7 @@ AWAY = 0.002
 @shows_progress("shrinking a counterexample of")
 def shrink(
     run: Run,
-    row: Row = None,
+    row: selection.Row = None,
     *,
     nominal: Mapping[str, Any] | None = None,
     by: Literal["count", "distance", "likelihood"] = "count",
@@ -103,7 +93,7 @@ def shrink(
     **Raises:** `ValueError` for a run without its problem or without a counterexample, a row that
     is none or does not fail when simulated again, a feature without a nominal value.
     """
-    problem = problem_of(run)
+    problem = selection.problem_of(run)
     if by not in ORDERS:
         raise unknown_name("order", by, ORDERS)
     check_count("budget", budget)
@@ -111,7 +101,7 @@ def shrink(
     if row is None and isinstance(at, Likeliest) and len(failing := run.table.counterexamples):
         density = run.improbability(failing)["log_density"].to_numpy(float)
         row = int(failing.index.to_numpy()[np.argmax(density)])
-    number, first = select_row(run, row)
+    number, first = selection.select_row(run, row)
     about_key = note_on_key(problem, number)
     problem = fix_key(problem, run, number)
     key = run_keys(run.seed)[1]
@@ -134,7 +124,9 @@ def shrink(
     candidates = Candidates(problem, at, int(budget), run.precision)
     search = _Search(candidates, by, np.random.default_rng(seed), start)
     count = 4 * OTHERS if by == "likelihood" else OTHERS
-    points = np.concatenate([start, select_others(run, at, number, count)]) if others else start
+    points = start
+    if others:
+        points = np.concatenate([start, selection.select_others(run, at, number, count)])
     notes, stopped = [], None
     try:
         search.search(points)
@@ -249,10 +241,10 @@ class _Search:
                 half, spent = candidates.limit, candidates.simulations
                 if candidates.differentiable:
                     candidates.limit = min(half, spent + candidates.budget // 8)
-                draw_around_elite(candidates, self.rng)
+                likelier.draw_around_elite(candidates, self.rng)
                 candidates.limit = half
             if len(nominal.cube.discrete):
-                exchange_cells(candidates, self.rng)
+                likelier.exchange_cells(candidates, self.rng)
         self.note()
         likely = self.by == "likelihood"
         self.follow(self.starts(), rounds=15 if likely else 60)
@@ -263,7 +255,7 @@ class _Search:
         for _ in range(8 if likely else 1):
             before = self.failures()[0]
             if likely:
-                shift_in_time(candidates, before)
+                likelier.shift_in_time(candidates, before)
             self.follow(self.starts(self.failures()[:1], cosine=0.97)[1:], rounds=10)
             if np.array_equal(self.failures()[0], before):
                 break
@@ -416,7 +408,7 @@ def _verified(
         for point in tried:
             if not nominal.space.accepts_points(point[None])[0]:
                 continue
-            columns = columns_at(problem, point)
+            columns = selection.columns_at(problem, point)
             again = replay(problem, columns, key, number, precision)
             if again.violated and (
                 not exact or replay(problem, columns, key, number, "float64").violated
@@ -437,7 +429,7 @@ def _changed(nominal: Nominal, u: Float[np.ndarray, " d"]) -> dict[str, tuple[An
         if column is None and names:
             column = columns[names[i]]
         values = (nominal.u[i], u[i]) if column is None else column
-        changed[name] = (None if nominal.lacks[i] else _plain(values[0]), _plain(values[1]))
+        changed[name] = (None if nominal.lacks[i] else as_scalar(values[0]), as_scalar(values[1]))
     return changed
 
 

@@ -158,10 +158,6 @@ class Shrunk(Drawn, InNotebook):
     __repr__ = __str__
 
 
-def _plain(value: object) -> Any:
-    return value.item() if isinstance(value, np.generic) else value
-
-
 def _of(count: int, d: int) -> str:
     return f"{count} of {d} features" if d != 1 else "its one feature"
 

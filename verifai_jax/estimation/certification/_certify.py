@@ -20,10 +20,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from verifai_jax.core.checks import check_count, check_fraction
+from verifai_jax.core.compilation import power_of_two
 from verifai_jax.core.devices import enable_compile_cache
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.executors import Executor
-from verifai_jax.core.programs import power_of_two
 from verifai_jax.core.progress import say_done, shows_progress
 from verifai_jax.estimation.certification.allocation import Allocation, find_leader
 from verifai_jax.estimation.certification.attack import PolicyRecord, attack_policies, check_attack

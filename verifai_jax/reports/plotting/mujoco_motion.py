@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.programs import Slot
+from verifai_jax.core.compilation import Slot
 from verifai_jax.core.waveform import set_durations
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.reports.plotting.film import caption_of, decided_at

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from verifai_jax.core.checks import check_count
+from verifai_jax.core.checks import check_count, is_number
 from verifai_jax.core.trace import Trace
 
 SignalNames = Sequence[str] | Mapping[str, int]
@@ -41,7 +41,7 @@ class TraceForm:
                         f"signals must say how many components {name!r} has, at least 1; "
                         f"got {width!r}"
                     )
-        if dt is not None and not (_is_number(dt) and 0 < dt < math.inf):
+        if dt is not None and not (is_number(dt) and 0 < dt < math.inf):
             raise ValueError(f"dt must be a positive number of seconds; got {dt!r}")
         if length is not None:
             check_count("length", length)
@@ -106,7 +106,3 @@ class TraceForm:
                 if not isinstance(self.signals, Mapping):
                     hint = f"; declare vectors by signals={{{name!r}: {shape[1]}, ...}}"
                 raise ValueError(f"signal {name!r} must be {wanted}; got {list(shape)}{hint}")
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)

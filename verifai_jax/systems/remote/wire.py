@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from verifai_jax.core.checks import is_number
 from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.core.reaction import Reaction
 from verifai_jax.core.trace import Trace
@@ -142,7 +143,7 @@ def trace_of(message: Message) -> Trace:
             f"a result must have signals, an object of arrays by name; got {brief(signals)}"
         )
     dt, times, valid = header.get("dt"), header.get("times"), header.get("valid")
-    if dt is not None and not (_is_number(dt) and 0 < dt < math.inf):
+    if dt is not None and not (is_number(dt) and 0 < dt < math.inf):
         raise WireError(f"dt must be a positive number of seconds; got {brief(dt)}")
     if times is not None:
         times = _array("times", times, raw)
@@ -230,10 +231,6 @@ def _without_nan(value: object) -> Any:
 
 def _is_integer(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def unknown_type(kind: object, known: Iterable[str]) -> WireError:

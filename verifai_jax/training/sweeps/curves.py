@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from verifai_jax.core.compilation import power_of_two
 from verifai_jax.core.errors import check_names
-from verifai_jax.core.programs import power_of_two
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import Formula, parse, robustness
 from verifai_jax.mtl.formula import Interval

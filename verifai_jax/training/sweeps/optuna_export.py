@@ -8,7 +8,7 @@ import numpy as np
 
 from verifai_jax.core.errors import require
 from verifai_jax.features import FeatureSpace
-from verifai_jax.features.domain import Domain
+from verifai_jax.features.domain import Domain, as_scalar
 from verifai_jax.training.sweeps.optuna_distributions import optuna_distribution
 from verifai_jax.training.sweeps.record import STOPPED, algorithm_uses
 
@@ -118,8 +118,8 @@ def _trial(
     elif STOPPED in str(row["status"]).split(", "):
         state = optuna.trial.TrialState.PRUNED
     complete = state == optuna.trial.TrialState.COMPLETE
-    attributes = {name: _plain(row[name]) for name in _ATTRIBUTES if name in row}
-    parameters = {n: _clamp(_plain(row[n]), d) for n, d in distributions.items()}
+    attributes = {name: as_scalar(row[name]) for name in _ATTRIBUTES if name in row}
+    parameters = {n: _clamp(as_scalar(row[n]), d) for n, d in distributions.items()}
     parameters = {n: v for n, v in parameters.items() if v == v}
     return optuna.trial.create_trial(
         state=state,
@@ -141,7 +141,3 @@ def _clamp(value: object, distribution: "BaseDistribution") -> object:
         return value
     assert isinstance(value, int | float)
     return (int if isinstance(low, int) else float)(min(max(value, low), high))
-
-
-def _plain(value: object) -> object:
-    return value.item() if isinstance(value, np.generic) else value
