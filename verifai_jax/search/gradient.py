@@ -39,9 +39,9 @@ from verifai_jax.search.draws import draw_uniform
 from verifai_jax.search.halton import halton_points
 from verifai_jax.search.linear_steps import HALVINGS, flip_weakest, minimax_direction
 
-LITTLE = 0.9
-"""Share of the robustness that is left after a step which is only a little better.
-Chosen by hand; no comparison with other values is recorded."""
+# The first two were chosen by hand; no comparison with other values is recorded.
+LITTLE = 0.9  # share of the robustness that is left after a step which is only a little better
+COOLING = 0.7  # factor on the temperature with each step, after the first descent
 
 WOBBLE = 0.1
 """Greatest share by which boxes smaller than the cube are less, in all of a run: with it all points
@@ -66,10 +66,6 @@ default factor."""
 UNPROMISING = 0.75
 """Share of `FIRST_BOX` below which a box is not tried where no greater one was better: the first
 box is tried, and the next smaller one is not."""
-
-COOLING = 0.7
-"""Factor on the temperature with each step, after the first descent. Chosen by hand;
-no comparison with other values is recorded."""
 
 
 class GradientState(NamedTuple):

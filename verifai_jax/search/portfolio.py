@@ -43,9 +43,16 @@ from verifai_jax.search.mutation import FEW, Mutation, MutationState
 from verifai_jax.search.wrapper import Wrapper
 
 GRADIENT, MUTATION, CROSS_ENTROPY = range(3)  # numbers of the members
+
+# The numbers before `FILLED` were chosen by hand; no comparison with other values is recorded.
 PRIOR_GAINS = 4.0, 2.5
 """Gains before there is evidence, of descents and of the other two together: as if descents had
-succeeded always. Chosen by hand; no comparison with other values is recorded."""
+succeeded always."""
+
+PRIOR_COSTS = 4.0  # cost of these gains, in simulations: few, so that evidence soon decides
+DISCOUNT = 0.98  # of evidence, for each simulation since: that of 50 simulations ago counts a third
+MIN_SHARE = 0.05  # of the budget of a member, so that its evidence never ends
+PATIENT = 4  # rounds in a row without a failure after which failures are rare
 
 FILLED = 8
 """Batch from which on cross-entropy has nine tenths of what it and mutations have, whatever gains
@@ -62,15 +69,6 @@ IN_VAIN = 3
 Without a factor on the gains they got on as long as the numbers alone can: five problems of choices
 and numbers took 1.03 to 1.4 times as many simulations."""
 
-PRIOR_COSTS = 4.0  # cost of these gains, in simulations: few, so that evidence soon decides
-DISCOUNT = 0.98
-"""Discount of evidence, for each simulation since: that of 50 simulations ago counts a third.
-Chosen by hand; no comparison with other values is recorded."""
-
-MIN_SHARE = 0.05
-"""Minimum share of the budget of a member, so that its evidence never ends. Chosen by hand; no
-comparison with other values is recorded."""
-
 OPENING = 6
 """Descents before the budget is shared by evidence. With two instead, SB3 to SB5 together took 0.99
 times as many simulations; with twelve, and one of four with the whole cube, the
@@ -84,10 +82,6 @@ simulations with these descents as without, where more are two took 1.3 and 2.7 
 MANY = 32
 """Simulations of a round beyond which descents wait until failures are rare: such rounds simulate
 thousands in the seconds that gradients take to compile."""
-
-PATIENT = 4
-"""Rounds in a row without a failure after which they are rare. Chosen by hand; no comparison with
-other values is recorded."""
 
 NEVER = 1 << 30
 """Simulations since the last failure that stand for any number of them: more than a run has."""

@@ -35,16 +35,12 @@ from verifai_jax.search.process_data import (
     snap,
 )
 
-MAX_PATHS = 32
-"""Functions drawn for a batch; larger batches take several points from each. As in `bayes`."""
-WAVES = 256
-"""Random waves of such a function. As in `bayes`."""
-FIT_STEPS = 12
-"""Steps of Adam in a fit. Chosen by hand; no comparison with other values is recorded."""
-COORDINATES = 20
-"""Coordinates in which a candidate differs from the best point, on average; that of the paper."""
-SIDES = (2.0**-7, 0.8, 1.6)
-"""Smallest, first and largest side of the box, in cubes; those of the paper."""
+# The first two as in `bayes`, the third chosen by hand; no comparison with others is recorded.
+MAX_PATHS = 32  # functions drawn for a batch; larger batches take several points from each
+WAVES = 256  # random waves of such a function
+FIT_STEPS = 12  # steps of Adam in a fit
+COORDINATES = 20  # in which a candidate differs from the best point, on average; of the paper
+SIDES = (2.0**-7, 0.8, 1.6)  # smallest, first and largest of the box, in cubes; of the paper
 PROGRESS = 1e-3
 """Share of the lowest robustness by which a point must be below it, to be progress; that of the
 authors' program."""
