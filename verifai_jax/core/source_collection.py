@@ -15,15 +15,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from verifai_jax.core import source_objects
 from verifai_jax.core.reads import documents, files_read_by, modules_loaded_by
-from verifai_jax.core.source_objects import (
-    Function,
-    Module,
-    OwnFiles,
-    is_notebook_cell,
-    is_user_file,
-    parts_of,
-)
 from verifai_jax.core.source_scan import MAX_FILES, Import, files_of_model, scan
 from verifai_jax.core.sources import (
     CALLER,
@@ -55,7 +48,7 @@ def made_here() -> tuple[Maker, ...]:
         file = frame.f_code.co_filename
         if found and file.startswith("<frozen importlib"):
             break
-        if is_user_file(file):
+        if source_objects.is_user_file(file):
             role = PROBLEM if not found else CALLER
             # A cell, or what is executed as text, belongs to no file.
             path = os.path.abspath(file) if os.path.isfile(file) else ""
@@ -78,10 +71,10 @@ def sources_of(*things: object, made: Sequence[Maker] = (), first: int = 0) -> S
     collector = _Collector()
     for maker in made:
         collector.add_maker(maker)
-    for part in parts_of(things):
-        if isinstance(part, Module):
+    for part in source_objects.parts_of(things):
+        if isinstance(part, source_objects.Module):
             collector.add_module(part.file, _as_imported(part.owner, part.file), IMPORTED)
-        elif isinstance(part, OwnFiles):
+        elif isinstance(part, source_objects.OwnFiles):
             for file, sha256 in part.files.items():
                 collector.add_data(file, MODEL, sha256)
         else:
@@ -141,8 +134,8 @@ class _Collector:
         except OSError:
             self.without_file.append(f"{shown_path(file)} cannot be read, and is not recorded")
 
-    def add_function(self, function: Function) -> None:
-        where = "notebook" if is_notebook_cell(function.file) else "no file"
+    def add_function(self, function: source_objects.Function) -> None:
+        where = "notebook" if source_objects.is_notebook_cell(function.file) else "no file"
         name = f"{function.name} ({where})"
         # Of several of one name, such as lambdas, the hash stands for all in their order.
         if (known := self.functions.get(name)) is not None:
@@ -200,7 +193,11 @@ def _named(text: str, program: str) -> Iterator[str]:
     folder = Path(program).parent
     for base in dict.fromkeys((folder, folder.parent, Path.cwd())):
         with_base = os.path.join(base, text)
-        if not text.endswith(".py") and os.path.isfile(with_base) and is_user_file(with_base):
+        if (
+            not text.endswith(".py")
+            and os.path.isfile(with_base)
+            and source_objects.is_user_file(with_base)
+        ):
             yield os.path.abspath(with_base)
             return
 
@@ -237,7 +234,7 @@ def _search_path(top: str, program: str) -> list[Path]:
     if module is not None:
         folders = [Path(path).parent for path in getattr(module, "__path__", ())]
         file = getattr(module, "__file__", None)
-        if file is not None and not is_user_file(file):
+        if file is not None and not source_objects.is_user_file(file):
             return []  # An installed package, of which no file is looked for.
         return folders or ([] if file is None else [Path(file).parent])
     spec = importlib.machinery.PathFinder.find_spec(top)
@@ -258,7 +255,7 @@ def _found_below(name: str, folders: Sequence[Path], program: str) -> Iterator[s
             files = [path.with_name(f"{path.name}{ending}") for ending in endings]
             for file in (*files, path / "__init__.py"):
                 text = os.path.abspath(file)
-                if text != program and os.path.isfile(text) and is_user_file(text):
+                if text != program and os.path.isfile(text) and source_objects.is_user_file(text):
                     yield text
 
 
