@@ -18,17 +18,7 @@ import numpy as np
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Float
 
-from verifai_jax.features.continuous import (
-    REACH,
-    Bounded,
-    Continuous,
-    check_ends,
-    check_logs,
-    check_numbers,
-    check_positive,
-    normal_score,
-    scipy_special,
-)
+from verifai_jax.features import continuous
 from verifai_jax.features.domain import MAX_REAL, MIN_REAL, as_numbers, short
 from verifai_jax.features.ends import replace_where
 from verifai_jax.features.english import number, quantile_words
@@ -49,8 +39,8 @@ class _Table(NamedTuple):
 
     def at(self, z: Float[Array, ""]) -> Float[Array, ""]:
         """Return the value at a normal score."""
-        step = 2 * REACH / (KNOTS - 1)
-        position = (jnp.clip(z, -REACH, REACH) + REACH) / step
+        step = 2 * continuous.REACH / (KNOTS - 1)
+        position = (jnp.clip(z, -continuous.REACH, continuous.REACH) + continuous.REACH) / step
         i = jnp.clip(jnp.floor(position).astype(jnp.int32), 0, KNOTS - 2)
         t = position - i
         values, slopes = (jnp.asarray(part, z.dtype) for part in self)
@@ -62,7 +52,7 @@ class _Table(NamedTuple):
 
     def score(self, value: Float[Array, ""]) -> Float[Array, ""]:
         """Return the normal score of a value: the inverse, by Newton's method on the cubic."""
-        step = 2 * REACH / (KNOTS - 1)
+        step = 2 * continuous.REACH / (KNOTS - 1)
         values, slopes = (jnp.asarray(part, value.dtype) for part in self)
         i = jnp.clip(jnp.searchsorted(values, value, side="right") - 1, 0, KNOTS - 2)
         low, gap = values[i], values[i + 1] - values[i]
@@ -73,17 +63,17 @@ class _Table(NamedTuple):
             curve = t * gap + t * (1 - t) * bend
             slope = gap + (1 - 2 * t) * bend - t * (1 - t) * (first + last - 2 * gap)
             t = jnp.clip(t - (curve - (value - low)) / slope, 0.0, 1.0)
-        return (i + t) * step - REACH
+        return (i + t) * step - continuous.REACH
 
 
 def _knots() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return normal scores, their log-densities, and the probabilities on both sides."""
-    z = np.linspace(-REACH, REACH, KNOTS)
+    z = np.linspace(-continuous.REACH, continuous.REACH, KNOTS)
     return (
         z,
         -(z**2) / 2 - math.log(2 * math.pi) / 2,
-        scipy_special().ndtr(z),
-        scipy_special().ndtr(-z),
+        continuous.scipy_special().ndtr(z),
+        continuous.scipy_special().ndtr(-z),
     )
 
 
@@ -104,12 +94,12 @@ class Gamma(Positive):
     scale: float
 
     def __post_init__(self) -> None:
-        check_numbers(self, "shape", "scale")
-        check_positive(self, "shape", "scale")
+        continuous.check_numbers(self, "shape", "scale")
+        continuous.check_positive(self, "shape", "scale")
         if self.shape < 0.05:
             raise ValueError(f"shape of a Gamma must be at least 0.05; got {self!r}")
         middle, greatest = self._median, self._median + self._table.values[-1]
-        check_logs(self, middle, greatest)
+        continuous.check_logs(self, middle, greatest)
 
     @cached_property
     def _table(self) -> _Table:
@@ -118,11 +108,11 @@ class Gamma(Positive):
         with np.errstate(divide="ignore"):
             x = np.where(
                 z < 0,
-                scipy_special().gammaincinv(self.shape, left),
-                scipy_special().gammainccinv(self.shape, right),
+                continuous.scipy_special().gammaincinv(self.shape, left),
+                continuous.scipy_special().gammainccinv(self.shape, right),
             )
             # What underflows in double precision: the first term of the series.
-            first = (np.log(left) + scipy_special().gammaln(self.shape + 1)) / self.shape
+            first = (np.log(left) + continuous.scipy_special().gammaln(self.shape + 1)) / self.shape
             y = np.where(x > 1e-290, np.log(x), first)
         slopes = np.exp(log_normal - self._log_density_of_log(y))
         return _Table(y - y[KNOTS // 2], slopes)
@@ -130,13 +120,15 @@ class Gamma(Positive):
     @cached_property
     def _median(self) -> float:
         """The logarithm of the median."""
-        return math.log(scipy_special().gammaincinv(self.shape, 0.5)) + math.log(self.scale)
+        return math.log(continuous.scipy_special().gammaincinv(self.shape, 0.5)) + math.log(
+            self.scale
+        )
 
     def _log_density_of_log(self, y: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         return self.shape * y - np.exp(y) - math.lgamma(self.shape)
 
     def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
-        return math.exp(self._median) * jnp.exp(self._table.at(normal_score(u)))
+        return math.exp(self._median) * jnp.exp(self._table.at(continuous.normal_score(u)))
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
         share = jnp.maximum(value, MIN_REAL) / math.exp(self._median)
@@ -151,12 +143,15 @@ class Gamma(Positive):
 
     def tail(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         x = np.maximum(np.asarray(value, np.float64), 0) / self.scale
-        sides = scipy_special().gammainc(self.shape, x), scipy_special().gammaincc(self.shape, x)
+        sides = (
+            continuous.scipy_special().gammainc(self.shape, x),
+            continuous.scipy_special().gammaincc(self.shape, x),
+        )
         return 2 * np.minimum(*sides)
 
 
 @dataclass(frozen=True, repr=False)
-class Beta(Bounded):
+class Beta(continuous.Bounded):
     """Shares, or numbers between two ends: `Beta(a, b)`, `Beta(a, b, low, high)`.
 
     **Arguments:**
@@ -174,11 +169,11 @@ class Beta(Bounded):
     high: float = 1.0
 
     def __post_init__(self) -> None:
-        check_numbers(self, "a", "b", "low", "high")
+        continuous.check_numbers(self, "a", "b", "low", "high")
         for name in ("a", "b"):
             if getattr(self, name) < 0.05:
                 raise ValueError(f"{name} of a Beta must be at least 0.05; got {self!r}")
-        check_ends(self, self.low, self.high)
+        continuous.check_ends(self, self.low, self.high)
 
     @property
     def closed(self) -> str:
@@ -195,10 +190,10 @@ class Beta(Bounded):
 
     def _logs(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the logarithms of the share and of the rest, at probabilities on both sides."""
-        share = scipy_special().betaincinv(self.a, self.b, left)
-        rest = scipy_special().betaincinv(self.b, self.a, right)
+        share = continuous.scipy_special().betaincinv(self.a, self.b, left)
+        rest = continuous.scipy_special().betaincinv(self.b, self.a, right)
         # What underflows in double precision: the first term of the series.
-        log = scipy_special().betaln(self.a, self.b)
+        log = continuous.scipy_special().betaln(self.a, self.b)
         first = (np.log(left) + math.log(self.a) + log) / self.a
         last = (np.log(right) + math.log(self.b) + log) / self.b
         below = np.where(share > 1e-290, np.log(share), first)
@@ -211,10 +206,10 @@ class Beta(Bounded):
         return below, above
 
     def _log_density_of_logit(self, below: np.ndarray, above: np.ndarray) -> np.ndarray:
-        return self.a * below + self.b * above - scipy_special().betaln(self.a, self.b)
+        return self.a * below + self.b * above - continuous.scipy_special().betaln(self.a, self.b)
 
     def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
-        y = self._table.at(normal_score(u))
+        y = self._table.at(continuous.normal_score(u))
         # From the nearer end, exact at both.
         small = jnp.exp(-jnp.abs(y)) / (1 + jnp.exp(-jnp.abs(y))) * (self.high - self.low)
         return jnp.where(y < 0, self.low + small, self.high - small)
@@ -231,14 +226,15 @@ class Beta(Bounded):
         share = np.where(inside, (value - self.low) / width, 0.5)
         rest = np.where(inside, (self.high - value) / width, 0.5)
         density = (self.a - 1) * np.log(share) + (self.b - 1) * np.log(rest)
-        density = density - scipy_special().betaln(self.a, self.b) - math.log(width)
+        density = density - continuous.scipy_special().betaln(self.a, self.b) - math.log(width)
         return np.where(inside, density, -np.inf)
 
     def tail(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         x = (np.asarray(value, np.float64) - self.low) / (self.high - self.low)
         x = np.clip(x, 0.0, 1.0)
         return 2 * np.minimum(
-            scipy_special().betainc(self.a, self.b, x), scipy_special().betaincc(self.a, self.b, x)
+            continuous.scipy_special().betainc(self.a, self.b, x),
+            continuous.scipy_special().betaincc(self.a, self.b, x),
         )
 
     def __repr__(self) -> str:
@@ -247,7 +243,7 @@ class Beta(Bounded):
 
 
 @dataclass(frozen=True, repr=False, init=False)
-class Empirical(Continuous):
+class Empirical(continuous.Continuous):
     """Numbers as they were measured: `Empirical(data)`.
 
     The quantiles are those of the sorted data, with straight lines between neighbours; a number

@@ -27,15 +27,8 @@ from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.max_min import max_min_step
-from verifai_jax.synthesis import optimize
+from verifai_jax.synthesis import arguments, optimize
 from verifai_jax.synthesis.adversary import attack
-from verifai_jax.synthesis.arguments import (
-    AIMS,
-    ATTACK,
-    attack_search,
-    check_numbers,
-    feature_parameters,
-)
 from verifai_jax.synthesis.failure_counts import FailureCounts
 from verifai_jax.synthesis.held_out import HeldOut, draw, held_out
 from verifai_jax.synthesis.parametric import FeatureParameters, Parametric, rows_of
@@ -105,14 +98,14 @@ def synthesize(
     """
     started = time.perf_counter()
     check_options(budget, batch, seed, max_seconds, None)
-    check_numbers(margin, environments=environments, held_out=held_out)
-    check_names("aim", [aim], AIMS)
+    arguments.check_numbers(margin, environments=environments, held_out=held_out)
+    check_names("aim", [aim], arguments.AIMS)
     if prove is not None:
         check_positive("prove", prove)
-    loop = feature_parameters(
+    loop = arguments.feature_parameters(
         problem, parameters, gradient, batch, budget, precision, backend, seed
     )
-    search = attack_search(problem, attack, loop)
+    search = arguments.attack_search(problem, attack, loop)
     enclosed = None
     if prove is not None:
         from verifai_jax.verification.enclosure import enclosable
@@ -276,7 +269,7 @@ class _Synthesis:
                 break
             level = choice.value - 1e-3 * self.scale
             share = max(self.limits.left // 4, min(self.limits.left, 256))
-            share = min(share, ATTACK)
+            share = min(share, arguments.ATTACK)
             assert self.region is not None
             result = attack(
                 self.loop, choice.theta, level, self.limits.slice(share), search=self.search,
@@ -289,7 +282,9 @@ class _Synthesis:
             self.attacked.append(choice._replace(value=worst))
             if not result.violating.any():
                 # What a handful of simulations does not find says nothing.
-                thorough = len(result.rho) >= min(ATTACK // 2, max(32, self.limits.maximum // 20))
+                thorough = len(result.rho) >= min(
+                    arguments.ATTACK // 2, max(32, self.limits.maximum // 20)
+                )
                 self.stopped = "converged" if thorough else self.limits.stopped_by
                 return
             self.extend(result.select(ADDED))

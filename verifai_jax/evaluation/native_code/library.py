@@ -14,14 +14,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt32
 
+from verifai_jax.core import machine_code
 from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.machine_code import (
-    Program,
-    Unavailable,
-    compiler,
-    library_file,
-    library_folder,
-)
 from verifai_jax.core.remembered import remembered_as
 from verifai_jax.evaluation.native_code.source import OTHERS, PRELUDE
 
@@ -47,7 +41,7 @@ class Library:
         try:
             loaded = ctypes.CDLL(str(path))
         except OSError as error:
-            raise Unavailable(f"{path.name} cannot be loaded: {error}") from error
+            raise machine_code.Unavailable(f"{path.name} cannot be loaded: {error}") from error
         self.count = count
         self._width = int(loaded.width())
         self._run = loaded.run
@@ -87,12 +81,12 @@ def library_name(fingerprint: str | None) -> str:
     - `fingerprint`: the fingerprint of the program; None if it has none.
     **Raises:** `Unavailable` where there is no compiler, no cache folder, or no fingerprint.
     """
-    tool = compiler()
+    tool = machine_code.compiler()
     about = tool.stat()
     which = (str(tool), about.st_size, about.st_mtime_ns, _processor(), FLAGS, PRELUDE)
     name = remembered_as("native", fingerprint, which)
     if name is None:
-        raise Unavailable("a part of the program cannot be identified")
+        raise machine_code.Unavailable("a part of the program cannot be identified")
     return name
 
 
@@ -107,28 +101,30 @@ def load(name: str, count: int, translate: Callable[[], str], quickly: bool = Fa
     **Raises:** `Unavailable` where it cannot be compiled, kept or loaded.
     """
 
-    def program() -> Program:
+    def program() -> machine_code.Program:
         source = translate()
         effort = "-O1" if quickly or source.count("\n") > LONG else "-O2"
         return source, (effort, *FLAGS)
 
-    return Library(library_file(name, program), count)
+    return Library(machine_code.library_file(name, program), count)
 
 
 def is_approved(name: str) -> bool | None:
     """Return whether a library computes what XLA does, as `approve` noted; None if unknown."""
     try:
-        return {"yes": True, "no": False}.get((library_folder() / f"{name}.agrees").read_text())
-    except (OSError, Unavailable):
+        return {"yes": True, "no": False}.get(
+            (machine_code.library_folder() / f"{name}.agrees").read_text()
+        )
+    except (OSError, machine_code.Unavailable):
         return None
 
 
 def approve(name: str, agrees: bool) -> None:
     """Note whether a library computes what XLA does, for later processes."""
     try:
-        with replacing(library_folder() / f"{name}.agrees") as partial:
+        with replacing(machine_code.library_folder() / f"{name}.agrees") as partial:
             partial.write_bytes((b"no", b"yes")[agrees])
-    except (OSError, Unavailable):
+    except (OSError, machine_code.Unavailable):
         return  # It is compared again.
 
 

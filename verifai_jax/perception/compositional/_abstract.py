@@ -33,18 +33,12 @@ from verifai_jax.falsification import Run, falsify, resume, simulate
 from verifai_jax.falsification.validation import check_search
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import Formula, parse
+from verifai_jax.perception.compositional import result
 from verifai_jax.perception.compositional.region import (
     UNCERTAIN,
     Abstraction,
     AbstractLoop,
     sample_region,
-)
-from verifai_jax.perception.compositional.result import (
-    BUDGET,
-    FOUND,
-    INTERRUPTED,
-    NOTHING,
-    Compositional,
 )
 from verifai_jax.problem import Problem, ProblemError
 from verifai_jax.search import Search
@@ -70,7 +64,7 @@ def abstract(
     seed: int = 0,
     images_per_simulation: int | None = None,
     progress: bool | None = None,
-) -> Compositional:
+) -> result.Compositional:
     """Find failures of a loop that its perception causes, with few rendered images.
 
     Three stages:
@@ -134,8 +128,8 @@ def abstract(
         region = sample_region(loop, samples, seed)
         bar.end()
         bar.begin(f"{problem.name}: images", budget, "images")
-        ended = stages.play(bar) if UNCERTAIN in set(region["kind"]) else NOTHING
-    return Compositional(
+        ended = stages.play(bar) if UNCERTAIN in set(region["kind"]) else result.NOTHING
+    return result.Compositional(
         name=problem.name,
         error=str(condition),
         region=region,
@@ -236,19 +230,19 @@ class _Stages:
         while self.rendered < self.budget:
             before = self.rendered
             stopped = self._look(min(self.batch, self.budget - self.rendered))
-            if stopped == INTERRUPTED:
-                return INTERRUPTED
-            for row in self._next_candidates(last=stopped != BUDGET):
+            if stopped == result.INTERRUPTED:
+                return result.INTERRUPTED
+            for row in self._next_candidates(last=stopped != result.BUDGET):
                 if self.rendered + self.per > self.budget:
-                    return BUDGET
-                if self._simulate(row) == INTERRUPTED:
-                    return INTERRUPTED
+                    return result.BUDGET
+                if self._simulate(row) == result.INTERRUPTED:
+                    return result.INTERRUPTED
                 if self.confirmed >= self.stop_after:
-                    return FOUND
-            if stopped != BUDGET:
+                    return result.FOUND
+            if stopped != result.BUDGET:
                 return stopped
             bar.advance(self.rendered - before, f"{self.confirmed} confirmed")
-        return BUDGET
+        return result.BUDGET
 
     def _look(self, count: int) -> str:
         """Render a batch of images in the region."""
@@ -276,7 +270,7 @@ class _Stages:
         run = simulate(
             self.problem, self._erring().loc[[row]], batch=1, seed=self.seed, progress=False
         )
-        if run.stopped != INTERRUPTED:
+        if run.stopped != result.INTERRUPTED:
             self.simulations.append(run)
             self.rows.append(row)
             self.after.append(self.rendered)

@@ -16,14 +16,8 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from verifai_jax.systems.scenic import geometry
 from verifai_jax.systems.scenic.compilation import Compiled
-from verifai_jax.systems.scenic.geometry import (
-    box_inside,
-    edges_of,
-    is_convex,
-    point_inside,
-    rectangle_of,
-)
 from verifai_jax.systems.scenic.graph import is_random, kind_of
 from verifai_jax.systems.scenic.meaning import FUNCTIONS, Values
 from verifai_jax.systems.scenic.values import (
@@ -182,14 +176,16 @@ class _Evaluation:
         if region is None or not polygonal:
             raise Unsupported("containment in a region that is not a fixed polygon")
         if isinstance(thing, Body) and "width" in thing.names:
-            box = rectangle_of(thing)
-            return box_inside(box, edges_of(region.polygons), is_convex(region.polygons))
+            box = geometry.rectangle_of(thing)
+            return geometry.box_inside(
+                box, geometry.edges_of(region.polygons), geometry.is_convex(region.polygons)
+            )
         position = as_vec(thing)
         if kind_of(region) == "CircularRegion":
             return position.distanceTo(as_vec(self.values(region.center))) <= region.radius
         if kind_of(region) == "SectorRegion":
             raise Unsupported("containment in a sector")
-        return point_inside(position.x, position.y, edges_of(region.polygons))
+        return geometry.point_inside(position.x, position.y, geometry.edges_of(region.polygons))
 
     def _Call(self, tree: Any) -> Any:
         name = getattr(tree.func, "id", "")

@@ -8,26 +8,11 @@ import numpy as np
 
 from verifai_jax.features import Box, Categorical, Constant, DiscreteBox, Normal, TruncatedNormal
 from verifai_jax.features.domain import MAX_LEVELS, Domain
+from verifai_jax.systems.scenic import leaves
 from verifai_jax.systems.scenic.graph import field, is_random, kind_of, law
-from verifai_jax.systems.scenic.leaves import (
-    LABEL,
-    ChoiceIndex,
-    Chosen,
-    Deviation,
-    Histogram,
-    InPolygon,
-    InRectangle,
-    InSector,
-    Leaf,
-    Number,
-    OnPolyline,
-    Share,
-    TruncatedShare,
-    region_of,
-)
 
 
-def leaf_of(node: Any, name: str, options: Sequence[Any] | None = None) -> Leaf | None:
+def leaf_of(node: Any, name: str, options: Sequence[Any] | None = None) -> leaves.Leaf | None:
     """Return a random node as a leaf with an inverse; None for one that has none.
 
     **Arguments:**
@@ -39,27 +24,31 @@ def leaf_of(node: Any, name: str, options: Sequence[Any] | None = None) -> Leaf 
     match kind_of(drawn):
         case "Range":
             if is_random(field(drawn, "low")) or is_random(field(drawn, "high")):
-                return Share(node, name, {f"{name}.share": Box(0, 1)})
-            return Number(node, name, {name: _between(field(drawn, "low"), field(drawn, "high"))})
+                return leaves.Share(node, name, {f"{name}.share": Box(0, 1)})
+            return leaves.Number(
+                node, name, {name: _between(field(drawn, "low"), field(drawn, "high"))}
+            )
         case "Normal":
             mean, std = field(drawn, "mean"), field(drawn, "stddev")
             if is_random(mean) or is_random(std):
-                return Deviation(node, name, {f"{name}.deviation": Normal(0, 1)})
+                return leaves.Deviation(node, name, {f"{name}.deviation": Normal(0, 1)})
             if std <= 0:
-                return Number(node, name, {name: Constant(float(mean))}) if std == 0 else None
-            return Number(node, name, {name: Normal(float(mean), float(std))})
+                return (
+                    leaves.Number(node, name, {name: Constant(float(mean))}) if std == 0 else None
+                )
+            return leaves.Number(node, name, {name: Normal(float(mean), float(std))})
         case "TruncatedNormal":
             return _truncated(node, name)
         case "DiscreteRange":
             low, high = field(drawn, "low"), field(drawn, "high")
             if is_random(low) or is_random(high):
-                return ChoiceIndex(node, name, {f"{name}.share": Box(0, 1)})
+                return leaves.ChoiceIndex(node, name, {f"{name}.share": Box(0, 1)})
             return _discrete(node, name, low, high, field(drawn, "weights"), options)
         case "VerifaiRange":
             if field(drawn, "probs") is not None:
-                return Histogram(node, name, {f"{name}.share": Box(0, 1)})
+                return leaves.Histogram(node, name, {f"{name}.share": Box(0, 1)})
             ((low, high),) = field(drawn, "domain").intervals
-            return Number(node, name, {name: _between(low, high)})
+            return leaves.Number(node, name, {name: _between(low, high)})
         case "VerifaiDiscreteRange":
             ((low, high),) = field(drawn, "domain").intervals
             return _discrete(node, name, low, high, field(drawn, "probs"), options)
@@ -73,7 +62,7 @@ def _between(low: float, high: float) -> Domain:
     return Constant(low) if low == high else Box(low, high)
 
 
-def _truncated(node: Any, name: str) -> Leaf:
+def _truncated(node: Any, name: str) -> leaves.Leaf:
     drawn = law(node)
     mean, std = field(drawn, "mean"), field(drawn, "stddev")
     if not (is_random(mean) or is_random(std)):
@@ -83,8 +72,8 @@ def _truncated(node: Any, name: str) -> Leaf:
         except ValueError:
             pass  # Uniform but for rounding, or unbounded; the share between the ends is exact.
         else:
-            return Number(node, name, {name: domain})
-    return TruncatedShare(node, name, {f"{name}.share": Box(0, 1)})
+            return leaves.Number(node, name, {name: domain})
+    return leaves.TruncatedShare(node, name, {f"{name}.share": Box(0, 1)})
 
 
 def _discrete(
@@ -94,10 +83,10 @@ def _discrete(
     high: float,
     weights: Sequence[float] | None,
     options: Sequence[Any] | None,
-) -> Leaf | None:
+) -> leaves.Leaf | None:
     first, last = math.ceil(low), math.floor(high)
     if last - first >= MAX_LEVELS:
-        return ChoiceIndex(node, name, {f"{name}.share": Box(0, 1)})
+        return leaves.ChoiceIndex(node, name, {f"{name}.share": Box(0, 1)})
     values = tuple(range(first, last + 1))
     if weights is not None:
         weighted = [(v, w) for v, w in zip(values, weights, strict=True) if w > 0]
@@ -109,11 +98,17 @@ def _discrete(
         return None
     labels = None if options is None else _labels([options[value] for value in values])
     if len(values) == 1:
-        return Chosen(node, name, {name: Constant(labels[0] if labels else values[0])}, values)
+        return leaves.Chosen(
+            node, name, {name: Constant(labels[0] if labels else values[0])}, values
+        )
     if labels is None and weights is None:
         whole = DiscreteBox(values[0], values[-1])
-        return Chosen(node, name, {name: whole}, None if len(values) == whole.levels[0] else values)
-    return Chosen(node, name, {name: Categorical(*(labels or values), weights=weights)}, values)
+        return leaves.Chosen(
+            node, name, {name: whole}, None if len(values) == whole.levels[0] else values
+        )
+    return leaves.Chosen(
+        node, name, {name: Categorical(*(labels or values), weights=weights)}, values
+    )
 
 
 def _labels(options: Sequence[Any]) -> list[Any]:
@@ -143,22 +138,22 @@ def _text(option: Any) -> str:
     text = getattr(option, "__name__", None) if isinstance(option, type) else None
     if text is None:
         text = kind_of(option) if is_random(option) else repr(option)
-    return text if len(text) <= LABEL else text[: LABEL - 3] + "..."
+    return text if len(text) <= leaves.LABEL else text[: leaves.LABEL - 3] + "..."
 
 
-def _point(node: Any, name: str) -> Leaf | None:
-    region = region_of(node)
+def _point(node: Any, name: str) -> leaves.Leaf | None:
+    region = leaves.region_of(node)
     constant = not is_random(region)
     kind = kind_of(region)
     if kind == "RectangularRegion":
         width, length = field(region, "width"), field(region, "length")
         if is_random(width) or is_random(length):
-            return InRectangle(
+            return leaves.InRectangle(
                 node, name, {f"{name}.{axis}": Box(-0.5, 0.5) for axis in ("right", "forward")}
             )
         if constant and float(field(region, "heading")) == 0.0:
             x, y = (float(c) for c in field(region, "position").coordinates[:2])
-            return InRectangle(
+            return leaves.InRectangle(
                 node,
                 name,
                 {
@@ -166,7 +161,7 @@ def _point(node: Any, name: str) -> Leaf | None:
                     f"{name}.y": _between(y - length / 2, y + length / 2),
                 },
             )
-        return InRectangle(
+        return leaves.InRectangle(
             node,
             name,
             {
@@ -175,18 +170,20 @@ def _point(node: Any, name: str) -> Leaf | None:
             },
         )
     if kind in ("CircularRegion", "SectorRegion"):
-        return InSector(node, name, {f"{name}.{part}": Box(0, 1) for part in ("area", "angle")})
+        return leaves.InSector(
+            node, name, {f"{name}.{part}": Box(0, 1) for part in ("area", "angle")}
+        )
     if kind == "PolygonalRegion" and constant:
         pieces, cumulative = region._samplingData
         triangles = np.array([list(piece.exterior.coords)[:3] for piece, _ in pieces], float)
         shares = np.asarray(cumulative, float) / cumulative[-1]
         domains = {f"{name}.{part}": Box(0, 1) for part in ("piece", "along", "across")}
-        return InPolygon(node, name, domains, triangles[:, :, :2], shares)
+        return leaves.InPolygon(node, name, domains, triangles[:, :, :2], shares)
     if kind == "PolylineRegion" and constant:
         starts, ends = (
             np.array([segment[end][:2] for segment in region.segments], float) for end in (0, 1)
         )
         cumulative = np.asarray(region.cumulativeLengths, float)
         domain = Box(0, float(cumulative[-1]))
-        return OnPolyline(node, name, {f"{name}.along": domain}, starts, ends, cumulative)
+        return leaves.OnPolyline(node, name, {f"{name}.along": domain}, starts, ends, cumulative)
     return None

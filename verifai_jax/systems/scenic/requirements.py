@@ -19,16 +19,9 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from verifai_jax.core.progress import write_line
+from verifai_jax.systems.scenic import geometry
 from verifai_jax.systems.scenic.compilation import Compiled
 from verifai_jax.systems.scenic.conditions import Condition, conditions
-from verifai_jax.systems.scenic.geometry import (
-    box_inside,
-    boxes_apart,
-    edges_of,
-    is_convex,
-    rectangle_of,
-    sees_all_around,
-)
 from verifai_jax.systems.scenic.graph import field, is_random, kind_of
 from verifai_jax.systems.scenic.meaning import Values
 from verifai_jax.systems.scenic.sampling import LOCK, Refused, Sampling, _plain
@@ -117,10 +110,12 @@ class Constraint:
                     raise Unsupported(
                         f"a container that is not a fixed polygon ({kind_of(container)})"
                     )
-                edges, convex = edges_of(polygons), is_convex(polygons)
+                edges, convex = geometry.edges_of(polygons), geometry.is_convex(polygons)
                 if len(edges) > 2000:
                     raise Unsupported(f"a container of {len(edges)} edges")
-                return lambda values: box_inside(rectangle_of(values.body(body)), edges, convex)
+                return lambda values: geometry.box_inside(
+                    geometry.rectangle_of(values.body(body)), edges, convex
+                )
             case "VisibilityRequirement":
                 return _visible(requirement)
             case "CompiledRequirement":
@@ -202,8 +197,8 @@ def _apart(requirement: Any) -> Check:
             raise Unsupported("a random permission to collide")
         if field(body, "allowCollisions"):
             return lambda values: True
-    return lambda values: boxes_apart(
-        rectangle_of(values.body(one)), rectangle_of(values.body(other))
+    return lambda values: geometry.boxes_apart(
+        geometry.rectangle_of(values.body(one)), geometry.rectangle_of(values.body(other))
     )
 
 
@@ -225,6 +220,8 @@ def _visible(requirement: Any) -> Check:
             camera = as_vec(viewer.get("cameraOffset"))
             position = position.offsetRotated(viewer.get("orientation"), camera)
         distance = viewer.get("visibleDistance")
-        return sees_all_around(position.x, position.y, distance, rectangle_of(values.body(target)))
+        return geometry.sees_all_around(
+            position.x, position.y, distance, geometry.rectangle_of(values.body(target))
+        )
 
     return check

@@ -23,16 +23,10 @@ import numpy as np
 
 from verifai_jax.features import Array, Box, Categorical
 from verifai_jax.features.domain import Domain
+from verifai_jax.systems.scenic import leaves
 from verifai_jax.systems.scenic.compilation import Compiled, ProgramError
 from verifai_jax.systems.scenic.graph import field, is_constructed, is_random, kind_of, law, nodes
 from verifai_jax.systems.scenic.leaf_reading import leaf_of
-from verifai_jax.systems.scenic.leaves import (
-    Leaf,
-    NothingToDrawError,
-    OnPolyline,
-    Series,
-    SeriesValue,
-)
 from verifai_jax.systems.scenic.naming import leaf_names, owner_names, unique
 
 SEED = "seed"
@@ -72,7 +66,7 @@ class Sampling:
         variables = compiled.names
         self.owners = owner_names(self.scenario, variables, self.order)
         names = leaf_names(self.scenario, self.owners, variables, self.order)
-        self.leaves: dict[int, Leaf] = {}
+        self.leaves: dict[int, leaves.Leaf] = {}
         self.seeded: dict[int, str] = {}
         self.domains: dict[str, Domain] = {}
         self._external = False
@@ -126,7 +120,7 @@ class Sampling:
                 self.seeded[id(node)] = f"{name} ({kind_of(drawn)})"
                 self._external |= kind_of(drawn) not in COMPUTED and hasattr(type(drawn), "sampler")
 
-    def _series(self, leaf: Leaf) -> Leaf:
+    def _series(self, leaf: leaves.Leaf) -> leaves.Leaf:
         """Return the leaf of a value at each step.
 
         **Raises:** `ProgramError` where the program does not say how many steps there are.
@@ -137,7 +131,7 @@ class Sampling:
                 f"the TimeSeries {leaf.name} needs a number of steps: write `param timeBound = 50`"
             )
         domains = {name: Array(domain, bound) for name, domain in leaf.domains.items()}
-        return Series(leaf.node, leaf.name, domains, leaf)
+        return leaves.Series(leaf.node, leaf.name, domains, leaf)
 
     def _soft(self) -> dict[str, Any]:
         soft: dict[str, Any] = {}
@@ -171,19 +165,21 @@ class Sampling:
                     if id(node) in self.seeded:
                         _seed_generators(digest(seed, str(i)))
                     values[node] = law(node).sampleGiven(values)
-            except (distributions.RejectionException, NothingToDrawError) as error:
+            except (distributions.RejectionException, leaves.NothingToDrawError) as error:
                 raise Refused(str(error)) from error
         return values
 
-    def _drawn(self, leaf: Leaf, features: Mapping[str, Any], given: Callable[[Any], Any]) -> Any:
+    def _drawn(
+        self, leaf: leaves.Leaf, features: Mapping[str, Any], given: Callable[[Any], Any]
+    ) -> Any:
         parts = {name: _plain(features[name]) for name in leaf.domains}
         value = leaf.draw(parts, given, np)
         if not leaf.is_point:
-            return value if isinstance(value, int | SeriesValue) else float(value)
+            return value if isinstance(value, int | leaves.SeriesValue) else float(value)
         vectors = sys.modules["scenic.core.vectors"]
         region = given(field(law(leaf.node), "region"))
         x, y = float(value[0]), float(value[1])
-        if isinstance(leaf, OnPolyline):
+        if isinstance(leaf, leaves.OnPolyline):
             if region._usingDefaultOrientation:
                 return vectors.OrientedVector(x, y, 0, float(leaf.heading(parts, np)))
             return region.orient(vectors.Vector(x, y, 0))

@@ -14,13 +14,7 @@ import numpy as np
 
 from verifai_jax.core.text import counted, format_features, format_percent
 from verifai_jax.statistics.confidence_sequences import verdict_kind
-from verifai_jax.training.sweeps.ranking import (
-    full_return_threshold,
-    is_safe,
-    last_checkpoints,
-    preference_order,
-    return_safety_correlation,
-)
+from verifai_jax.training.sweeps import ranking
 from verifai_jax.training.sweeps.record import SweepRecord, algorithm_uses, error_message
 
 if TYPE_CHECKING:
@@ -72,7 +66,7 @@ def format_summary(findings: Findings) -> str:
         lines.append(f"  configurations  {format_verdicts(groups)}")
     if len(table) > len(groups):
         lines.append(f"  policies        {format_verdicts(table)}; each seed and checkpoint is one")
-    if len(preference_order(table)):
+    if len(ranking.preference_order(table)):
         lines += _best_lines(findings)
     if len(groups) and (groups["seeds"] > 1).any():
         lines += _seed_lines(findings)
@@ -80,7 +74,9 @@ def format_summary(findings: Findings) -> str:
         lines.append(f"  without policy  {missing}")
     if stopped := sum(str(status) == "stopped" for status in table["status"]):
         lines.append(f"  halving         stopped {counted(stopped, 'training')} before the end")
-    correlation = return_safety_correlation(last_checkpoints(table)) if len(table) else np.nan
+    correlation = (
+        ranking.return_safety_correlation(ranking.last_checkpoints(table)) if len(table) else np.nan
+    )
     if np.isfinite(correlation):
         lines.append(
             f"  return, safety  rank correlation {correlation:z.2f} "
@@ -108,11 +104,11 @@ def format_headline(findings: Findings) -> str:
     if not len(groups):
         return "no configuration was trained"
     text = f"{counted(len(groups), 'configuration')}; "
-    threshold = full_return_threshold(groups)
+    threshold = ranking.full_return_threshold(groups)
     if not np.isfinite(threshold):
         return text + "none has a policy"
     full = groups.loc[groups["nominal_return"] >= threshold]
-    safe = int(is_safe(full).sum())
+    safe = int(ranking.is_safe(full).sum())
     reach = "reaches" if len(full) == 1 else "reach"
     of_those = f"{safe} of those {len(full)}" if len(full) > 1 else ("it" if safe else "it is NOT")
     verb = {0: " are", 1: " is"}.get(safe, " are") if len(full) > 1 else (" is" if safe else "")
@@ -125,7 +121,7 @@ def format_headline(findings: Findings) -> str:
 def format_verdicts(rows: "pd.DataFrame") -> str:
     """Write the number of rows of each verdict."""
     verdicts: Any = rows["verdict"].astype(str)
-    parts = [f"{int(is_safe(rows).sum())} safe"]
+    parts = [f"{int(ranking.is_safe(rows).sum())} safe"]
     for verdict in ("unsafe", "undecided"):
         if count := int((verdicts == verdict).sum()):
             parts.append(f"{count} {verdict}")
@@ -152,7 +148,7 @@ def format_hyperparameters(findings: Findings, row: Mapping[str, Any]) -> str:
 def format_html(findings: Findings) -> str:
     """Write the headline, the first rows to choose from, and the summary to unfold."""
     record, table = findings.record, findings.table
-    rows = table.iloc[preference_order(table)[:MAX_ROWS]]
+    rows = table.iloc[ranking.preference_order(table)[:MAX_ROWS]]
     names = [name for name in record.hyperparameters if name != "steps"]
     heads = ["row", "verdict", "P(fail)", "nominal return", "steps", *names]
     entries: Any = rows.to_dict("records")
@@ -185,7 +181,7 @@ def _html_row(number: str, row: Mapping[str, Any], names: Sequence[str]) -> str:
 
 def _best_lines(findings: Findings) -> list[str]:
     table = findings.table
-    number = table.index[preference_order(table)[0]]
+    number = table.index[ranking.preference_order(table)[0]]
     best: Any = table.loc[number].to_dict()
     verdict = str(best["verdict"])
     if verdict_kind(verdict) == "safe":
@@ -210,7 +206,7 @@ def _best_lines(findings: Findings) -> list[str]:
 def _seed_lines(findings: Findings) -> list[str]:
     """Write the configurations that are safe whatever the training seed; one row may be luck."""
     groups: Any = findings.configurations
-    safe = groups.loc[is_safe(groups)].sort_values(
+    safe = groups.loc[ranking.is_safe(groups)].sort_values(
         ["nominal_return", "failure_high"], ascending=[False, True], kind="stable"
     )
     if not len(safe):
