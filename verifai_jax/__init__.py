@@ -155,9 +155,7 @@ if TYPE_CHECKING:
     from verifai_jax.verification import Verification as Verification
     from verifai_jax.verification import load_verification as load_verification
     from verifai_jax.verification import verify as verify
-
 # Imported when first used (PEP 562), so that importing this package takes milliseconds.
 __getattr__, __dir__, __all__ = _attach(__name__, "__version__")
-
 _claim_cores()
 _watch()

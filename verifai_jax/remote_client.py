@@ -37,7 +37,6 @@ from typing import Any
 import numpy as np
 
 log = logging.getLogger("verifai_jax.remote_client")
-
 PROTOCOL = 1
 """Version of the protocol that `docs/remote.md` describes."""
 FLUSH_SECONDS = 0.005
@@ -176,7 +175,6 @@ def serve(
     """Simulate the points of the run at `host` and `port` until interrupted.
 
     **Arguments:**
-
     - `simulate(features, seed) -> result`: features are numbers, arrays, dictionaries of these,
       `Waveform`s and `Reaction`s; `seed` is an integer in `[0, 2^32)`, the same on every replay.
       The result is a dictionary of signals, `[time]` or `[time, k]`, and `dt` in seconds (or
@@ -191,7 +189,6 @@ def serve(
     - `certificate`: for an encrypted connection (TLS), a PEM file with the server's certificate or
       that of the authority that signed it, or `"system"` for those that this machine trusts; the
       environment variable `VERIFAI_JAX_CERTIFICATE` when left out, and not encrypted without.
-
     **Raises:** `Refused` for a wrong token, another protocol or certificate, or something that is
     no run of verifai_jax; `ConnectionError` when no run could be reached at all and `reconnect`
     allows no more tries; `ValueError` for a file that is not a certificate.

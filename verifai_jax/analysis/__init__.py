@@ -40,6 +40,5 @@ if TYPE_CHECKING:
     from verifai_jax.analysis.sensitivity.morris import morris as morris
     from verifai_jax.analysis.sensitivity.sensitivity import Sensitivity as Sensitivity
     from verifai_jax.analysis.sensitivity.sobol import sobol_indices as sobol_indices
-
 # Imported when first used: a folder inside needs few of these names.
 __getattr__, __dir__, __all__ = attach(__name__)

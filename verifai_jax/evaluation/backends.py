@@ -29,7 +29,6 @@ from verifai_jax.systems.base import System
 
 if TYPE_CHECKING:
     from verifai_jax.evaluation.host_engine import HostEngine
-
 MIN_BUDGET = 64
 """Simulations below which nothing is compiled, or measured: either takes longer than they do."""
 WORTH_MEASURING = 30.0

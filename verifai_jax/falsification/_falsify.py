@@ -98,7 +98,6 @@ def falsify(
     """Search the feature space for inputs under which the system breaks its property.
 
     **Arguments:**
-
     - `problem`: what to break.
     - `search`: a name (`verifai_jax.search.names()`), or a search with its options. `"auto"` is
       `portfolio`, or `trace_surrogate`, which saves simulations, if the first two simulations of a
@@ -157,7 +156,6 @@ def falsify(
     Ctrl-C ends the run and returns what is finished. Likely mistakes of the problem are in `notes`.
 
     **Returns:** the run: its table, its statistics, and replays of its rows.
-
     **Raises:** `ValueError` before anything compiles for options out of range, unknown names, a
     problem whose parts do not fit, a constraint that refuses every sample, a search that cannot
     work on the space, a folder that cannot be written or that another process writes; `RunError`
@@ -268,7 +266,6 @@ def simulate(
     """Simulate given features, in their order: no search, a row of the table for each.
 
     **Arguments:**
-
     - `rows`: a DataFrame with the feature columns of a table (from an analysis, another run, a
       file), a row of one, or features as a person writes them, one or several.
     - all other arguments: as in `falsify`.
@@ -277,7 +274,6 @@ def simulate(
     run's precision; those of a table give its bits again.
 
     **Returns:** the run, with a row of its table for each of these.
-
     **Raises:** `ValueError` for features that are missing or outside the space, and for no rows; as
     `falsify`.
     """
@@ -315,7 +311,6 @@ def resume(
     """Go on with a run where it stopped, or where it was cut off, as if it had never stopped.
 
     **Arguments:**
-
     - `run`: a run, or the folder of one; a folder is written on.
     - `problem`: needed for a folder, which names no code to run.
     - `search`: needed only if it is none of `verifai_jax.search`.
@@ -332,7 +327,6 @@ def resume(
     notes say where that of `batch` would be another for a run from the start.
 
     **Returns:** the run with the earlier rows and the new ones.
-
     **Raises:** `ValueError` for a run without its problem or its state, a model that has changed, a
     budget that is spent, or a folder that another process writes; as `falsify` otherwise.
     """
@@ -411,10 +405,8 @@ def _resume(
         executor, run.target, rows_of_first(run.first, problem), suggests=asking is not None,
         engine=as_wanted(run.engine), budget=run.budget,
     )  # fmt: skip
-
     if asking is not None:
         rounds.ask(replace(asking, search=search), checkpoint)
-
     rounds.checks = tuple(run.checks)
 
     def prepare() -> None:

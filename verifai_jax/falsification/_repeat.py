@@ -33,11 +33,7 @@ from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.verdicts import violations
 from verifai_jax.falsification.confirm_seeds import SeedConfirmer
 from verifai_jax.falsification.lockstep import lockstep
-from verifai_jax.falsification.validation import (
-    adapt_search,
-    check_search,
-    usual_batch,
-)
+from verifai_jax.falsification.validation import adapt_search, check_search, usual_batch
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Observations, Search
 
@@ -152,7 +148,6 @@ def repeat(
     """Run a search from many seeds at once; each asks for what `falsify` with its seed would.
 
     **Arguments:**
-
     - `budget`: simulations of each seed, rounded up to whole batches.
     - `batch`, `precision`, `backend`: as in `falsify`.
     - `seeds`: which, or how many from 0 on.
@@ -171,7 +166,6 @@ def repeat(
 
     **Returns:** the robustness and the verdicts of each seed's simulations, as simulated, and which
     of the violations are not claimed.
-
     **Raises:** as `falsify`; `AlwaysRaises` where all of the first simulations raise, so that more
     of them would say nothing else; `ValueError` for a black box, a constraint (`where=`), a
     priority, a guide or the search `trace_surrogate`, which are dealt with between rounds: use

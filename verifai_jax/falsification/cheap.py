@@ -14,7 +14,6 @@ from verifai_jax.problem.problem import Problem, ProblemError
 
 if TYPE_CHECKING:
     import pandas as pd
-
 TIMES, MAX_CHEAP = 20, 50_000
 """Simulations of a cheap model for each one of the slow one, and at most."""
 MAX_ROWS = 16
@@ -58,7 +57,6 @@ def gravest_rows(run: Run, cheap: Problem, budget: int) -> "pd.DataFrame":
     Where few rows fail, those of the lowest robustness count as failures.
 
     **Arguments:**
-
     - `run`, `cheap`: the run of the cheap model, and this.
     - `budget`: simulations of the slow one, of which these take a quarter at most.
     """

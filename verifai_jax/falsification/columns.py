@@ -15,7 +15,6 @@ from verifai_jax.problem.problem import Problem
 if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
-
 Columns: TypeAlias = Mapping[str, np.ndarray]
 """Columns `[n]` by name, `rho` among them; texts are arrays of objects."""
 Batch: TypeAlias = tuple[int, Columns]
@@ -74,7 +73,6 @@ def wrong_column(columns: Columns, numbers: Sequence[str] = ()) -> str:
     """Say which column holds what it cannot; empty if all are as they were written.
 
     **Arguments:**
-
     - `columns`: with `status`, `violated` and `rho`.
     - `numbers`: names of features that are numbers.
     """
@@ -163,7 +161,6 @@ def rows_of(
     """Return the columns of the table, as the rows are before they are confirmed.
 
     **Arguments:**
-
     - `problem`: whose features and formulas name columns.
     - `verdicts`: the verdicts of a round, with features.
     - `differentiates`: whether clauses are differentiated in some rounds; the rows then say in

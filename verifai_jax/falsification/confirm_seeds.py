@@ -22,7 +22,6 @@ MORE = 4
 programs in few calls, and at most four times as many replays as are needed."""
 WITHOUT_BOUND = 2**31 - 1
 """A number of rows that no run has."""
-
 DRAWS: Slot[str, bool] = Slot("randomness of the system")
 """Whether the system uses its random key, by precision."""
 
@@ -33,7 +32,6 @@ class SeedConfirmer:
     Violations beyond the first `LIMIT` of a seed that were replayed count as claimed, as there.
 
     **Arguments:**
-
     - `problem`: on a backend that JAX traces.
     - `precision`: the precision of the simulations.
     - `seeds`: the seeds of the runs.
@@ -58,11 +56,9 @@ class SeedConfirmer:
         """Replay violating simulations.
 
         **Arguments:**
-
         - `seed`: index of the seed of each, ascending.
         - `numbers`: the numbers of the simulations in their runs, ascending for each seed.
         - `u`, `rho`: their points and the least formula's robustness.
-
         **Returns:** which of them are not claimed, and the greatest robustness of their replays, at
         least 1e-6, NaN where there was none.
         """

@@ -17,10 +17,8 @@ def as_simulated(problem: Problem, record: Mapping[str, Any]) -> Problem:
     """Return the problem that a run recorded, made of the one that was given.
 
     **Arguments:**
-
     - `problem`: as a person wrote it, or the one of the run itself, which stays as it is.
     - `record`: the record of the run.
-
     **Returns:** the given problem where nothing was made of it, or where it cannot be made.
     """
     problem = _with_held(problem, record)

@@ -29,11 +29,9 @@ if TYPE_CHECKING:
     from verifai_jax.falsification.coverage_counts import CoverageCounts
     from verifai_jax.falsification.likelihood import Likelihood
     from verifai_jax.falsification.surrogates import Surrogate
-
 MAX_WARM = 2048
 """Rows of an earlier table that a search starts with at most, the worst ones: a bound on what the
 first `tell` costs, whatever the length of that table."""
-
 Source = Literal["search", "first", "suggested"]
 """Who gave the points of a round: the search, a person before it began, or a person on the way."""
 
@@ -62,7 +60,6 @@ class Learning:
     """The search of a run with what it knows of the simulations; see the module's docstring.
 
     **Arguments:**
-
     - `problem`: the problem of the run.
     - `search`: the search of the run.
     - `key`: the key of the search.
@@ -147,7 +144,6 @@ class Learning:
         """Let the search learn from a round.
 
         **Arguments:**
-
         - `batch`: its points, of the unit cube.
         - `objective`: what the search minimises at each of them.
         - `verdicts`: the verdicts of its simulations.

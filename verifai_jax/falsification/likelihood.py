@@ -25,9 +25,7 @@ class Likelihood:
     """The objective of a search for likely failures, as `problem.rulebook.Objective`.
 
     **Arguments:**
-
     - `space`: the space of the features.
-
     **Raises:** `NoDensityError` for a space whose features have no density.
     """
 
@@ -49,15 +47,11 @@ class Likelihood:
         return np.where(failing, np.sqrt(self._square(points)), safe)
 
     def learned(
-        self,
-        points: Float[np.ndarray, "n d"],
-        rho: Float[np.ndarray, " n"],
-        verdicts: Verdicts,
+        self, points: Float[np.ndarray, "n d"], rho: Float[np.ndarray, " n"], verdicts: Verdicts
     ) -> tuple[Float[np.ndarray, " n"], Verdicts]:
         """Return the objective, and verdicts whose clauses and gradients are those of it.
 
         **Arguments:**
-
         - `points`: the points of a round, in the unit cube.
         - `rho`: what a search would minimise; positive where a failure is not claimed.
         - `verdicts`: the verdicts of their simulations.

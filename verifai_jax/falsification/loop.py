@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from verifai_jax.falsification.prefetch import Prefetch
     from verifai_jax.falsification.suggestions import Suggestions
     from verifai_jax.search import Suggested
-
 COMPILE, SEARCH, SIMULATE, CONFIRM, REST = "compile", "search", "simulate", "confirm", "rest"
 """What the seconds of a run are spent on."""
 

@@ -18,7 +18,6 @@ from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     from verifai_jax.evaluation.replay import Replay
-
 ROUNDING = 1e-4
 """Share of the signals by which a replay may differ where JAX compiles it: alone it rounds
 otherwise than in a batch, and some systems make that grow."""
@@ -43,11 +42,9 @@ def model_changes(
     """Return the files of a result's model that are others now.
 
     **Arguments:**
-
     - `recorded`: by the run or the sweep.
     - `now`: what the model is made of now; without it what lies on the disk counts.
     - `row`: the row of a run; every model that the run was simulated with if None.
-
     **Returns:** the changes; empty if nothing is recorded.
     """
     parts = [Sources.from_json(part) for part in recorded]
@@ -68,13 +65,11 @@ def continued_with(
     """Return the record of the models of a run that goes on, and a note where one is another.
 
     **Arguments:**
-
     - `name`: the name of the run.
     - `recorded`: by the run.
     - `problem`: with which it goes on.
     - `rows`: that it has.
     - `even_if_changed`: whether another model will do.
-
     **Raises:** `ValueError` for another model, unless that will do.
     """
     now = problem.sources(first=rows)
@@ -117,7 +112,6 @@ def finding_of(
     """Say that a replay does not give the number of its row; empty if it does.
 
     **Arguments:**
-
     - `seen`: the replay, in the precision of the run unless `near` says what may differ.
     - `stored`: the row of the table.
     - `several`: whether the problem has several formulas.

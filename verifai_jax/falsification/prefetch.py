@@ -43,7 +43,6 @@ class Prefetch:
     """The rounds that are on their way; see the module's docstring.
 
     **Arguments:**
-
     - `proposals`: the proposals of a search that does not learn.
     - `evaluate`: with an executor, or of a system that this process compiles.
     - `batch`: rows of a round.

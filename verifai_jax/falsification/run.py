@@ -84,7 +84,6 @@ class Run(InNotebook):
         "has_several_models", "lasting_notes", "model", "origin", "search_data", "space_data",
         "table_path", "verdict_counts",
     ))  # fmt: skip
-
     name: str
     formulas: dict[str, str]
     table: ErrorTable
@@ -275,14 +274,11 @@ class Run(InNotebook):
         """Return how improbable the prior makes rows of the table: a failure that is never met.
 
         **Arguments:**
-
         - `rows`: the rows of the table, all counterexamples when left out.
-
         **Returns:** by the numbers of the rows `log_density`, the natural logarithm of the prior's
         density (of a constrained space without the share that is accepted), and for each column
         with a distribution `tail.NAME`, the probability of a value at least as far out. The
         density is NaN where a feature has none, such as an automaton.
-
         **Raises:** `ValueError` for a run of which neither the problem nor the space is known, and
         for a row outside the space.
         """
@@ -333,7 +329,6 @@ class Run(InNotebook):
 
         **Returns:** the replay; its `changed` says that the model is another one by now, and its
         `finding` that it does not give the number of its row, which its text begins with.
-
         **Raises:** `ValueError` for a run without its problem; `IndexError` for a row that is not
         in the table.
         """
@@ -394,11 +389,9 @@ class Run(InNotebook):
         `vj.replay_counterexamples(problem, folder)` simulates them again.
 
         **Arguments:**
-
         - `folder`: it is made where there is none.
         - `options`: the options of `counterexamples.save_counterexamples`: `max_count`, `shrink`,
           `budget`.
-
         **Raises:** `ValueError` for a run without its problem or without a counterexample.
         """
         return lazy_import("verifai_jax.analysis.counterexamples", "save_counterexamples")(
@@ -417,11 +410,9 @@ class Run(InNotebook):
         """Write the evidence report on the run: one HTML file, and its claims as JSON next to it.
 
         **Arguments:**
-
         - `path`: the path of the HTML file.
         - `options`: the options of `reports.write_report`: `units` and `reasons` of features,
           `traces`, `studies`, `modes`, `odd`, `assessment`.
-
         **Returns:** the path.
         """
         return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)

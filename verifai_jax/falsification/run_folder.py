@@ -262,7 +262,6 @@ def write_checkpoint(
     """Write a checkpoint to `folder`, in place of an earlier one, never half.
 
     **Arguments:**
-
     - `checkpoint`: the state of the search, with the number of `rows` that it has seen.
     - `folder`: the folder of the run.
     - `rows_checksum`: the checksum of these rows.

@@ -36,7 +36,6 @@ from verifai_jax.search import Search
 
 if TYPE_CHECKING:
     from verifai_jax.statistics.stopping import StoppingRule
-
 Origin = Literal["prior", "first", "given", "sequence", "coverage", "learned"]
 """Where rows come from: as the points of a search (`search/base.py`), and `"first"` for samples of
 the prior after rows that were given."""
@@ -46,7 +45,6 @@ def origin_of(search: Search, first: int) -> Origin:
     """Return where the rows of a run come from.
 
     **Arguments:**
-
     - `search`: the search of the run.
     - `first`: number of rows that were given before the search proposed any.
     """
@@ -112,7 +110,6 @@ class Running:
     """A run that is going on.
 
     **Fields:**
-
     - `rounds`: its rounds, not compiled yet.
     - `ends`: the conditions that end it.
     - `choice`: the choice of its backend.
@@ -141,10 +138,7 @@ class Running:
     _model: str = field(default="", init=False)
 
     def play(
-        self,
-        progress: bool | None,
-        prepare: Callable[[], None],
-        callbacks: Sequence[Callback] = (),
+        self, progress: bool | None, prepare: Callable[[], None], callbacks: Sequence[Callback] = ()
     ) -> Run:
         """Compile, `prepare`, and play rounds until something ends them.
 

@@ -26,7 +26,6 @@ from verifai_jax.falsification.columns import ROW, Columns, column_to_arrow
 if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
-
 SEGMENT_ROWS = 1 << 20
 """Rows of a closed segment, which is read and checked as a whole."""
 SEGMENTS = "table"

@@ -41,11 +41,7 @@ from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.evaluation.worker import ARRAYS, evaluate_block
 from verifai_jax.falsification._falsify import falsify
 from verifai_jax.falsification.run import Run
-from verifai_jax.falsification.validation import (
-    adapt_search,
-    check_search,
-    usual_batch,
-)
+from verifai_jax.falsification.validation import adapt_search, check_search, usual_batch
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.search.proposals import Proposals
@@ -117,14 +113,11 @@ def simulate_shard(
     """Simulate one part of a run into a folder; a part that was begun there is completed.
 
     **Arguments:**
-
     - `shard`: the part.
     - `folder`: the folder of this part alone.
     - all other arguments: as in `falsify`, the same for all parts; `confirm` is done when they are
       merged.
-
     **Returns:** the number of simulations of this part.
-
     **Raises:** `ValueError` for a search that learns, a system with several backends of which none
     is named, a folder with another part; as `falsify` otherwise.
     """
@@ -370,14 +363,11 @@ def merge(
     """Make one run of its parts: the table is the one of one machine, bit for bit.
 
     **Arguments:**
-
     - `folders`: the folders of all parts.
     - `problem`: the problem of the run.
     - `folder`: the folder of the merged run; in memory when left out.
     - `progress`: as in `falsify`.
-
     **Returns:** the run.
-
     **Raises:** `ValueError` for parts of different runs, a part that is missing, there twice or not
     finished, and another problem; `FileNotFoundError` for a folder without a part.
     """

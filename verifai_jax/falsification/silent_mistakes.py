@@ -57,7 +57,6 @@ def nominal_note(problem: Problem, evaluate: Evaluator, search: Search) -> tuple
     number of rows.
 
     **Arguments:**
-
     - `problem`: the problem of the run.
     - `evaluate`: the run's own, compiled.
     - `search`: the search of the run.
@@ -112,7 +111,6 @@ def notes_after(
     """Return what all simulations of a run have in common and is likely a mistake.
 
     **Arguments:**
-
     - `table`: the table of the run.
     - `formulas`: texts by name.
     - `search`: the search of the run.
@@ -140,7 +138,6 @@ def cut_short_note(search: Search, total: int | None, simulated: int) -> tuple[s
     """Return a note on how much of a finite search, such as a grid, a run has simulated.
 
     **Arguments:**
-
     - `search`: the search of the run; it has more points to propose.
     - `total`: points of the whole search; None if it never ends.
     - `simulated`: points of it that were simulated.

@@ -29,7 +29,6 @@ from verifai_jax.search import Search
 if TYPE_CHECKING:
     from verifai_jax.core.executors import Executor
     from verifai_jax.evaluation.journal import Journal
-
 MAX_DIFFERENTIATED = 16
 """Rows whose clauses are differentiated in one call of the engine."""
 MEASURED = 2
@@ -41,7 +40,6 @@ class Simulations:
     """Evaluators with and without derivatives of clauses, and the first rows where these are timed.
 
     **Arguments:**
-
     - `problem`: on the backend that it runs on.
     - `search`: what it wants decides what is computed in addition to the robustness.
     - `batch`: simulations of a round at most.
@@ -142,7 +140,6 @@ class Simulations:
         """Simulate and evaluate the points of a round.
 
         **Arguments:**
-
         - `points`: the points of the unit cube.
         - `first`: number of the first of them in the run.
         - `differentiate`: whether derivatives of their clauses are wanted.

@@ -25,7 +25,6 @@ from verifai_jax.search import Suggested
 
 if TYPE_CHECKING:
     import pandas as pd
-
 SAMPLES = 16
 """Samples of a signal that are shown, evenly spaced, the first and the last among them: a question
 has to stay short for whoever reads it."""
@@ -44,16 +43,13 @@ def describe_run(
     """Return the question after these rows.
 
     **Arguments:**
-
     - `problem`: the one that is falsified.
     - `frame`: the table so far.
     - `search`: the one that asks.
     - `key`: the key of simulations, for the traces of the worst rows.
     - `precision`: the precision of simulations.
     - `refused`: what was wrong with earlier suggestions.
-
     **Returns:** a dictionary of plain data:
-
     - `problem`, `description`, `context`: texts.
     - `formulas`: text by name; all of them are to be kept, and one of them broken is a failure.
     - `features`: one dictionary each, with `name`, `kind`, `unit` where there is one, and what its

@@ -151,12 +151,10 @@ def row_of(problem: Problem, suggestion: object, precision: str) -> Float[np.nda
     """Return the row that simulates a suggestion exactly; see `given_rows`.
 
     **Arguments:**
-
     - `problem`: the one that is falsified.
     - `suggestion`: features by name, as a person writes them, or by the columns of the table;
       columns that are none of features are ignored.
     - `precision`: the precision of the run.
-
     **Raises:** `TypeError` for anything that is not a mapping; `ValueError` that names the feature
     for one that is missing, unknown or outside its domain, and for features that break the
     constraint.

@@ -65,7 +65,6 @@ class Surrogate:
     """The rows of a run with their traces, and proposals from a model of them.
 
     **Arguments:**
-
     - `problem`: the problem of the run; its monitored signals are modelled.
     - `options`: the options of the model and the descents on it.
     - `key`: the key of its random numbers.
@@ -252,9 +251,7 @@ class Descents:
         # Rows become what the model takes inside of the programs: outside each operation would
         # compile a program for each number of rows.
         cube = self.cube
-        self.fit = jax.jit(
-            lambda hyper, u, *rest: models.fit(hyper, _embed(u, cube), *rest),
-        )
+        self.fit = jax.jit(lambda hyper, u, *rest: models.fit(hyper, _embed(u, cube), *rest))
         self.descend: Any = jax.jit(self._descend, static_argnums=(0, 1))
 
     def _descend(
@@ -338,7 +335,6 @@ def spread_factor(rho: Float[np.ndarray, " n"], number: int, dim: int) -> float:
     more widely, its simulators have their minima elsewhere. After a failure there is no need.
 
     **Arguments:**
-
     - `rho`: robustness of the rows, in the order in which they were simulated.
     - `number`: the number of the round.
     - `dim`: the dimension of the cube.

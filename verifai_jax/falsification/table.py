@@ -43,7 +43,6 @@ from verifai_jax.falsification.tail import TAIL, read_tail, tail_entry
 
 if TYPE_CHECKING:
     import pandas as pd
-
 FINISHED = "table.parquet"
 """Name of a finished table without segments on disk."""
 RESERVED = (
@@ -68,12 +67,10 @@ class ErrorTable(TableView):
     """Rows in the order in which they were simulated; append-only.
 
     **Arguments:**
-
     - `features`: names of the feature columns; may not be one of `RESERVED`.
     - `folder`: where to keep the rows; in memory only when left out.
 
     **Attributes:**
-
     - `missing`: ranges of rows that are missing, as their files are damaged or gone.
     - `damage`: what is damaged and what is missing; empty if nothing is.
     - `changed`: whether rows are others than those that were written, so that no number of the
@@ -154,11 +151,9 @@ class ErrorTable(TableView):
         What is damaged is left out: `missing` and `damage` say what.
 
         **Arguments:**
-
         - `folder`: the folder of the table.
         - `features`: names of the feature columns.
         - `numbers`: those among them that are numbers, where that is known.
-
         **Raises:** `FileNotFoundError` where there is none; `TableError` for a `table.parquet` that
         is damaged, or a column that is missing or holds what it cannot.
         """

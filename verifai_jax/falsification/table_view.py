@@ -34,8 +34,6 @@ from verifai_jax.falsification.segments import Segment, standing_out
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
 FEW = 64
 """Batches in memory up to which they are read one by one: to make one batch of them copies each."""
 
@@ -83,9 +81,7 @@ class TableView(InNotebook):
         """Yield the rows of `all` in their order, at most 1 048 576 in memory at a time.
 
         **Arguments:**
-
         - `columns`: the columns wanted; all when left out.
-
         **Raises:** `TableError` for a file that is damaged.
         """
         for segment in self._segments:

@@ -15,7 +15,6 @@ from verifai_jax.falsification.segments import MAX_ROWS
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
 TAIL = "rows.tail"
 """Name of the file in a run's folder."""
 _STREAM = "arrow"

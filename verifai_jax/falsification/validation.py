@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
     from verifai_jax.core.executors import Executor
     from verifai_jax.statistics.stopping import StoppingRule
-
-
 MAX_AT_ONCE = 131_072
 """Simulations of a round at most, by default; more are no faster."""
 
@@ -43,7 +41,6 @@ def usual_batch(
     is likely to end in its first. Where it does not learn it has at most a thousand rounds.
 
     **Arguments:**
-
     - `search`: that of the run.
     - `budget`: simulations of the run.
     - `stop_after`: counterexamples at which it ends, if it does.
@@ -77,7 +74,6 @@ def batch_size(
     """Return the simulations of a round.
 
     **Arguments:**
-
     - `asked`: what the user wants; the default when left out.
     - `search`, `budget`, `stop_after`, `whole`: as of `usual_batch`.
     - `small`: the usual size where many small rounds are wanted.

@@ -75,14 +75,12 @@ class Fault:
     """A fault of one channel; its kinds derive from it, as frozen dataclasses.
 
     **Arguments:**
-
     - `channel`: `"observation"`, `"action"`, one entry of them, `"observation[2]"`, or the name of
       a sensor, signal, joint, actuator or part of the state.
     - `onset`: seconds from the beginning of the simulation until the fault; below 0 it has begun
       before.
     - `duration`: seconds until the channel recovers; None for never.
     - `name`: the name of the fault, and of its feature: `gyro_dropout` when left out.
-
     **Raises:** `ValueError` for numbers that are not finite or out of range, with their names.
     """
 
@@ -96,7 +94,6 @@ class Fault:
     """Whether it draws random numbers."""
     holds: ClassVar[bool] = False
     """Whether it remembers a value to repeat it."""
-
     channel: str = field(kw_only=False)
     onset: Number = 0.0
     duration: Number | None = None

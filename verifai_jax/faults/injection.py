@@ -259,7 +259,6 @@ def on_host(
     """Apply faults in a simulator of one's own, such as a client of `remote`.
 
     **Arguments:**
-
     - `faults`: those of `problem.with_faults(..., by_simulator=True)`, each with a channel that
       begins with `observation` or `action`.
     - `features`: the features of the simulation, as the simulator gets them.

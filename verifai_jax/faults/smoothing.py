@@ -33,7 +33,6 @@ def blend(
     simulation grows by one for each period by which the fault is longer.
 
     **Arguments:**
-
     - `on`: whether the fault acts; `live`: whether the instant lies in its time, so that it would
       act if it were a little severer; `possible`: whether it happens at all.
     - `lead`, `trail`: periods since its onset, and since its end.

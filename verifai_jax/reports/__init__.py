@@ -7,6 +7,5 @@ from verifai_jax.core.lazy import attach
 if TYPE_CHECKING:
     from verifai_jax.reports.document import write_report as write_report
     from verifai_jax.reports.widget import explore as explore
-
 # Imported when first used: a folder inside needs few of these names.
 __getattr__, __dir__, __all__ = attach(__name__)

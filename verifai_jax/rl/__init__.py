@@ -31,6 +31,5 @@ if TYPE_CHECKING:
     from verifai_jax.rl.task.task import Continuous as Continuous
     from verifai_jax.rl.task.task import Discrete as Discrete
     from verifai_jax.rl.task.task import Task as Task
-
 # Imported when first used: a folder inside needs few of these names.
 __getattr__, __dir__, __all__ = attach(__name__)

@@ -43,10 +43,8 @@ if TYPE_CHECKING:
     from verifai_jax.search.turbo import TuRBO as TuRBO
     from verifai_jax.search.uniform import Uniform as Uniform
     from verifai_jax.search.wrapper import Wrapper as Wrapper
-
 # Imported when first used: a run needs few of these searches.
 __getattr__, __dir__, __all__ = attach(__name__, "from_json", "named", "names", "split", "to_json")
-
 _SEARCHES = {
     "uniform": "Uniform",
     "halton": "Halton",
@@ -79,10 +77,8 @@ def named(name: str, **options: Any) -> "Search":
     """Build a search by its name.
 
     **Arguments:**
-
     - `name`: such as `"cross_entropy"`; `names()` lists all.
     - `options`: hyper-parameters of the search, by name.
-
     **Raises:** `ValueError` for an unknown name or option, or a value out of range.
     """
     if name not in _SEARCHES:
@@ -96,10 +92,8 @@ def split(parts: "Mapping[str, str | Search]", rest: "str | Search" = "uniform")
     """Build a search that has one for each part of the space; see `Split`.
 
     **Arguments:**
-
     - `parts`: feature name -> search, or the name of one.
     - `rest`: the search of all other features.
-
     **Raises:** as `named` and `Split`.
     """
     from verifai_jax.search._split import Split

@@ -27,7 +27,6 @@ class Split(Search[tuple[PyTree, ...]]):
     """A search for each part of the space, and one for the rest.
 
     **Arguments:**
-
     - `parts`: feature name -> search; `"cars"` means all of `cars[0].x`, `cars[0].v`, ...; several
       names for one search are written `"x0, v0"`.
     - `rest`: the search of all other features.

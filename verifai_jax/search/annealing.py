@@ -37,7 +37,6 @@ ACCEPTED = 0.3
 """Acceptance rate that the scales of the steps aim at: between 0.44 and 0.23, the best rates of a
 random walk in one and in many dimensions (Gelman, Roberts, Gilks, Efficient Metropolis jumping
 rules, Bayesian Statistics 5, 1996)."""
-
 ADAPTATION = 0.3  # change of the logarithm of the scale by one acceptance
 COPIES = 4  # chains that begin at one point
 MIN_SCALE = 0.01  # smallest scale of the steps, in unit coordinates
@@ -60,13 +59,11 @@ class Annealing(Search[AnnealingState]):
     """Parallel tempering; each row of the batch is a chain at a temperature of its own.
 
     **Arguments:**
-
     - `chains`: minimum number of chains; more than the batch has rows take turns.
     - `hottest`, `coldest`: temperatures, geometric in between, in units of the robustness' spread
       (from the best to the median) where the chains start.
     - `exploration`: share of chains that draw from the prior, for ever; at least one.
     - `patience`: proposals in a row that a chain may refuse before it starts again elsewhere.
-
     **Raises:** `ValueError` for values out of range, `coldest` above `hottest` included.
     """
 
@@ -111,7 +108,6 @@ class Annealing(Search[AnnealingState]):
         one, other = (row[:, 3:5] * chains).astype(jnp.int32).T
         along = (0.3 + 0.7 * row[:, 2:3]) * (state.u[one] - state.u[other]) + 0.1 * step
         step = jnp.where(moved, jnp.where(row[:, 5:] < ALONG_OTHERS, along, step), 0.0)
-
         index = np.flatnonzero(~has_fine_cells(cube))
         few = cube.discrete[index]
         # Of a cell, the neighbour or any; of a choice, any.
@@ -122,7 +118,6 @@ class Annealing(Search[AnnealingState]):
         step = step.at[:, few].set(jnp.where((drawn > RESAMPLED) & (drawn < either), sideways, 0.0))
         u = reflect(own + step)
         u = u.at[:, few].set(jnp.where(drawn < RESAMPLED, prior[:, few], u[:, few]))
-
         anywhere = jnp.isinf(state.energy[turn]) | (self._coldness(chains) == 0)[turn]
         return jnp.where(anywhere[:, None], prior, u), state._replace(asks=state.asks + 1)
 
@@ -137,7 +132,6 @@ class Annealing(Search[AnnealingState]):
         sweeps = len(partners_of(chains))
         key = jax.random.fold_in(jax.random.fold_in(state.key, state.tells), 1)
         chance = jnp.log(draw_uniform(key, (batch + sweeps * chains,)))
-
         rise = jnp.where(jnp.isinf(before), 0.0, coldness[turn] * (new - before))
         accepted = usable & (jnp.isinf(before) | (coldness[turn] == 0) | (chance[:batch] < -rise))
         rests = jnp.where(accepted, 0, state.rests[turn] + usable)

@@ -51,14 +51,12 @@ class Bandit(Search[BanditState]):
     Ordered cells of discrete coordinates are grouped into buckets; unordered ones are an arm each.
 
     **Arguments:**
-
     - `buckets`: how many a coordinate has, and each bucket again.
     - `depth`: how often buckets are split, the first time included.
     - `optimism`: factor on the bonus; the larger, the more even the draws.
     - `best`: share of the remembered points that gets rewards.
     - `window`: how many points are remembered; at least two batches.
     - `exploration`: share of points drawn from the prior, for ever.
-
     **Raises:** `ValueError` for values out of range, and for more than 10 000 buckets in all.
     """
 

@@ -77,12 +77,10 @@ def check_options(
     """Check the options of a search, attributes of the same names.
 
     **Arguments:**
-
     - `options`: the search.
     - `counts`: names of whole numbers, and the smallest value of each.
     - `shares`: names of those in `(0, 1]`.
     - `sizes`: names of those that are positive and finite.
-
     **Raises:** `ValueError` that names the first one out of range.
     """
     for name, smallest in (counts or {}).items():
@@ -98,13 +96,11 @@ class TraceOptions:
     """Options of a model of the traces, which the loop keeps for a search and descends on.
 
     **Arguments:**
-
     - `initial`: points of the prior before the model has a say.
     - `share`: the share of the points that the model proposes; the others are those of the search.
     - `capacity`: maximum number of rows that the model knows, the best half and the last ones.
     - `starts`: descents for each proposal, the best one of which is simulated.
     - `steps`: steps of a descent.
-
     **Raises:** `ValueError` for values out of range.
     """
 
@@ -123,7 +119,6 @@ class Wants:
     """Needs of a search from the loop, in addition to the robustness of its points.
 
     **Arguments:**
-
     - `gradient`: `Observations.gradient`, at the `temperature` of the search.
     - `clauses`: `Observations.clauses`. Such a search plans its rounds (`plan`).
     - `clause_gradients`: `Observations.clause_gradients`, in the rounds whose plan says so.
@@ -177,7 +172,6 @@ class Wants:
         """Return the shapes and types of the observations of a round.
 
         **Arguments:**
-
         - `cube`: the cube that is searched.
         - `batch`: rows of a round.
         - `coverage_ids`: coverage ids of a row.
@@ -218,10 +212,8 @@ class Plan(NamedTuple):
 Origin = Literal["prior", "given", "sequence", "coverage", "learned"]
 """Where points come from: independent samples of the prior; a list that somebody gave; a sequence
 that is fixed from the start; a search guided by coverage; a search guided by robustness."""
-
 State = TypeVar("State")
 """The state of a search: a pytree of arrays."""
-
 Asked: TypeAlias = tuple[Float[Array, "batch d"], State]
 """Points to simulate, and the state of the search after it proposed them."""
 
@@ -322,7 +314,6 @@ class Search(ForUsers, abc.ABC, Generic[State]):
         parts that may never take part nothing is compiled.
 
         **Arguments:**
-
         - `state`: before an `ask`; None for that of `init`.
         """
         return self

@@ -69,7 +69,6 @@ class Bayes(Search[BayesState]):
     """Gaussian process on the robustness; asks where it may be negative.
 
     **Arguments:**
-
     - `acquisition`: `"thompson"` or `"expected_improvement"`.
     - `capacity`: maximum number of points that the process knows. Of more it keeps the best half
       (of equally good ones a random choice) and a random choice of all others.
@@ -308,10 +307,7 @@ def _minima(
 
 
 def _near(
-    parent: Float[Array, "n d"],
-    random: Float[Array, "n r"],
-    cube: Cube,
-    scales: Float[Array, " 2"],
+    parent: Float[Array, "n d"], random: Float[Array, "n r"], cube: Cube, scales: Float[Array, " 2"]
 ) -> Float[Array, "n d"]:
     """Draw points around others: some coordinates moved by a step between two scales."""
     d = cube.dim

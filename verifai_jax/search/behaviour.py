@@ -20,11 +20,9 @@ from verifai_jax.core.clauses import OUTCOME, SEGMENTS, SIGNALS
 MEMORY = 256
 """Outcomes that are remembered; the last ones. As many as `Diverse` archives failures by
 default."""
-
 NEIGHBOURS = 15
 """Remembered outcomes that say how well known one is: the k of novelty search, which Lehman and
 Stanley set to 15."""
-
 ALIKE = 1e-4
 """Spread of the robustness of safe points, over its size, up to which it says nothing: a thousand
 roundings of float32, as a constant robustness may have from the arithmetic of a simulation."""
@@ -76,7 +74,6 @@ class SeenBehaviour(NamedTuple):
         """Return the memory with ranges that hold these outcomes too.
 
         **Arguments:**
-
         - `outcomes`: the outcomes of a round.
         - `safe`: the robustness of safe points, NaN of others.
         """

@@ -14,7 +14,6 @@ def newest_first(
     """Return the points of a round before those of a memory, with their scores.
 
     **Arguments:**
-
     - `u`, `new`: of the round; a score is infinite where there is nothing to learn.
     - `points`, `score`: of the memory; a score is infinite where there is no point.
     """

@@ -23,7 +23,6 @@ from verifai_jax.search.draws import draw_uniform
 MAX_COMBINATIONS = 1024
 """Maximum number of combinations of the lengths of arrays: in a run of a thousand
 simulations more of them would be met once or never, and their histograms would learn nothing."""
-
 MAX_BINS = 2**22
 """Maximum number of bins of all histograms, which take 16 MB."""
 
@@ -44,11 +43,9 @@ class CECompat(Search[CECompatState]):
     each combination of them has histograms of its own.
 
     **Arguments:**
-
     - `buckets`: the buckets of a continuous coordinate.
     - `alpha`: share that a histogram keeps of itself at each failure.
     - `threshold`: robustness below which a point is a failure; at it, it is none.
-
     **Raises:** `ValueError` for values out of range. `check` raises it for more than 1024
     combinations of lengths, or histograms that would not fit into memory.
     """

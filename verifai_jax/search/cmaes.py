@@ -32,33 +32,22 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Asked, Observations, Search, check_options, choose
 from verifai_jax.search.draws import draw_uniform, standard_normal
-from verifai_jax.search.evolution import (
-    Evolution,
-    rates,
-    recombination,
-    reverse_recombination,
-)
+from verifai_jax.search.evolution import Evolution, rates, recombination, reverse_recombination
 from verifai_jax.search.halton import halton_points
 
 MAX_CELLS = 32
 """Cells up to which an unordered coordinate has probabilities: a generation cannot learn more."""
-
 MARGIN = 0.25
 """Minimum standard deviation of an ordered discrete coordinate, in cells: the next cell, whose edge
 is then two standard deviations away, is still drawn in one of twenty points."""
-
 LEARNING = 0.3
 """Learning rate of the probabilities of unordered cells, per generation. Chosen by hand;
 no comparison with other values is recorded."""
-
 LARGEST = 1e30
 """Robustness above which all is equally bad: sums of such stay finite in float32."""
-
-
 ADAPTATIONS = 4
 """Times that the covariance could be learned anew without progress before a run ends. With 1,
 every third run in ten dimensions ended too early on Rastrigin's function; with 4, one in thirty."""
-
 FEW_COORDINATES = 5
 """Coordinates up to which the share of exploration is the given one. In more of them, a point of
 the prior is seldom near anything: with 5 % instead of 10 % in ten coordinates, CMA-ES needs 0.93
@@ -94,7 +83,6 @@ class CMAES(Search[CMAESState]):
     Batches smaller than a population should be (`4 + 3 log d`) are collected until there is one.
 
     **Arguments:**
-
     - `step`: standard deviation, in unit coordinates, with which a run from the prior begins.
     - `small_step`: that of a run around a point of exploration.
     - `exploration`: share of the points drawn from the prior, for ever, in up to five coordinates;
@@ -105,7 +93,6 @@ class CMAES(Search[CMAESState]):
       those in which the covariance is learned (25 in all in four coordinates with batches of 16,
       130 in ten with batches of 10).
     - `failures`: after this many failing points, and no fewer than two generations', a run ends.
-
     **Raises:** `ValueError` for values out of range.
     """
 

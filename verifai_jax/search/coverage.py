@@ -27,20 +27,16 @@ STEP = 0.1  # standard deviation of small steps, in unit coordinates
 MOVES = (0.35, 0.55, 0.75, 0.9)
 """Cumulative shares of mutations: a few coordinates, a stretch, all from one coordinate on, a
 splice; the rest are small steps."""
-
 SHARES = (0.25, 0.5, 0.25, 0.25)
 """Shares of the kinds of ids: of features, of cells of behaviour, of verdicts, and others."""
-
 KINDS = len(SHARES)  # number of kinds of coverage ids that the search distinguishes
 VERDICT = 2  # the kind of coverage ids of verdicts
 EDITED = 0.85  # share of mutations that edit an item of an array, where there are such
 EDITS = (0.3, 0.38, 0.72, 0.8)
 """Cumulative shares of edits: putting an item in, another item in place of one, the same kind of
 item with one other number, taking one out; the rest are new items from one on."""
-
 APPENDED = 0.3
 """Share of edits at the end of an array, where what has happened before stays as it is."""
-
 EXTREME = 0.5  # share of new items whose numbers are drawn towards the ends of their ranges
 LONGER = 0.5  # share of mutations that make an array no shorter and perhaps longer
 
@@ -58,17 +54,14 @@ class Coverage(Search[CoverageState]):
     """Mutations of points that covered what few others did; see the module's docstring.
 
     **Arguments:**
-
     - `exploration`: share of points drawn from the prior, for ever.
     - `rarity`: exponent by which seldom coverage ids are preferred; 0 is not at all.
     - `buckets`: coverage ids of a kind that the search distinguishes; further coverage ids share
       these buckets.
-
     **Raises:** `ValueError` for values out of range.
     """
 
     wants: ClassVar[Wants] = Wants(coverage_ids=True, max_batch=64)
-
     exploration: float = 0.15
     rarity: float = 2.0
     buckets: int = 512

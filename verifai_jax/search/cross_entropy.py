@@ -31,15 +31,12 @@ from verifai_jax.search.halton import halton_points
 
 MAX_CELLS = 32
 """Cells up to which a coordinate has a histogram: a batch cannot fill one of more."""
-
 FEW_COORDINATES = 4
 """Coordinates up to which the options that depend on the dimension are the given ones. Chosen
 by hand; no comparison with other values is recorded."""
-
 MORE_PATIENCE = 30
 """Simulations without progress that a search waits longer for each further coordinate. In ten
 dimensions, batches of ten and 6 rounds alone, one search in three missed Rastrigin's function."""
-
 NARROWER = 1.5
 """Power of the dimension with which `min_std` falls: to 0.005 in ten dimensions, where 0.02 and
 0.008 are too wide to hit a ball of radius 0.007."""
@@ -60,7 +57,6 @@ class CrossEntropy(Search[CrossEntropyState]):
     """Cross-entropy over Gaussian and categorical mixtures around the best points so far.
 
     **Arguments:**
-
     - `elite`: size of the elite, as a share of the batch; at least `min_elite` points.
     - `focus`: in `[0, 1]`; 0 draws from one Gaussian, 1 from the surroundings of elite points.
     - `exploration`: share of each batch drawn from the prior, for ever.
@@ -69,7 +65,6 @@ class CrossEntropy(Search[CrossEntropyState]):
       more than four coordinates it is less, since a point must be near in all of them.
     - `patience`: rounds without progress after which it starts afresh elsewhere; in more than four
       coordinates 30 simulations more for each of the others.
-
     **Raises:** `ValueError` for values out of range.
     """
 
@@ -147,7 +142,6 @@ class CrossEntropy(Search[CrossEntropyState]):
         count = jnp.maximum(jnp.sum(weight), 1.0)
         # The elite is sorted: the points that exist come first.
         parent = state.elite[jnp.minimum((pick[:, 0] * count).astype(jnp.int32), len(weight) - 1)]
-
         mean = weight @ state.elite / count
         std = jnp.sqrt(weight @ (state.elite - mean) ** 2 / count)
         fewer = min(1.0, FEW_COORDINATES / max(cube.dim, 1))
@@ -157,7 +151,6 @@ class CrossEntropy(Search[CrossEntropyState]):
         u = jnp.clip(mean + self.focus * (parent - mean) + spread * std * normal, 0.0, 1.0)
         if len(cells) == 0:
             return u
-
         levels = np.array([cube.levels[i] for i in cells], np.int32)
         prior = np.zeros((len(cells), levels.max()), np.float32)
         for row, j in zip(prior, narrow, strict=True):

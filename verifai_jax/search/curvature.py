@@ -19,14 +19,11 @@ from jaxtyping import Array, Bool, Float
 
 PAIRS = 8
 """Remembered differences of a descent: Nocedal and Wright recommend 3 to 20."""
-
 SHRINKS, GROWS = 0.25, 2.0
 """Factors on the trust region after a step that was no better, and after one to its edge that was:
 those of algorithm 4.1."""
-
 ENOUGH = 1e-4
 """Share of what the slope promises that a step has to bring, as usual in Armijo's rule."""
-
 BENT = 1e-6
 """Cosine between a step and the difference of the slopes below which the two say nothing: float32
 has seven digits."""
@@ -65,7 +62,6 @@ def advance(
     """Learn from one point of each descent, and return the next one.
 
     **Arguments:**
-
     - `point`, `value`, `slope`: what was proposed last, and what came of it; all finite.
     - `fresh`: descents that begin at their point.
     - `radius`: trust regions of these.

@@ -44,7 +44,6 @@ NEARER = 0.5  # factor on the first step of a descent that starts from a good po
 CLEARLY = 0.995  # share of the lowest value so far below which a new one is clearly lower
 SMALLEST = 1e-5
 """Trust region, in unit coordinates, below which a descent ends: float32 has seven digits."""
-
 REMEMBERED = 32
 """Latest descents at each rung among which one must be good to go on: enough for a quantile such as
 the half, and few enough to follow the search."""
@@ -70,7 +69,6 @@ class Descent(SlopeSearch[DescentState]):
     """L-BFGS from many starts; discrete coordinates keep their start's value.
 
     **Arguments:**
-
     - `descents`: maximum number at once; the batch if that is smaller.
     - `rate`: size of the first step, in unit coordinates.
     - `steps`: maximum number of gradients of a descent.
@@ -79,7 +77,6 @@ class Descent(SlopeSearch[DescentState]):
     - `hottest`, `coldest`: temperature of the smooth robustness at the start and at the end of a
       descent, in units of the spread of the predicates.
     - `patience`: gradients in a row without a clearly lower point after which a descent ends.
-
     **Raises:** `ValueError` for values out of range; `check` for a space without continuous
     features.
     """
@@ -156,7 +153,6 @@ class Descent(SlopeSearch[DescentState]):
         informative = jnp.all(jnp.isfinite(gradient), axis=1) & jnp.any(gradient != 0, axis=1)
         informative &= usable
         gradient = jnp.where(informative[:, None], gradient, 0.0)
-
         merit = jnp.where(usable, jnp.max(clauses, axis=1), jnp.inf)
         best = jnp.minimum(state.best, merit)
         step = state.step + 1
@@ -167,14 +163,12 @@ class Descent(SlopeSearch[DescentState]):
         better = jnp.sum(rungs[:, None] < best[:, None], axis=2)
         goes_on = better < self.kept * jnp.sum(jnp.isfinite(rungs), axis=1)[:, None]
         over |= jnp.any(arrives & ~goes_on, axis=0)
-
         rate = self.rate * jnp.where(state.given, NEARER, 1.0)
         value = jnp.where(usable, merit, 0.0)
         curvature, point = advance(
             state.curvature, observed.u, value, gradient, state.step == 0, rate
         )
         over |= curvature.radius < SMALLEST
-
         useless = state.useless + jnp.sum(usable & ~informative)
         return state._replace(
             point=point,
@@ -203,27 +197,22 @@ def _latest(
 AT_ONCE = 2
 """Maximum number of descents of a round: few, so that within a thousand simulations some come far.
 """
-
 EARLY = 400.0
 """Simulations before the first descent begins, from the best point of the others: more than most
 budgets of the ARCH competition, in which they need no help. Rosenbrock's function in ten dimensions
 fell below 1 within 1500 simulations from 10, 9, 9 and 9 of 10 seeds in batches of 1, 2, 4 and 16;
 beginning at 500 from 2 of 10 in batches of 1, where the others are in the wrong hollow by then."""
-
 TRIAL = 24.0
 """Simulations of descents, before `BEGINS`, that may lower no robustness: a dozen slopes, in which
 one from a good point gets on if any does. They may spend as many more as they had spent when they
 last got on: a valley that led to a minimum which is no failure has others nearby."""
-
 BEGINS = 1500.0
 """Simulations before descents go on that are behind the others: the budget of the ARCH competition.
 When all began at 256, CC4 took 429 simulations instead of 357, at 64, SB3 took 330 instead of 271
 (`benchmarks/RESULTS.md`)."""
-
 # The numbers below were chosen by hand; no comparison with other values is recorded.
 IDLE = 100.0
 """Simulations without progress of the others after which the share of the descents is greatest."""
-
 MAX_SHARE = 0.6  # greatest share of the budget of the descents
 PROGRESS = 0.99  # share of the lowest robustness below which a new one is progress
 TRIED = 100.0  # simulations that the descents spend before what they reach is compared
@@ -292,7 +281,6 @@ def learn(
     """Learn from a round.
 
     **Arguments:**
-
     - `observations`: the observations of the round, of all its points.
     - `score`: robustness of each row, 0 for all failures, infinite for rows not to learn from.
     - `spent`: simulations of the round, one with gradients counted as two.

@@ -39,7 +39,6 @@ from verifai_jax.search.wrapper import Learn, Wrapper
 AT_ONCE = 16
 """Maximum number of failures archived in a round, each by one step of a loop: as many as the rounds
 of a diverse run have points by default."""
-
 MOVES = ("inputs", "behaviour")
 """What failures can be far from each other in."""
 
@@ -72,7 +71,6 @@ class Diverse(Wrapper[DiverseState]):
     """Another search, kept away from earlier failures.
 
     **Arguments:**
-
     - `search`: the one inside.
     - `radius`: how far distinct failures are apart at first: root mean square over the unit
       coordinates, in which two random points are 0.41 apart; choices differ by 0 or 1.
@@ -82,7 +80,6 @@ class Diverse(Wrapper[DiverseState]):
     - `capacity`: the capacity of the archive, and so the maximum number of distinct failures.
     - `by`: what distinct failures are far from each other in: `"inputs"`, or `"behaviour"`, for
       which the radius is a share of what can differ (`search.behaviour.unlike`).
-
     **Raises:** `TypeError` for anything that is not a search; `ValueError` for values out of range.
     """
 
@@ -198,7 +195,6 @@ class Diverse(Wrapper[DiverseState]):
         state = self._remember(state, cube, points, rho)
         # The best points of a fruitless period lead nowhere.
         state = state._replace(rho=jnp.where(tired, jnp.inf, state.rho))
-
         raised = self._deflate(state, cube, observations)
         inner = learn(state.inner, cube, raised)
         if self.search.learns and self.search.total(cube) is None:
@@ -279,7 +275,6 @@ class Diverse(Wrapper[DiverseState]):
         changed = observations._replace(rho=rho)
         if observations.gradient is None and observations.clauses is None:
             return changed
-
         offset = jnp.where(np.array(cube.levels) == 0, u - state.archive[nearest], 0.0)
         length = apart(cube, u, state.archive)[jnp.arange(len(u)), nearest]
         # Of the root mean square over the coordinates.
@@ -361,13 +356,11 @@ def distinct(
     The first is chosen, and then each that is beyond the radius of all chosen ones.
 
     **Arguments:**
-
     - `points`: `[n, d]`, in the unit cube.
     - `radius`: root mean square distance over the coordinates, as of `Diverse`.
     - `cube`: the unit cube of the space; with continuous coordinates alone when left out.
     - `order`: indices of the points, the most wanted first, such as `np.argsort(rho)`; as they come
       when left out.
-
     **Returns:** indices `[k]` of the chosen points, in that order.
     """
     u = np.asarray(points, np.float32)

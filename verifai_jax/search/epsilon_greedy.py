@@ -51,7 +51,6 @@ class EpsilonGreedy(Search[EpsilonGreedyState]):
     """Draws around the best points so far, and a share `epsilon` from the prior.
 
     **Arguments:**
-
     - `epsilon`: share of points drawn from the prior, for ever.
     - `best`: how many best points are kept, as a share of the batch; at least `min_best`.
     - `reach`: largest standard deviation of the noise, in units of that of the best points.
@@ -60,7 +59,6 @@ class EpsilonGreedy(Search[EpsilonGreedyState]):
     - `patience`: rounds without progress after which it starts afresh; small ones count as parts
       of rounds of `begin` points.
     - `doubt`: how many standard errors above chance greedy draws must be, or it starts afresh.
-
     **Raises:** `ValueError` for values out of range.
     """
 
@@ -103,7 +101,6 @@ class EpsilonGreedy(Search[EpsilonGreedyState]):
         one, other = state.best[parents[:, 0]], state.best[parents[:, 1]]
         recombined = (inherit < 0.5) & (row[:, 2:3] < RECOMBINED)
         parent = jnp.where(recombined, other, one)
-
         mean = good @ state.best / jnp.maximum(count, 1.0)
         std = jnp.sqrt(good @ (state.best - mean) ** 2 / jnp.maximum(count, 1.0))
         # A single one does not show any.
@@ -112,7 +109,6 @@ class EpsilonGreedy(Search[EpsilonGreedyState]):
         step = factor * std * standard_normal(noise)
         step = jnp.where(all_or_some(row[:, 4:5], move), step, 0.0)
         u = jnp.clip(parent + step, 0.0, 1.0)
-
         many = has_fine_cells(cube)
         cell = jnp.where(many, cube.cells(u), cube.cells(parent))
         cell = jnp.where((choice < RESAMPLED) & ~many, cube.cells(prior), cell)
@@ -126,7 +122,6 @@ class EpsilonGreedy(Search[EpsilonGreedyState]):
         usable = observations.usable
         exploring = self._exploring(state, len(observations.rho))
         score = observations.score
-
         # What greed gained over the prior; equally good draws count half.
         greedy = usable & ~exploring
         median = self._median(state)
@@ -137,7 +132,6 @@ class EpsilonGreedy(Search[EpsilonGreedyState]):
         useless &= tried >= self.begin
         # Whatever the robustness says, close to failures there are others.
         useless &= state.score[0] > 0
-
         state = self._with_best(state, observations.u, score)
         stale = jnp.where(state.begun < self.begin, 0, state.stale)
         again = (stale >= self.patience * max(len(score), self.begin)) | useless

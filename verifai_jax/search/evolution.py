@@ -56,7 +56,6 @@ class Evolution(NamedTuple):
         """Update by points; in comments the tutorial's names.
 
         **Arguments:**
-
         - `points`: the points of a generation.
         - `weights`: recombination weights, which sum to one.
         - `worse`: weights of the points that the covariance is to shrink along, which sum to one
@@ -73,7 +72,6 @@ class Evolution(NamedTuple):
         limit = math.sqrt(n) + 2 * n / (n + 2)
         cut = jnp.minimum(1.0, limit / jnp.maximum(norm, 1e-12))
         steps, white = steps * cut, white * cut
-
         mass = _mass(weights)  # mu_eff
         size_rate = (mass + 2) / (n + mass + 5)  # c_sigma
         damping = 1 + 2 * jnp.maximum(0, jnp.sqrt((mass - 1) / (n + 1)) - 1) + size_rate
@@ -85,14 +83,12 @@ class Evolution(NamedTuple):
         shrinking = jnp.minimum(shrinking, (1 - one - many) / (n * learned)) * jnp.sum(worse)
         length = jnp.sum(white**2, axis=1)
         signed = weights - shrinking * worse * n / jnp.maximum(length, 1e-12)
-
         step = weights @ steps
         gain = jnp.sqrt(size_rate * (2 - size_rate) * mass)
         whitened = (1 - size_rate) * self.whitened + gain * (weights @ white)
         length = jnp.sqrt(jnp.sum(whitened**2))
         expected = math.sqrt(n) * (1 - 1 / (4 * n) + 1 / (21 * n**2))
         growth = size_rate / damping * (length / expected - 1)
-
         unbiased = jnp.sqrt(1 - (1 - size_rate) ** (2 * (self.age + 1)))
         steady = length / unbiased < (1.4 + 2 / (n + 1)) * expected  # h_sigma
         gain = jnp.sqrt(path_rate * (2 - path_rate) * mass)
@@ -144,7 +140,6 @@ def rates(
     """Return the learning rates of the covariance: of its path, and of a generation's points.
 
     **Arguments:**
-
     - `mass`: as how many equal weights those of the better points count.
     - `n`: number of coordinates.
     - `full`: whether the covariance is a whole matrix rather than a diagonal.

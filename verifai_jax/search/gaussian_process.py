@@ -25,16 +25,12 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 
 VARIANCE = (-3.0, 4.0)
 """Range of the logarithm of the variance. Data have variance 1, whose logarithm is well inside."""
-
 LENGTH = (-4.0, 8.0)
 """Range of the logarithms of the length scales, in cubes: from a fiftieth of a cube, below which a
 few hundred points say nothing about what lies between them, to 3000 cubes, where a coordinate is of
 no influence."""
-
 NOISE = (-11.0, 0.0)  # range of the logarithm of the noise, which keeps 32-bit factors finite
 SMALLEST = 2.0**-24  # smallest uniform number above zero, where a normal quantile is infinite
-
-
 Fitted = TypeVar("Fitted", bound=PyTree)
 """Hyper-parameters: a pytree of arrays."""
 
@@ -80,7 +76,6 @@ class GaussianProcess:
     """Regression over points with these coordinates; the prior's mean is zero.
 
     **Arguments:**
-
     - `unordered`: for each coordinate, whether it holds codes rather than a quantity in `[0, 1]`.
     """
 

@@ -42,27 +42,21 @@ from verifai_jax.search.linear_steps import HALVINGS, flip_weakest, minimax_dire
 # The first two were chosen by hand; no comparison with other values is recorded.
 LITTLE = 0.9  # share of the robustness that is left after a step which is only a little better
 COOLING = 0.7  # factor on the temperature with each step, after the first descent
-
 WOBBLE = 0.1
 """Greatest share by which boxes smaller than the cube are less, in all of a run: with it all points
 of a descent but its start and a corner depend on the seed."""
-
 SIZES = 6
 """Maximum number of boxes tried at once: after the whole cube, the sixth box has a hundredth of its
 side, which is less than the default `min_radius`."""
-
 FIRST_BOX = 0.4
 """Size of the first box of short descents: beyond it gradients say little. Chosen among others from
 192 to 384 random starts, by simulations a failure (`benchmarks/RESULTS.md`, "Short descents")."""
-
 FULL_CUBE = 2
 """Of so many descents one begins with the whole cube, for failures in corners such as those of CC2.
 With one of four, and twelve descents first, the landscape of ripples cost half as much again."""
-
 OFFERED_BOX = 0.16
 """Size of the first box around a start that was offered: `FIRST_BOX` shrunk once by the
 default factor."""
-
 UNPROMISING = 0.75
 """Share of `FIRST_BOX` below which a box is not tried where no greater one was better: the first
 box is tried, and the next smaller one is not."""
@@ -98,7 +92,6 @@ class Gradient(SlopeSearch[GradientState]):
     """Sequential linear programming on the clauses; discrete coordinates keep their start's value.
 
     **Arguments:**
-
     - `descents`: maximum number at once; a quarter of the batch if that is smaller.
     - `shrinks`: factor on the size of the box when nothing in it was better.
     - `min_radius`: size of the box below which a descent ends, once it has made a step.
@@ -108,7 +101,6 @@ class Gradient(SlopeSearch[GradientState]):
       predicates: of the first descent, which halves it with every step, then of the others in turn,
       where it falls more slowly. A single one is that of all.
     - `coldest`: temperature below which it does not fall.
-
     **Raises:** `ValueError` for values out of range; `check` for a space without continuous
     features.
     """
@@ -172,7 +164,6 @@ class Gradient(SlopeSearch[GradientState]):
         differentiates = 2 * (n - known) >= n
         starts, begun = self._starts(state, cube)
         state = choose(differentiates, begun, state)
-
         first = jnp.argsort(jnp.where(differentiates, state.known, ~state.known), stable=True)
         there = jnp.where(differentiates, n - known, jnp.maximum(known, 1))
         row = jnp.arange(batch)
@@ -242,7 +233,6 @@ class Gradient(SlopeSearch[GradientState]):
         best = jnp.argmin(scores, axis=1)
         lowest = jnp.min(scores, axis=1)
         failed = jnp.any(owner & (usable & (observations.rho < 0))[None], axis=1)
-
         gradients = jnp.where(usable[best][:, None, None], observations.clause_gradients[best], 0.0)
         finite = jnp.all(jnp.isfinite(gradients), axis=(1, 2))
         gradients = jnp.where(finite[:, None, None], gradients, 0.0)
@@ -252,7 +242,6 @@ class Gradient(SlopeSearch[GradientState]):
         informative = finite & jnp.any(slope != 0, axis=(1, 2)) & jnp.isfinite(lowest)
         visited = jnp.any(owner, axis=1)
         before = jnp.max(state.clauses, axis=1)
-
         # With gradients: a descent goes on from where they are known, or starts elsewhere.
         begin = jnp.where(state.number % FULL_CUBE > 0, FIRST_BOX, 1.0)
         begin = jnp.where(state.given, OFFERED_BOX, begin)

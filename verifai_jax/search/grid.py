@@ -23,7 +23,6 @@ from verifai_jax.search.base import Asked, PointSequence
 MAX_POINTS = 2**31 - 1
 """Maximum number of points of a grid: numbers of points are 32 bits, and sums of two of them
 too."""
-
 STEPS = 6
 """Steps of the permutation; with fewer, small grids have fewer different orders."""
 
@@ -42,10 +41,8 @@ class Grid(PointSequence[GridState]):
     Batches beyond the end repeat the last point.
 
     **Arguments:**
-
     - `points`: number of values of each continuous coordinate, or a tuple with one number each; 1
       is the middle.
-
     **Raises:** `ValueError` for numbers below 1. `check` raises it for a tuple that does not go
     with the space, and for more than `2^31 - 1` points in all.
     """
@@ -124,7 +121,6 @@ def permuted(
     """Return where a random permutation of the numbers below `total` takes these.
 
     **Arguments:**
-
     - `number`: numbers below `total`.
     - `total`: at most `2^31 - 1`.
     - `keys`: random bits, one for each step; the same keys give the same permutation.

@@ -23,11 +23,9 @@ from verifai_jax.search.draws import draw_uniform
 BITS = 32  # bits of the index of a point: JAX has no wider integers by default
 PLAIN_UP_TO = 8
 """Number of bases up to which the sequence is plain: in larger ones lines are visible."""
-
 MAX_IN_LOOP = 2**14
 """Coordinates of points computed in a loop, which compiles in a third of the time; more run ten
 times as fast where the loop is written out."""
-
 MAX_SKIPPED_POINTS = 2**31  # maximum number of skipped points, so that as many indices remain
 MAX_SKIPPED_BASES = 10_000
 """Maximum number of skipped bases: in bases beyond, which are
@@ -44,7 +42,6 @@ class Halton(PointSequence[HaltonState]):
     """Halton points, the first one with index 1; the same for any batch size, up to rounding.
 
     **Arguments:**
-
     - `scramble`: permute digits at random (from the key). `False` is the plain sequence, which
       does not depend on the key. By default plain where all bases are among the first 8 primes
       (up to 8 coordinates), and scrambled otherwise.
@@ -52,7 +49,6 @@ class Halton(PointSequence[HaltonState]):
       index `1 + skip_points`. VerifAI calls it `sample_index`.
     - `skip_bases`: number of primes left out; the first coordinate has base 3 after one. VerifAI
       calls it `bases_skipped`.
-
     **Raises:** `ValueError` for a `scramble` other than True, False and None, or numbers to skip
     that are no integers, negative or too large.
     """
@@ -64,10 +60,7 @@ class Halton(PointSequence[HaltonState]):
     def __post_init__(self) -> None:
         if self.scramble is not None and not isinstance(self.scramble, bool):
             raise ValueError(f"scramble must be True, False or None; got {self.scramble!r}")
-        for name, limit in (
-            ("skip_points", MAX_SKIPPED_POINTS),
-            ("skip_bases", MAX_SKIPPED_BASES),
-        ):
+        for name, limit in (("skip_points", MAX_SKIPPED_POINTS), ("skip_bases", MAX_SKIPPED_BASES)):
             count = getattr(self, name)
             check_count(name, count, 0)
             if count > limit:
@@ -90,7 +83,6 @@ def halton_points(
     """Compute points number `index` of the Halton sequence, in `[0, 1)`.
 
     **Arguments:**
-
     - `index`: of the points, from 1 on (point 0 is the corner at the origin).
     - `dim`: number of coordinates.
     - `key`: the key of the random permutations of digits; the sequence is plain without.
@@ -192,7 +184,4 @@ def _digit_maps(
 ) -> tuple[UInt32[Array, "digits d"], UInt32[Array, "digits d"]]:
     """Draw factors in `[1, base)` and shifts in `[0, base)` for every digit of every base."""
     factor, shift = draw_uniform(key, (2, digits, len(bases)))
-    return (
-        1 + (factor * (bases - 1)).astype(jnp.uint32),
-        (shift * bases).astype(jnp.uint32),
-    )
+    return (1 + (factor * (bases - 1)).astype(jnp.uint32), (shift * bases).astype(jnp.uint32))

@@ -21,7 +21,6 @@ from verifai_jax.search.process_data import encode, process_of, snap
 PARENTS = 8  # best candidates that climb. Chosen by hand
 APART = 1e-4
 """Distance from an observation, in every coordinate, within which a point says nothing new."""
-
 CLIMBS, CLIMB = 24, 0.05  # steps to a maximum, and their first length. Chosen by hand
 
 

@@ -20,9 +20,7 @@ class Likeliest(Wrapper[PyTree]):
     """Another search, which learns of likely failures that they are the best.
 
     **Arguments:**
-
     - `search`: the one inside; it must learn.
-
     **Raises:** `TypeError` for anything that is not a search; `ValueError` for one that does not
     learn, or of whose failures the objective says nothing.
     """

@@ -39,7 +39,6 @@ def minimax_direction(
 
     pairs = np.array(list(combinations(range(CLAUSES), 2)))
     one, two = gradients[pairs[:, 0]], gradients[pairs[:, 1]]
-
     apart, turned = clauses[pairs[:, 0]] - clauses[pairs[:, 1]], one - two
 
     def gap(points: Float[Array, "m d"]) -> Float[Array, " m"]:

@@ -20,7 +20,6 @@ def all_or_some(coin: Float[Array, "n 1"], mask: Float[Array, "n d"]) -> Bool[Ar
     """Return which coordinates move: in every second row all, else a third, or one on average.
 
     **Arguments:**
-
     - `coin`, `mask`: uniform random numbers.
     """
     return mask < jnp.where(coin < 0.5, 1.0, max(0.3, 1 / max(mask.shape[1], 1)))

@@ -34,7 +34,6 @@ from verifai_jax.search.draws import draw_columns, standard_normal
 # (`benchmarks/RESULTS.md`).
 PARENTS = 4
 """Best points that are mutated; each half as often as the one before. Of failures all are."""
-
 MIN_STEP = 0.02  # smallest standard deviation of steps, in unit coordinates; they are log-uniform
 MAX_STEP = 0.6  # largest standard deviation of steps, in unit coordinates
 MAX_EXPLORATION = 0.9  # share of proposals that explore after many simulations without progress
@@ -42,7 +41,6 @@ EVENLY = 0.1  # share of exploration that samples the prior; it grows where noth
 FEW = 4
 """Dimensions below which corners are few, and points that are spread find soon what descents find:
 more of exploration samples the prior, and the portfolio descends less before there is evidence."""
-
 SELDOM = 0.35  # share of exploration in which signals change seldom
 SWINGING = 0.35  # share of exploration in which signals swing to and fro
 TO_AND_FRO = 0.9
@@ -64,14 +62,12 @@ class Mutation(Search[MutationState]):
     """Mutations of the best points so far, by steps of all sizes, and exploration.
 
     **Arguments:**
-
     - `kept`: number of best points that are kept.
     - `first`: simulations that explore before anything is mutated.
     - `exploration`: share of proposals that explore.
     - `idle`: simulations without progress after which nearly all do.
     - `difference`: share of mutations by the difference of two good points.
     - `patience`: simulations without progress after which it begins afresh.
-
     **Raises:** `ValueError` for values out of range.
     """
 
@@ -150,7 +146,6 @@ class Mutation(Search[MutationState]):
         rank = jnp.floor(-jnp.log2(jnp.maximum(coin, 2.0**-PARENTS)))
         rank = jnp.where(any_of_them, jnp.floor(coin * failures), rank)
         parent = state.points[jnp.minimum(rank, jnp.maximum(there - 1, 0)).astype(jnp.int32)]
-
         good = jnp.minimum(there, jnp.maximum(6.0, there / 3))
         one, two = (state.points[(coins[:, i] * good).astype(jnp.int32)] for i in (1, 2))
         factor = jnp.array([0.3, 0.6, 1.0])[(coins[:, 3] * 3).astype(jnp.int32)]
@@ -158,7 +153,6 @@ class Mutation(Search[MutationState]):
         crossed = parent + (masks < share[:, None]) * factor[:, None] * (one - two)
         differs = (coins[:, 5] < self.difference) & (there >= 6)
         base = jnp.where(differs[:, None], crossed, parent)
-
         size = MIN_STEP * (MAX_STEP / MIN_STEP) ** coins[:, 6]
         # One coordinate, two, an eighth or a third of them; at least one.
         counts = np.array([1, 2, max(1, d // 8), max(1, d // 3)], np.float32)
@@ -185,10 +179,7 @@ class Mutation(Search[MutationState]):
 
 
 def _other_cells(
-    cube: Cube,
-    points: Float[Array, "n d"],
-    step: Float[Array, "n d"],
-    values: Float[Array, "n d"],
+    cube: Cube, points: Float[Array, "n d"], step: Float[Array, "n d"], values: Float[Array, "n d"]
 ) -> Float[Array, "n d"]:
     """Move each discrete coordinate to another cell: by the step if it is ordered, or to any."""
     levels = np.array(cube.levels)[cube.discrete]

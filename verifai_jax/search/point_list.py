@@ -21,9 +21,7 @@ class PointList(PointSequence[PointListState]):
     """Given points of the unit cube, one after the other; it ends with the last one.
 
     **Arguments:**
-
     - `points`: `[n, d]`, in `[0, 1]`.
-
     **Raises:** `ValueError` for no points, or points outside the unit cube; `check` for points of
     another dimension than the cube's.
     """

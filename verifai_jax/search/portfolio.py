@@ -43,17 +43,14 @@ from verifai_jax.search.mutation import FEW, Mutation, MutationState
 from verifai_jax.search.wrapper import Wrapper
 
 GRADIENT, MUTATION, CROSS_ENTROPY = range(3)  # numbers of the members
-
 # The numbers before `FILLED` were chosen by hand; no comparison with other values is recorded.
 PRIOR_GAINS = 4.0, 2.5
 """Gains before there is evidence, of descents and of the other two together: as if descents had
 succeeded always."""
-
 PRIOR_COSTS = 4.0  # cost of these gains, in simulations: few, so that evidence soon decides
 DISCOUNT = 0.98  # of evidence, for each simulation since: that of 50 simulations ago counts a third
 MIN_SHARE = 0.05  # of the budget of a member, so that its evidence never ends
 PATIENT = 4  # rounds in a row without a failure after which failures are rare
-
 FILLED = 8
 """Batch from which on cross-entropy has nine tenths of what it and mutations have, whatever gains
 say: those of mutations are small ones, near what is known, and there are none where the best points
@@ -63,32 +60,25 @@ many. Signals are left to the gains, as mutations know their shape: with nine te
 competition took 1.2 times as many. So are descents among numbers alone: the landscape of ripples
 took 1.07 times as many. In rounds of one simulation cross-entropy draws from the prior alone, and
 has a fifth until there is evidence."""
-
 IN_VAIN = 3
 """Power of the share of coordinates that descents can move with which they count, and their gains.
 Without a factor on the gains they got on as long as the numbers alone can: five problems of choices
 and numbers took 1.03 to 1.4 times as many simulations."""
-
 OPENING = 6
 """Descents before the budget is shared by evidence. With two instead, SB3 to SB5 together took 0.99
 times as many simulations; with twelve, and one of four with the whole cube, the
 landscape of ripples cost half as much again (`benchmarks/RESULTS.md`)."""
-
 MOSTLY = 0.75
 """Share of coordinates that descents can move from which on some descents go first. Where a fifth
 of the coordinates or fewer are choices three problems took 0.36, 0.41 and 0.88 times as many
 simulations with these descents as without, where more are two took 1.3 and 2.7 times as many."""
-
 MANY = 32
 """Simulations of a round beyond which descents wait until failures are rare: such rounds simulate
 thousands in the seconds that gradients take to compile."""
-
 NEVER = 1 << 30
 """Simulations since the last failure that stand for any number of them: more than a run has."""
-
 AMONG = 4
 """Number of best points among which a new one is a gain: those that mutations have as parents."""
-
 TAKEN = 32
 """Points remembered as starts and ends of descents; as many as mutations keep to start from."""
 
@@ -114,7 +104,6 @@ class Portfolio(Search[PortfolioState]):
     """Gradient, mutations and cross-entropy together, with the budget by evidence; no tuning.
 
     **Arguments:**
-
     - `gradients`: whether to use gradients of the robustness. They are left out automatically where
       there are none: for black boxes, where all features are discrete, where the robustness is
       constant almost everywhere, as over signals that are whole numbers.
@@ -338,7 +327,6 @@ class Portfolio(Search[PortfolioState]):
         latest = jnp.where(begins[:, None], before.offered, before.point)
         count = jnp.sum(begins | ends)
         taken = jnp.roll(state.taken, count, axis=0).at[index].set(latest, mode="drop")
-
         points, score = state.mutation.points, state.mutation.score
         free = not_taken(points, score, taken)
         best = jnp.argsort(~free, stable=True)[:n]
@@ -408,7 +396,6 @@ class PortfolioStage(Wrapper[PortfolioState]):
     """Some members of a portfolio, with the states of all.
 
     **Arguments:**
-
     - `search`: the whole portfolio.
     - `descends`: whether short descents take part, or neither these nor those into the interior.
     """

@@ -21,7 +21,6 @@ from verifai_jax.search.gaussian_process import GaussianProcess, Hyper, Posterio
 CAP = 30.0
 """Quartiles of the robustness above which all values are the same to the process, so that a few
 huge ones do not hide the rest. Chosen by hand; no comparison with other values is recorded."""
-
 LARGEST = 1e30  # robustness above which nothing differs: sums of such stay finite in float32
 NO_VERDICT = 2e30  # score of a simulation without a verdict
 FIT_POINTS = 192

@@ -31,11 +31,9 @@ from verifai_jax.search.search_program import compiled_search
 TRIES = 32
 """Maximum number of asks in one round until every row of a search that learns is accepted. Where
 one point in ten is allowed, 32 asks leave a row refused in one of thirty cases."""
-
 MAX_REFUSED = 2000
 """Asks in a row without a single accepted point, after which a run ends: in rounds of 16 these
 are 32 000 points, among which one allowed in ten thousand would be met."""
-
 FILLERS = {
     "gradient": 0.0, "clauses": 0.0, "clause_gradients": 0.0, "coverage_ids": -1, "outcomes": np.nan
 }  # fmt: skip
@@ -120,11 +118,8 @@ class Proposals:
         """Return the next points; none if the constraint refuses all rows of a round.
 
         **Arguments:**
-
         - `max_points`: maximum number of points.
-
         **Returns:** points of the unit cube, `[m, d]`.
-
         **Raises:** `ConstraintError` when the constraint has refused everything for long.
         """
         self.begin_stage()
@@ -149,7 +144,6 @@ class Proposals:
         """Let the search learn from the simulations of the points that `next` gave last.
 
         **Arguments:**
-
         - `rho`: robustness of each point.
         - `valid`: False for simulations without a verdict.
         - `gradient`: the gradient of the smooth robustness, for a search that wants it.

@@ -13,11 +13,9 @@ from verifai_jax.core.cube import Cube
 
 MEMORY = 1 << 16
 """Maximum number of remembered points, the first of a run: later ones are seldom repeated."""
-
 NUDGE = 2.0**-16
 """Greatest distance, in unit coordinates, by which a repeated point is moved. Derivatives there are
 those of the point itself, and float32 tells the two apart."""
-
 TRIES = 16
 """Draws until points are taken though they are repeated: in a space of few points all may be."""
 
@@ -65,13 +63,11 @@ class Repetition:
         """Replace points that were simulated before, or that stand there twice.
 
         **Arguments:**
-
         - `points`: proposals, in the unit cube.
         - `wanted`: which of them will be simulated.
         - `anywhere`: whether any point of the cube may take a turn; otherwise one next to it, but
           for a cube without continuous coordinates, in which nothing is next to a point.
         - `number`: proposals up to these, from which the random numbers follow.
-
         **Returns:** the points to simulate, and those that the search learns of: the same, but the
         proposals themselves where what is simulated lies next to them.
         """

@@ -24,7 +24,6 @@ from verifai_jax.search.base import Asked, PointSequence
 
 BITS = 32
 """Bits of the index of a point: JAX has no wider integers by default."""
-
 MAX_DIMENSIONS = 21201
 """Coordinates for which direction numbers are known: those of Joe and Kuo, which SciPy has."""
 
@@ -44,10 +43,8 @@ class Sobol(PointSequence[SobolState]):
     Sobol' point, 2022).
 
     **Arguments:**
-
     - `scramble`: scramble at random (from the key). `False` is the plain sequence, which does not
       depend on the key.
-
     **Raises:** `ValueError` for a `scramble` that is neither True nor False. `check` raises it for
     more coordinates than there are direction numbers for.
     """

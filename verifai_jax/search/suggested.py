@@ -32,7 +32,6 @@ class Suggested(Wrapper[PyTree]):
     """Another search, to which a function gives points on the way.
 
     **Arguments:**
-
     - `suggest`: called with a question, returns a list of suggestions: features by name, as a
       person writes them, or by the columns of the table. An empty list is no suggestion.
     - `search`: the one that goes on from them; it must learn.
@@ -46,7 +45,6 @@ class Suggested(Wrapper[PyTree]):
     - `context`: whatever else the function should know; for the question alone.
     - `strict`: end the run at a suggestion that cannot be simulated. Otherwise it is left out, the
       notes of the run say so, and so does the next question.
-
     **Raises:** `TypeError` for anything that is neither a function nor a search; `ValueError` for a
     search that does not learn, or numbers out of range.
     """

@@ -50,9 +50,7 @@ class TraceHyper(NamedTuple):
 def first_hyper(width: int) -> TraceHyper:
     """Return the start of the first fit, the mode of the prior."""
     return TraceHyper(
-        jnp.full(width, _mean_length(width), jnp.float32),
-        jnp.asarray(PARTS),
-        jnp.float32(NOISE),
+        jnp.full(width, _mean_length(width), jnp.float32), jnp.asarray(PARTS), jnp.float32(NOISE)
     )
 
 
@@ -141,12 +139,10 @@ def draw(
     """Draw simulators from the posterior.
 
     **Arguments:**
-
     - `count`: the number of simulators.
     - `guess`: whether the first one is the posterior's mean.
     - `spread`: factor on the posterior's standard deviations; more than 1 where the model has been
       too sure of itself. The mean, and the rows that it goes through, stay.
-
     **Returns:** what `basis` needs, and the weights of its terms for each of them.
     """
     n, width = model.x.shape

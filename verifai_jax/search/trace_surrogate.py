@@ -23,13 +23,11 @@ class TraceSurrogate(TraceOptions, Wrapper[TuRBOState]):
     """Model of the traces, monitored and descended on; the real system decides.
 
     **Arguments:**
-
     - `initial`: points of the prior before the model has a say.
     - `share`: the share of the points that the model proposes; the others are those of `TuRBO`.
     - `capacity`: maximum number of rows that the model knows, the best half and the last ones.
     - `starts`: descents for each proposal, the best one of which is simulated.
     - `steps`: steps of a descent.
-
     **Raises:** `ValueError` for values out of range.
     """
 

@@ -63,7 +63,6 @@ class TuRBO(Search[TuRBOState]):
     """Bayesian optimization in a trust region; for 20 coordinates and more.
 
     **Arguments:**
-
     - `capacity`: maximum number of points that the process knows, since the last restart. Of more
       it keeps the best half and a random choice of the others.
     - `candidates`: points of the box among which each drawn function is minimized.
@@ -71,7 +70,6 @@ class TuRBO(Search[TuRBOState]):
     - `successes`: rounds with progress in a row, after which the box doubles.
     - `patience`: points without progress after which it halves, in dimensions of the space; never
       less than four points.
-
     **Raises:** `ValueError` for values out of range.
     """
 

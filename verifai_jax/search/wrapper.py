@@ -35,7 +35,6 @@ class Wrapper(Search[State]):
     """
 
     _internal = frozenset(("inner_state", "learn", "with_inner_state"))
-
     search: Search
 
     def __post_init__(self) -> None:

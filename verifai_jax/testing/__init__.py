@@ -20,6 +20,5 @@ if TYPE_CHECKING:
     from verifai_jax.testing.searches import check_search as check_search
     from verifai_jax.testing.strategies import strategy as strategy
     from verifai_jax.testing.systems import check_system as check_system
-
 # Imported when first used: a folder inside needs few of these names.
 __getattr__, __dir__, __all__ = attach(__name__)

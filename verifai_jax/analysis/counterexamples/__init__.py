@@ -26,5 +26,4 @@ if TYPE_CHECKING:
     from verifai_jax.analysis.counterexamples.shrunk import Shrunk as Shrunk
     from verifai_jax.evaluation.confirmations import Confirmation as Confirmation
     from verifai_jax.evaluation.confirmations import Confirmations as Confirmations
-
 __getattr__, __dir__, __all__ = attach(__name__)

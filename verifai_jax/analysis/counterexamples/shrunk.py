@@ -6,9 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from verifai_jax.analysis.counterexamples.selection import (
-    columns_at,
-)
+from verifai_jax.analysis.counterexamples.selection import columns_at
 from verifai_jax.core.events import Events
 from verifai_jax.core.figure import Drawn
 from verifai_jax.core.notebook import InNotebook

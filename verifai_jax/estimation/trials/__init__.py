@@ -18,5 +18,4 @@ if TYPE_CHECKING:
     from verifai_jax.estimation.trials.policies import compare_trials as compare_trials
     from verifai_jax.estimation.trials.protocol import trial_protocol as trial_protocol
     from verifai_jax.estimation.trials.result import RealTrials as RealTrials
-
 __getattr__, __dir__, __all__ = attach(__name__)

@@ -57,7 +57,6 @@ def fmea(
     """Make the failure table of a system: what each fault does, and how probable that is.
 
     **Arguments:**
-
     - `problem`: a problem, whose own features stay nominal.
     - `faults`: the faults of `vj.faults`, in addition to those that the problem has. Each has to
       have a number at which it is off, such as `duration=vj.Box(0, 2)`.
@@ -75,9 +74,7 @@ def fmea(
     - `executor`: whose workers simulate, as in `falsify`.
     - `target`: `FILE.py:NAME` of the problem with its faults, for the commands that replay.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Returns:** the table, the most probable failure first.
-
     **Raises:** `ValueError` for no fault, one that cannot be off, rates out of range or without a
     mission time; as `Problem.with_faults`.
     """

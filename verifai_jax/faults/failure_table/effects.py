@@ -46,7 +46,6 @@ def effect_of(
     """Return what is known of a fault or a pair, without probabilities.
 
     **Arguments:**
-
     - `run`: with the candidates as rows; `verdicts`: of the confirmation, by row.
     - `faults`: all of them by name.
     """

@@ -109,7 +109,6 @@ class FailureTable(Drawn, InNotebook):
 
     _picture = "failure_table", "plot_failure_table"
     """The probability of each row with its interval."""
-
     name: str
     effects: tuple[Effect, ...]
     run: Run | None = field(repr=False)
@@ -164,7 +163,6 @@ class FailureTable(Drawn, InNotebook):
         """Write the evidence report on the table as HTML, and its claims as JSON.
 
         **Arguments:**
-
         - `path`: the path of the HTML file, which is returned.
         - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`.
         """

@@ -144,7 +144,6 @@ def harden(
     together, is made after the choice, from samples that decided nothing.
 
     **Arguments:**
-
     - `study`: a `Study`, a `Trainer`, or a task. A task says by `start(key, features) -> state` how
       an episode with the features of the problem starts, as tasks of `ode_task` do. A function that
       trains gets the argument `starts`: a list of features, of which each of its episodes takes one
@@ -173,9 +172,7 @@ def harden(
     - `folder`: keeps finished work: the same call goes on where it was interrupted.
     - `even_if_changed`: whether to go on with a folder although files of the model have changed.
     - `progress`: whether to show one line of progress; see `core.progress` for the default.
-
     **Returns:** the result. Ctrl-C ends the call; with `folder` it may be repeated.
-
     **Raises:** before anything is trained, `HardeningError` for a task that cannot start with the
     features; `ValueError` for numbers out of range; as `Trainer.configuration`. `CacheError` for a
     folder of another hardening; `FolderInUse` where another process writes it.

@@ -25,7 +25,6 @@ from verifai_jax.training.sweeps.training_runs import RunCheckpoint
 
 STARTS = 4096
 """Episodes that a function gets to train on: enough that each of 256 neighbourhoods has some."""
-
 AVERAGED = 4
 """Weights that are averaged over the second half of a round's training: those of the last update
 alone fail, and return, more or less by chance. Source: Izmailov et al., Averaging weights leads to

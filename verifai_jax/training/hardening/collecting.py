@@ -63,7 +63,6 @@ def collect(
     """Confirm failures, and make the points to train around of them.
 
     **Arguments:**
-
     - `problem`: the problem of the policy.
     - `failing`: rows that fail, the worst first; `earlier`: points of the rounds before.
     - `seed`, `table`: the seed and the number of samples of the prior.

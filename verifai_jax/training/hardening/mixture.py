@@ -32,7 +32,6 @@ the first fails. At 0.03 what was learnt of wide failures did not reach beyond t
 at 0.3 it was domain randomisation."""
 TRIES = 8
 """Draws of which the first that the constraint accepts is taken."""
-
 Start = Callable[[Key[Array, ""], dict[str, Any]], State]
 """`(key, features) -> state`"""
 Shares = tuple[float, float, float]
@@ -64,7 +63,6 @@ class Mixture:
 
     # JAX rebuilds the class with stacked arrays and placeholders, which have other shapes.
     __no_type_check__ = True
-
     space: FeatureSpace = field(metadata={"static": True})
     shares: Float[Array | np.ndarray, "3"]
     low: Float[Array | np.ndarray, "n d"]
@@ -118,7 +116,6 @@ class MixtureTask:
     """
 
     __no_type_check__ = True
-
     static: StaticTask = field(metadata={"static": True})
     starting: Start | None = field(metadata={"static": True})
     own: tuple[float, ...] | None = field(metadata={"static": True})

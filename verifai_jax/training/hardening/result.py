@@ -55,7 +55,6 @@ class Hardening(Drawn, InNotebook):
 
     _picture = "hardening", "plot_hardening"
     """Failure probability and return of each round."""
-
     problem: str
     table: pd.DataFrame
     added: pd.DataFrame
