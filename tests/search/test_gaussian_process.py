@@ -138,9 +138,10 @@ def test_fitting_finds_the_coordinates_that_matter():
     def posterior(hyper):
         return float(PLAIN.evidence(hyper, seen) + PLAIN.log_prior(hyper))
 
-    assert posterior(fitted) > posterior(first) + 50
-    # Going on from there changes little: the slope is gone.
-    assert abs(posterior(fit(fitted, seen, 60)) - posterior(fitted)) < 2
+    gained = posterior(fitted) - posterior(first)
+    assert gained > 50
+    # Going on from there gains little, by coordinates whose lengths are beyond all distances.
+    assert abs(posterior(fit(fitted, seen, 60)) - posterior(fitted)) < 0.1 * gained
 
 
 @pytest.mark.thorough
