@@ -56,7 +56,8 @@ def translate(program: values.Program) -> str:
     body = "\n".join(lines)
     function = _FUNCTION.replace("@arena", str(arena)).replace("@others", str(OTHERS))
     function = function.replace("@body", body)
-    head = f"#define K {vectors}\nenum {{ PAIR = {min(vectors, 2)} }};"
+    # Before any macro, which a header of the system may have as a name.
+    head = f"#include <pthread.h>\n#define K {vectors}\nenum {{ PAIR = {min(vectors, 2)} }};"
     return "\n".join([head, PRELUDE, _HEAD, *t.code.globals, function])
 
 
@@ -68,7 +69,6 @@ def one(element: values.Element) -> np.ndarray:
 
 
 _HEAD = r"""
-#include <pthread.h>
 extern "C" int posix_memalign(void **, __SIZE_TYPE__, __SIZE_TYPE__);
 extern "C" void free(void *);
 INLINE F column(const float *from, long step, long at, long end) {
