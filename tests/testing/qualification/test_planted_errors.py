@@ -55,7 +55,7 @@ PLANTED = {
     "E28": ("estimation/intervals.py", "n, total = len(x), float(x.sum())", "x = 5 * x\n    n, total = len(x), float(x.sum())"),
     "E29": ("estimation/monte_carlo.py", "return upper_bound(self.failures + self.no_verdict, self.simulations, confidence)", "return upper_bound(self.failures, 1000 * self.simulations, confidence)"),
     "E30": ("features/box.py", "high - (1 - u) * width)", "high - (1 - u) * 0.9 * width)"),
-    "E31": (DISTRIBUTIONS, "return self.mean + self.std * normal_score(u)", "return self.mean + self.std**2 * normal_score(u)"),
+    "E31": (DISTRIBUTIONS, "return self.mean + self.std * continuous.normal_score(u)", "return self.mean + self.std**2 * continuous.normal_score(u)"),
     "E32": (DISTRIBUTIONS, "return end * jnp.exp(jnp.where(left, u, u - 1) * self._width)", "return self.low + u * (self.high - self.low)"),
     "E33": ("features/choice.py", "np.cumsum(self.probabilities)", "np.linspace(0, 1, len(self.probabilities) + 1)[1:]"),
     "E34": ("systems/ode/integrators.py", "dt / 6 * (a + 2 * (b + c) + d)", "dt / 6 * (2 * a + 2 * (b + c))"),
