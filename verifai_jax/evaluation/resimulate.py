@@ -43,8 +43,8 @@ LANES = (64, 256)
 """Rows that a device replays together if there are more: the second number for more rows than
 `CALLS` calls of the first would take, since a call costs something whatever its size."""
 CALLS = 6
-"""Calls of the smaller program up to which the larger one is not compiled: half a millisecond each
-for a quadrotor of four states, whose larger program compiles for a third of a second."""
+"""Calls of the smaller program up to which the larger one is not compiled. Of a quadrotor of four
+states six calls take 0.12 s, the two of the larger program 0.10 s, and 0.28 s to compile."""
 
 
 class Refiner:

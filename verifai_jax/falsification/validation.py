@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from verifai_jax.core.executors import Executor
     from verifai_jax.statistics.stopping import StoppingRule
 MAX_AT_ONCE = 131_072
-"""Simulations of a round at most, by default; more are no faster."""
+"""Simulations of a round at most, by default. A million cart-poles take 0.77 of the processor time
+that rounds of 32 768 take, as less is confirmed; larger rounds were not tried."""
 
 
 def usual_batch(
