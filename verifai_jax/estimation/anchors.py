@@ -178,6 +178,6 @@ def _regions(exploration: Exploration) -> list[Int[np.ndarray, " chains"]]:
 
 
 def weigh_chains(exploration: Exploration) -> Float[np.ndarray, " m"]:
-    """Weigh chains by the prior at their least distant failure, tempered and bounded below."""
+    """Weight chains by the prior at their failure nearest to the origin, bounded below."""
     norms = np.sum(exploration.nearest**2, axis=1)
     return np.maximum(np.exp((norms.min() - norms) / 4), MIN_WEIGHT)

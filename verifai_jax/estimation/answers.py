@@ -78,7 +78,7 @@ class Answer:
 
 
 def chains_for(budget: int, share: float) -> int:
-    """Return the chains of a level that takes this share of the budget, in multiples of 32."""
+    """Return the number of chains for a level with this share of the budget, a multiple of 32."""
     return 32 * max(1, round(budget * share / CHAIN / 32))
 
 

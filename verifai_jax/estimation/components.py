@@ -55,7 +55,7 @@ class Gaussian:
     stds: Float[np.ndarray, " d"]
 
     def widened(self, factor: float) -> "Gaussian":
-        """Return it with standard deviations below the prior's enlarged, up to the prior's."""
+        """Return it with standard deviations below the prior's enlarged towards the prior's."""
         stds = np.where(self.stds < 1, np.minimum(factor * self.stds, 1.0), self.stds)
         return Gaussian(self.mean, self.axes, stds)
 
@@ -201,7 +201,7 @@ def _between(low: np.ndarray, high: np.ndarray, uniform: np.ndarray) -> np.ndarr
 def log_ratios(
     components: Sequence[Component], z: Float[np.ndarray, "n d"]
 ) -> Float[np.ndarray, "n k"]:
-    """Return logarithms of each component's density over the prior's, clipped before they overflow."""
+    """Return logarithms of each component's density over the prior's, clipped to be finite."""
     if not len(z):
         return np.zeros((0, len(components)))
     columns = [np.clip(component.log_ratio(z), -700, 700) for component in components]

@@ -123,7 +123,7 @@ class DoublePrecisionEvaluator:
         return verdicts.lowest, verdicts.violated, verdicts.proper
 
     def begin(self, u: Float[np.ndarray, "n d"]) -> Sent | None:
-        """Send points to the workers of the executor, if there is one, to be waited for later."""
+        """Send points to the executor's workers, if there is one; results are fetched later."""
         return self._evaluator.begin(self._plain(u)) if self._sends else None
 
     def gradient(

@@ -302,7 +302,7 @@ def _steps(
 def fit_shell(
     z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], worth: float = 1.0
 ) -> Shell:
-    """Fit shells to the distances of the points from the origin, in steps narrow in probability."""
+    """Fit shells to the points' distances from the origin, in steps of small probability."""
     from scipy.special import ndtr
 
     score = radial_score(z)

@@ -56,7 +56,7 @@ class Agreement:
 
 
 def proposal_from(exploration: Exploration, rng: np.random.Generator, defensive: float) -> Mixture:
-    """Make a proposal of an exploration's failures: fitted ones, and some around each region."""
+    """Make a proposal from an exploration's failures, with components around each region."""
     weight = weigh_chains(exploration)[exploration.chain_ids]
     fitted = fit_mixture(exploration.points, weight, exploration.chain_ids, rng, defensive)
     return fitted.join(anchors_of([exploration], defensive).fit(), 0.5)

@@ -74,7 +74,7 @@ def approach_origin(
 def come_in_by_parts(
     limit_state: LimitState, rng: np.random.Generator, z: Float[np.ndarray, "n d"]
 ) -> Float[np.ndarray, "n d"]:
-    """Set groups of coordinates to zero, the middle of the prior, as long as the points still fail."""
+    """Set groups of coordinates to zero, the middle of the prior, while the points still fail."""
     return _replace_by_parts(limit_state, rng, z, np.zeros_like(z), z != 0)[0]
 
 

@@ -111,7 +111,7 @@ class Trials(InNotebook):
 
     @property
     def median_simulations(self) -> float:
-        """Median simulations to the first failure, infinite if half of the seeds found none."""
+        """Median simulations to the first failure; infinite if half of the seeds found none."""
         ordered = np.sort(self.first_failure)
         return float((ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2)
 

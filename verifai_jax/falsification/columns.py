@@ -124,7 +124,7 @@ def to_arrow(columns: Columns) -> "pa.RecordBatch":
 
 
 def column_to_arrow(values: Shaped[np.ndarray, " n"]) -> "pa.Array":
-    """Return a column as an Arrow array; texts have type string, with nulls, even if all are null."""
+    """Return a column as an Arrow array; text has type string, with nulls, even if all are null."""
     import pandas as pd
     import pyarrow as pa
 
@@ -136,7 +136,7 @@ def column_to_arrow(values: Shaped[np.ndarray, " n"]) -> "pa.Array":
 
 
 def column_checksum(values: Shaped[np.ndarray, " n"], before: int | None = None) -> int:
-    """Return the checksum of a column, continued from `before`, the checksum of its earlier part."""
+    """Return the checksum of a column, continued from `before`, that of its earlier part."""
     import pandas as pd
 
     if values.dtype == object and len(values) and not isinstance(values[0], str):

@@ -117,7 +117,7 @@ class Learning:
 
     @property
     def distinct(self) -> int | None:
-        """Failures that are far from each other, if the search looks for diverse ones; else None."""
+        """Failures that are far from each other, for a search for diverse ones; else None."""
         return self.proposals.distinct
 
     @property
@@ -128,7 +128,7 @@ class Learning:
         return self.proposals.accepted / max(self.proposals.proposed, 1)
 
     def objective(self, verdicts: Verdicts) -> Float[np.ndarray, " n"]:
-        """Return what the search minimises; with a priority it depends on the rows before."""
+        """Return what the search minimises; with a priority it depends on earlier rows."""
         if self._objective is None:
             return verdicts.lowest
         return self._objective(verdicts.rho, verdicts.rho < 0)
@@ -234,7 +234,7 @@ class Learning:
         self.proposals.warm_start(points, rho)
 
     def checkpoint(self) -> dict[str, Any]:
-        """Return all that was learned as entries of a checkpoint, without the state of the search."""
+        """Return what was learned as entries of a checkpoint, without the search's state."""
         weighed = self._likelihood or self._objective
         state = {} if weighed is None else weighed.state
         entries: dict[str, Any] = {f"objective.{name}": value for name, value in state.items()}

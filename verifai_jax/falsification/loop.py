@@ -329,7 +329,7 @@ class Rounds:
 
     @property
     def hopeless(self) -> str | None:
-        """The message of all simulations if they all raised, so that more are pointless; else None."""
+        """The message that all simulations raised, which makes more pointless; else None."""
         measured = self._simulations.hopeless
         return self._raising.reason if measured is None else measured
 

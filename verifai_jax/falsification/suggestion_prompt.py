@@ -167,7 +167,7 @@ def _signals(seen: Replay) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """Convert to JSON types: no NumPy or JAX values, numbers with six digits, None if not finite."""
+    """Convert to JSON types; numbers have six digits, and are None if not finite."""
     if isinstance(value, Mapping):
         return {str(name): plain(each) for name, each in value.items()}
     if isinstance(value, list | tuple):

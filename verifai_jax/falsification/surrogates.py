@@ -242,7 +242,7 @@ class Surrogate:
 
 
 class Descents:
-    """The compiled programs of a problem: the fit, and descents on simulators drawn from the model."""
+    """The compiled programs of a problem: the fit, and descents on simulators drawn from it."""
 
     def __init__(self, problem: Problem, options: TraceOptions) -> None:
         self.end: End = problem.end

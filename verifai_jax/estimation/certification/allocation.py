@@ -116,7 +116,7 @@ class Allocation:
         simulations: Int[np.ndarray, " n"],
         margins: Float[np.ndarray, " n"] | None = None,
     ) -> Int[np.ndarray, " n"]:
-        """Return the blocks to simulate of each policy; all zero once nothing more can be decided.
+        """Return how many blocks to simulate for each policy; all zero if nothing is left open.
 
         - `margins`: numbers that decide between equal leaders; see `find_leader`.
         """

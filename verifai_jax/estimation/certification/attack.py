@@ -51,7 +51,7 @@ class PolicyRecord:
         self.not_finite += int(np.sum(~verdicts.proper))
 
     def take_out(self, block: int, index: int) -> None:
-        """Remove a row from the counterexamples and the least robustness, but not from the counts."""
+        """Remove a row from the counterexamples and the least robustness, not from the counts."""
         verdicts = self.verdicts[block]
         rho, violated = verdicts.rho.copy(), verdicts.violated.copy()
         rho[index], violated[index] = np.nan, False

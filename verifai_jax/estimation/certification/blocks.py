@@ -172,7 +172,7 @@ class Blocks:
     def attack(
         self, chosen: Sequence[tuple[int, np.ndarray]], round_: int, search: str
     ) -> Iterator[tuple[int, Verdicts]]:
-        """Yield verdicts of points that a search chose for each policy, by indices in `chosen`."""
+        """Yield verdicts of each policy's points that a search chose; `chosen` holds indices."""
         blocks = [
             Block(
                 policy, points, round_ * self.lanes,

@@ -37,7 +37,7 @@ MAX_KEPT = 64
 
 
 class ExecutorSimulator:
-    """Policies of one structure, or each by itself, on workers; see the module's docstring.
+    """A simulator on workers, for one or more policies of one structure; see the module.
 
     **Arguments:**
     - `shipment`: the pickled code for the workers, with `problem_of`.

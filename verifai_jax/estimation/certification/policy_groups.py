@@ -64,7 +64,7 @@ def is_numeric(policy: Any) -> bool:
 
 
 def padded(policy: Any) -> Any:
-    """Return a policy with NumPy leaves, hidden layers of a `Policy` at the shared width."""
+    """Return a policy with NumPy leaves and hidden layers padded to the shared width."""
     policy = jax.tree.map(_on_host, policy)
     if not isinstance(policy, Policy):
         return policy

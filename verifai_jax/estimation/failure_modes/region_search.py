@@ -94,7 +94,7 @@ def share_explained(
     z: Float[np.ndarray, "n d"],
     share: Float[np.ndarray, " n"],
 ) -> tuple[int, int]:
-    """Draw failures; return how many a path of failures joins to a region, and how many were drawn."""
+    """Draw failures; return the number that a path joins to a region, and the total."""
     count = min(LOOKED_AT, max(2, limit_state.left // A_LOOK))
     _, joined = _look(limit_state, rng, regions, z, share, count)
     return int(joined.sum()), len(joined)

@@ -73,7 +73,7 @@ class RealTrials(InNotebook):
         return self.table[[verdict is not None for verdict in self.table["failed"]]]
 
     def rules(self, **options: Any) -> "Rules":
-        """Describe with a few boxes of the features where the simulation is wrong; see `vj.rules`.
+        """Describe with a few boxes where the simulation is wrong; see `analysis.rules`.
 
         **Arguments:**
         - `options`: the options of `analysis.rules`.
