@@ -185,7 +185,7 @@ _ENTRIES = 20_000_000
 
 
 def tightest(coordinates: Float[np.ndarray, "n p"], codes: Int[np.ndarray, "n m"], k: int) -> int:
-    """Return the index of a row whose `k` nearest, itself included, have the least summed distance.
+    """Return the index of the row whose `k` nearest, including itself, have the least sum.
 
     The squared distance is that of the coordinates plus the number of differing codes.
     """

@@ -45,7 +45,7 @@ class EventTables:
 
     @cached_property
     def widths(self) -> tuple[int, ...]:
-        """Coordinates of an event: one for its kind, those of its wait and of each parameter."""
+        """Numbers of coordinates of an event: 1 for its kind, those of its wait and parameters."""
         waits = max(each.wait.size for each in self.transitions)
         others = [max(domain.size for domain in group) for group in self.domains.values()]
         return (1, waits, *others)

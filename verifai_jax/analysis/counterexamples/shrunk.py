@@ -24,8 +24,8 @@ class Step(NamedTuple):
 
 
 class LogDensities(NamedTuple):
-    """Natural logarithms of the prior's density: of a failure, of the row at which its search
-    began, and of the likeliest features.
+    """Natural logarithms of the prior's density: at a failure, at the row where its search
+    started, and at the likeliest features.
     """
 
     failure: float
