@@ -9,8 +9,8 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax import faults
-from verifai_jax.core.fingerprint import programs_in
-from verifai_jax.core.trace import Status
+from verifai_jax.core.compute.fingerprint import programs_in
+from verifai_jax.core.values.trace import Status
 from verifai_jax.faults.kinds import KINDS as KINDS_OF_FAULTS
 
 DT, STEPS = 0.1, 30

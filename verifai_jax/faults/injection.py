@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PyTree
 
-from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.messages.errors import unknown_name
 from verifai_jax.faults.chance import uniform
 from verifai_jax.faults.fault import AtMost, Fault, Moment
 from verifai_jax.faults.kinds import WrongChannel

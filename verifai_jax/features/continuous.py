@@ -15,7 +15,7 @@ from jax.scipy.special import ndtri
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, PyTree
 
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.features.domain import (
     MAX_REAL,
     MIN_REAL,
@@ -73,7 +73,7 @@ class Continuous(Domain):
 
     @property
     def closed(self) -> str:
-        """Which ends of the support are values, as in `Box`."""
+        """The ends of the support that are values, as in `Box`."""
         return "both"
 
     def log_density(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:

@@ -15,8 +15,8 @@ import numpy as np
 import pandas as pd
 
 from verifai_jax.analysis.counterexamples.selection import Row
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.evaluation.backends import Engines, resolved
 from verifai_jax.evaluation.confirmations import Confirmation, Confirmations, Repetitions
 from verifai_jax.evaluation.confirmer import Confirmer
@@ -67,7 +67,7 @@ def confirm(
     - `max_rows`: minimum number of rows to replay, by default 256; more if a row takes few replays.
       If there are more counterexamples, the worst and those nearest to zero are replayed, until the
       rest is far from zero (see `evaluation.confirmer.Confirmer`).
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** a `Confirmation` for a row, `Confirmations` for all; after Ctrl-C those that are
     finished.
     **Raises:** `ValueError` for a run without its problem, a row that is not a counterexample, or

@@ -10,8 +10,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from verifai_jax.core.notebook import InNotebook, frame_html
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.display.notebook import InNotebook, frame_html
+from verifai_jax.core.messages.text import format_percent
 
 if TYPE_CHECKING:
     import pandas as pd

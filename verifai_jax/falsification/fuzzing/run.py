@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from verifai_jax.core.text import printable
+from verifai_jax.core.messages.text import printable
 from verifai_jax.falsification.coverage_counts import SEEN
 from verifai_jax.falsification.fuzzing.coverage import FuzzCoverage
 from verifai_jax.falsification.run import Run
@@ -24,7 +24,7 @@ class FuzzRun(Run):
 
     @cached_property
     def coverage(self) -> FuzzCoverage:
-        """What the run covered, and how much of it there is to cover.
+        """The coverage: what the run covered, and how much there is to cover.
 
         **Raises:** `ValueError` for a run without its problem or its counts.
         """

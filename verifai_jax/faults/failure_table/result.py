@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.notebook import InNotebook, frame_html
-from verifai_jax.core.text import format_percent, format_seconds
+from verifai_jax.core.display.figure import Drawn
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.display.notebook import InNotebook, frame_html
+from verifai_jax.core.messages.errors import check_names
+from verifai_jax.core.messages.text import format_percent, format_seconds
+from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.falsification.run import Run
 
 if TYPE_CHECKING:

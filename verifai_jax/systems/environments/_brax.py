@@ -16,8 +16,8 @@ from typing import Any, ClassVar
 import jax
 from jaxtyping import Array, Int, Key, PyTree
 
-from verifai_jax.core.compilation import XlaOptimization
-from verifai_jax.core.errors import require, suggests_options, unknown_name
+from verifai_jax.core.compute.compilation import XlaOptimization
+from verifai_jax.core.messages.errors import require, suggests_options, unknown_name
 from verifai_jax.systems.base import Features
 from verifai_jax.systems.delays import DelayOption
 from verifai_jax.systems.environments import brax_model
@@ -42,7 +42,7 @@ class Brax(PolicyLoop):
 
     @property
     def effort(self) -> XlaOptimization:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Effort of XLA: with `little` the generalized backend compiles sooner and runs as fast."""
+        """Effort of XLA: with `little` the generalized backend compiles sooner, runs as fast."""
         backend = getattr(self.env.unwrapped, "_backend", None)
         return "little" if backend == "generalized" else "most"
 
