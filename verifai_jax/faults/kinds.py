@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import PyTree
 
 from verifai_jax.faults.chance import normal
-from verifai_jax.faults.fault import Fault, Moment, Number, Vector, ends, number
+from verifai_jax.faults.fault import Fault, Moment, Number, Vector, number
 from verifai_jax.faults.smoothing import straight
-from verifai_jax.systems.delays import entry, line_of, moved_up
+from verifai_jax.systems.delays import entry, moved_up
 
 
 class Dropout(Fault):
@@ -51,7 +51,7 @@ class HeldAction(Fault, severity="hold", holds=True):
         return held, held
 
 
-class Delay(Fault, severity="seconds"):
+class Delay(Fault, severity="seconds", late=("seconds", "swing")):
     """The channel is `seconds` late, in whole periods.
 
     It swings by `swing` seconds up and down once in `cycle` seconds.
@@ -61,22 +61,16 @@ class Delay(Fault, severity="seconds"):
     swing: Number = number(0, default=0.0)
     cycle: Number = number(1e-9, default=1.0)
 
-    def memory(self, zero: Vector, period: float) -> PyTree:
-        return _line(zero, (ends(self.seconds)[1] + ends(self.swing)[1]) / period)
-
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         number = at.number
         turn = at.xp.sin(2 * math.pi * at.time / number["cycle"])
         return _late(good, memory, number["seconds"] + number["swing"] * turn, at)
 
 
-class ClockJitter(Fault, severity="jitter", draws=True):
+class ClockJitter(Fault, severity="jitter", draws=True, late=("jitter",)):
     """Each value is late by a random time up to `jitter` seconds, in whole periods."""
 
     jitter: Number = number(0)
-
-    def memory(self, zero: Vector, period: float) -> PyTree:
-        return _line(zero, ends(self.jitter)[1] / period)
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         return _late(good, memory, at.uniform(1)[0] * at.number["jitter"], at)
@@ -189,17 +183,6 @@ class WrongChannel(Fault):
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         assert at.other is not None
         return at.other, memory
-
-
-KINDS: tuple[type[Fault], ...] = (
-    Delay, Dropout, Freeze, Bias, Drift, Noise, Spikes, Quantisation, Saturation, Stuck,
-    LossOfAuthority, HeldAction, PacketLoss, ClockJitter, SignFlip, WrongChannel,
-)  # fmt: skip
-"""All kinds."""
-
-
-def _line(zero: Vector, periods: float) -> Any:
-    return line_of(zero, math.ceil(periods - 1e-6) + 1)
 
 
 def _late(good: Vector, line: Any, seconds: Any, at: Moment) -> tuple[Vector, Any]:

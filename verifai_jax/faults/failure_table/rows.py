@@ -12,7 +12,7 @@ from verifai_jax.core.store.cache import Cache
 from verifai_jax.estimation import estimate
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.falsification import falsify
-from verifai_jax.faults.failure_table.effects import Found
+from verifai_jax.faults.failure_table.result import Effect
 from verifai_jax.faults.fault import Fault
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
@@ -68,8 +68,11 @@ class Rows:
         known = self.cache.remember(f"{what}/{zlib.crc32(points.tobytes())}", simulated)
         return known["violated"], known["proper"]
 
-    def try_out(self, names: tuple[str, ...], samples: int, budget: int) -> Found:
-        """Sample a fault or a pair, search where few samples fail, and lower what fails."""
+    def try_out(self, names: tuple[str, ...], samples: int, budget: int) -> tuple[Effect, Points]:
+        """Sample a fault or a pair, search where few samples fail, and lower what fails.
+
+        **Returns:** the effect as far as it is known, and failing points, the least severe first.
+        """
         points = np.repeat(self.nominal.u[None], samples, axis=0)
         for name in names:
             points[:, self.groups[name]] = self.rng.random((samples, len(self.groups[name])))
@@ -80,25 +83,25 @@ class Rows:
             failing = np.concatenate([failing, self._searched(names, budget)])
         if len(failing):
             failing = self._lowered(names, failing)
-        return Found(names, failing, int(violated.sum()), int((~proper).sum()), samples)
+        fails, failures = len(failing) > 0, int(violated.sum())
+        return Effect(names, fails, failures, samples, int((~proper).sum())), failing
 
-    def probability(self, found: Found, confidence: float, budget: int) -> Float[np.ndarray, "3"]:
+    def probability(self, effect: Effect, confidence: float, budget: int) -> Float[np.ndarray, "3"]:
         """Return the interval and the probability of a failure, given that the faults happen."""
-        rate = clopper_pearson(found.failures, found.simulations, confidence, found.without)
-        enough = not len(found.candidates) or found.failures >= FEW
-        if enough or not budget or len(found.faults) > 1:
+        rate = clopper_pearson(effect.failures, effect.simulations, confidence, effect.undecided)
+        enough = not effect.fails or effect.failures >= FEW
+        if enough or not budget or len(effect.faults) > 1:
             return np.array([rate.low, rate.high, rate.estimate])
 
         def estimated() -> dict[str, np.ndarray]:
             seen = estimate(
-                self.problem.only(*found.faults), budget=2 * budget, confidence=confidence,
+                self.problem.only(*effect.faults), budget=2 * budget, confidence=confidence,
                 seed=self.seed, progress=False, executor=self.executor,
             )  # fmt: skip
             chance = rate.estimate if seen.probability is None else seen.probability
             return {"interval": np.array([seen.low, seen.high, chance])}
 
-        name = f"estimate/{'+'.join(found.faults)}/{confidence}"
-        return self.cache.remember(name, estimated)["interval"]
+        return self.cache.remember(f"estimate/{effect.name}/{confidence}", estimated)["interval"]
 
     def _searched(self, names: Sequence[str], budget: int) -> Points:
         """Return the worst failing points that a search finds."""

@@ -15,7 +15,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from verifai_jax.core.figure import Drawn
-from verifai_jax.core.notebook import InNotebook, frame_html
+from verifai_jax.core.notebook import Tabular
 from verifai_jax.core.store.files import replacing_all
 from verifai_jax.core.store.locks import write_lock
 from verifai_jax.core.text import format_percent
@@ -32,7 +32,7 @@ FILES = ("added.parquet", "summary.txt", "start.npz", "policy.npz", "table.parqu
 
 
 @dataclass(frozen=True, eq=False)
-class Hardening(Drawn, InNotebook):
+class Hardening(Drawn, Tabular):
     """The result of `harden`.
 
     - `problem`: name of the problem.
@@ -156,9 +156,6 @@ class Hardening(Drawn, InNotebook):
                 else:
                     policy.save(made / f"{name}.npz")
         return path
-
-    def _notebook_parts(self) -> list[str]:
-        return [frame_html(self.table)]
 
     def __str__(self) -> str:
         return self.summary()
