@@ -85,7 +85,7 @@ class SpecFile(pytest.File):
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         """Write an error of loading the file in its one line."""
-        from verifai_jax.core.targets import TargetError
+        from verifai_jax.core.user_code.targets import TargetError
 
         if isinstance(excinfo.value, TargetError):
             return _clean(str(excinfo.value))
@@ -177,7 +177,7 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, Any, pytest.
 
 
 def _clean(text: str) -> str:
-    from verifai_jax.core.text import printable
+    from verifai_jax.core.messages.text import printable
 
     return printable(text)
 

@@ -27,7 +27,7 @@ from jaxtyping import Float
 
 import verifai_jax as vj
 from benchmarks.arch import BUDGETS, requirements
-from verifai_jax.core.waveform import Waveform, control_times
+from verifai_jax.core.values.waveform import Waveform, control_times
 
 COLUMNS = (
     "system",

@@ -23,7 +23,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 from scipy.stats import norm, qmc
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import Bayes, Observations
 
 RAISED = 10.0

@@ -31,7 +31,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 import verifai_jax as vj
 from envs import cartpole
 from specs import ball, hopper, mujoco_cartpole
-from verifai_jax.core.keys import run_keys, simulation_key
+from verifai_jax.core.compute.keys import run_keys, simulation_key
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.differentiation import Derivative
 from verifai_jax.evaluation.engine import Engine, engine_for

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from verifai_jax.core.clauses import CLAUSES
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.clauses import CLAUSES
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.mtl.clauses import ABSENT
 from verifai_jax.search import Observations
 

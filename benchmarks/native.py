@@ -23,7 +23,7 @@ from throughput import GAINS, PERIOD, RANGES, STEPS, THETA_LIMIT, X_LIMIT
 
 import verifai_jax as vj
 from envs import cartpole
-from verifai_jax.core.keys import run_keys
+from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.evaluation.engine import engine_for
 from verifai_jax.evaluation.native_engine import FIRST, NativeEngine
 

@@ -26,8 +26,8 @@ import verifai_jax as vj
 from envs import cones
 from envs.train_cones import SPACES
 from specs import cones as specs
-from verifai_jax.core.devices import enable_compile_cache
-from verifai_jax.core.errors import require
+from verifai_jax.core.compute.devices import enable_compile_cache
+from verifai_jax.core.messages.errors import require
 
 FRAMES = 1024
 SIZES = ((24, 48), (48, 96))

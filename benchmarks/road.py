@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from specs import road, tempe
-from verifai_jax.core.keys import run_keys
+from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.evaluation.engine import engine_for
 
 PROBLEMS = (

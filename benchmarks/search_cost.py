@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import verifai_jax as vj
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import Observations
 
 CUBE = Cube((0, 0, 0, 0))

@@ -21,7 +21,7 @@ import numpy as np
 from landscapes import LANDSCAPES, tell_of
 
 import verifai_jax as vj
-from verifai_jax.core.targets import load_target
+from verifai_jax.core.user_code.targets import load_target
 
 BATCH = {"uniform": 512, "halton": 512, "sobol": 512, "gradient": 8, "bayes": 8}
 ACTIVE_BATCH = 16

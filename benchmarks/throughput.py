@@ -20,7 +20,7 @@ import numpy as np
 
 import verifai_jax as vj
 from envs import cartpole
-from verifai_jax.core.keys import run_keys
+from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.evaluation.engine import engine_for
 
 STEPS, PERIOD = 200, 0.02

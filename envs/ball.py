@@ -15,7 +15,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from verifai_jax.core.errors import check_names
+from verifai_jax.core.messages.errors import check_names
 from verifai_jax.systems.mujoco.loop import State
 from verifai_jax.systems.mujoco.system import MuJoCo, mujoco
 

@@ -27,7 +27,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from envs.randomisation import check_ranges, factor
-from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.messages.errors import unknown_name
 from verifai_jax.rl import Discrete, Policy, load_policy
 from verifai_jax.rl.algorithm import Number
 from verifai_jax.rl.policy import Layers, scalar_network

@@ -22,8 +22,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from verifai_jax.core.errors import unknown_name
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.messages.errors import unknown_name
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.features import Array as ArrayOf
 from verifai_jax.features import Box, Categorical
 from verifai_jax.perception import Box as BoxSolid

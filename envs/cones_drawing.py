@@ -60,7 +60,7 @@ def film_strip(
 
     **Returns:** the figure.
     """
-    from verifai_jax.core.figure import new_figure
+    from verifai_jax.core.display.figure import new_figure
 
     nearest = int(np.argmin(np.asarray(trace["cone_gap"])))
     samples = np.unique(np.linspace(0, max(nearest, 1), count).round().astype(int))

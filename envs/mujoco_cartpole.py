@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from envs import cartpole as analytic
-from verifai_jax.core.errors import check_names
+from verifai_jax.core.messages.errors import check_names
 from verifai_jax.systems.mujoco.loop import State
 from verifai_jax.systems.mujoco.system import MuJoCo, mujoco
 

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from verifai_jax.core.errors import check_names
+from verifai_jax.core.messages.errors import check_names
 from verifai_jax.rl import Continuous, Policy, load_policy
 from verifai_jax.rl.task.mjx import MjxState, MjxTask, mjx_task
 from verifai_jax.systems.mujoco.bindings import Scaled

@@ -27,13 +27,13 @@ PACKAGE = Path(__file__).parents[1] / "verifai_jax"
 
 CHECKED_ROOMS: list[str] = [
     "analysis",
-    "core.callbacks",
-    "core.cube",
-    "core.devices",
-    "core.keys",
-    "core.loggers",
-    "core.trace",
-    "core.waveform",
+    "core.user_code.callbacks",
+    "core.values.cube",
+    "core.compute.devices",
+    "core.compute.keys",
+    "core.store.loggers",
+    "core.values.trace",
+    "core.values.waveform",
     "estimation",
     "falsification",
     "features",
@@ -83,7 +83,7 @@ check_first_calls()
 install_import_hook([*checked_modules()], "checked_types.check")
 
 import verifai_jax  # noqa: E402 - before any test starts JAX's backend, as users should
-from verifai_jax.core import figure  # noqa: E402
+from verifai_jax.core.display import figure  # noqa: E402
 
 _plain_figure = figure._figure_class
 

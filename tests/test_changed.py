@@ -14,7 +14,7 @@ def test_a_file_calls_for_its_room_and_for_those_that_import_it():
 def test_importers_go_through_others():
     found = importers(["verifai_jax.statistics.binomial"])
     assert {"verifai_jax.statistics.binomial", "verifai_jax.falsification.summary"} <= found
-    assert "verifai_jax.core.trace" not in found
+    assert "verifai_jax.core.values.trace" not in found
 
 
 def test_a_file_that_is_gone_calls_for_all_that_its_room_does():

@@ -132,4 +132,4 @@ def test_the_site_is_built_strictly(tmp_path):
         command, capture_output=True, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"}
     )
     assert done.returncode == 0, done.stderr.decode()
-    assert "Fuzz" in (tmp_path / "reference" / "fuzzing.html").read_text()
+    assert "Fuzz" in (tmp_path / "reference" / "falsification.html").read_text()

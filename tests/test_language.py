@@ -114,7 +114,7 @@ def test_arguments_have_types(package):
 
 def test_one_file_calls_shard_map():
     calls = [file for file in FILES if "shard_map(" in file.read_text()]
-    assert calls == [PACKAGE / "core" / "devices.py"]
+    assert calls == [PACKAGE / "core" / "compute" / "devices.py"]
 
 
 def test_modules_hidden_by_a_function_of_their_name():

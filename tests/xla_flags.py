@@ -5,7 +5,7 @@
 XLA ends every process that gets a flag it does not know, so none is written down in the Makefile.
 """
 
-from verifai_jax.core.compilation import known_options
+from verifai_jax.core.compute.compilation import known_options
 
 QUICK = {
     # The older emitters of loops compile in a quarter to a third less processor time (JAX 0.10 has

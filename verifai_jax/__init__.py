@@ -3,9 +3,9 @@
 from typing import TYPE_CHECKING
 
 from verifai_jax._version import __version__ as __version__
-from verifai_jax.core.cores import claim_cores as _claim_cores
-from verifai_jax.core.lazy import attach as _attach
-from verifai_jax.core.reads import watch as _watch
+from verifai_jax.core.compute.cores import claim_cores as _claim_cores
+from verifai_jax.core.display.lazy import attach as _attach
+from verifai_jax.core.user_code.reads import watch as _watch
 
 if TYPE_CHECKING:
     from verifai_jax import analysis as analysis
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
         replay_counterexamples as replay_counterexamples,
     )
     from verifai_jax.analysis.counterexamples import shrink as shrink
-    from verifai_jax.core.loggers import CSVLogger as CSVLogger
-    from verifai_jax.core.loggers import TensorBoardLogger as TensorBoardLogger
-    from verifai_jax.core.trace import Status as Status
-    from verifai_jax.core.trace import Trace as Trace
-    from verifai_jax.core.waveform import Waveform as Waveform
+    from verifai_jax.core.store.loggers import CSVLogger as CSVLogger
+    from verifai_jax.core.store.loggers import TensorBoardLogger as TensorBoardLogger
+    from verifai_jax.core.values.trace import Status as Status
+    from verifai_jax.core.values.trace import Trace as Trace
+    from verifai_jax.core.values.waveform import Waveform as Waveform
     from verifai_jax.estimation import Estimate as Estimate
     from verifai_jax.estimation import SequenceEstimate as SequenceEstimate
     from verifai_jax.estimation import estimate as estimate

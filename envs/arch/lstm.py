@@ -27,9 +27,9 @@ from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
 from envs.arch.stepped import real, value
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.trace import Trace
-from verifai_jax.core.waveform import set_durations
+from verifai_jax.core.messages.errors import check_names
+from verifai_jax.core.values.trace import Trace
+from verifai_jax.core.values.waveform import set_durations
 from verifai_jax.systems.base import Seed, System
 
 STEPS = 24

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PyTree
 
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.trace import Status, Trace
-from verifai_jax.core.waveform import set_durations
+from verifai_jax.core.messages.errors import check_names
+from verifai_jax.core.values.trace import Status, Trace
+from verifai_jax.core.values.waveform import set_durations
 from verifai_jax.systems.base import Carry, Seed, System
 from verifai_jax.systems.checkpointing import checkpointed_scan
 from verifai_jax.systems.ode.integrators import check_factor

@@ -19,7 +19,7 @@ from envs.road.bodies import CAR, PERSON, TRUCK, VAN, Body, Pose, gap, sight
 from envs.road.cars import WHEELBASE, Car, bicycle, held_at_rest, steering
 from envs.road.driving import Driver, cruise_control, equilibrium_gap, idm, lane_change, mobil
 from envs.road.paths import Path
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.values.waveform import Waveform
 from verifai_jax.systems.ode import Ode, ode
 
 Features = Mapping[str, Any]

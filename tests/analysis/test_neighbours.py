@@ -7,7 +7,7 @@ from checked_types import unchecked
 from verifai_jax.analysis import neighbours as module
 from verifai_jax.analysis.data.samples import Samples
 from verifai_jax.analysis.neighbours import k_closest, nearest, random_rows
-from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.messages.errors import UnknownNameError
 
 
 def table(kind, n=120, seed=0):

@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from verifai_jax.cli.main import main
-from verifai_jax.core import progress
+from verifai_jax.core.display import progress
 
 SPEC = """
 import numpy as np

@@ -503,7 +503,8 @@ def test_list_where_problems_are_elsewhere(call, tmp_path, monkeypatch):
 
 def test_a_missing_extra_is_one_line(call, tmp_path):
     (tmp_path / "specs" / "robot.py").write_text(
-        "from verifai_jax.core.errors import require\nrequire('no_such_engine', extra='engine')\n"
+        "from verifai_jax.core.messages.errors import require\n"
+        "require('no_such_engine', extra='engine')\n"
     )
     told = "no_such_engine is not installed: pip install 'verifai_jax[engine]'"
     assert call("falsify", "specs/robot.py:walk", code=2) == f"Error: {told}\n"

@@ -7,7 +7,7 @@ from click.testing import CliRunner
 from verifai_jax.cli.exit_codes import CommandError
 from verifai_jax.cli.main import main
 from verifai_jax.cli.monitor import monitor_stream
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import parse, robustness, satisfied
 
 LINES = ["time,dist,p[0],p[1]", "0,5,3,4", "0.5,3,0,0", "1,0,1,1", "1.5,-2,1,1", "2,7,1,1"]

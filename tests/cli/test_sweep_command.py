@@ -10,9 +10,9 @@ from click.testing import CliRunner
 from drifting import quick_certificates
 
 from verifai_jax.cli.main import main
-from verifai_jax.core import progress
+from verifai_jax.core.display import progress
 from verifai_jax.core.store.cache import Cache
-from verifai_jax.core.targets import TargetError, definitions, load_target
+from verifai_jax.core.user_code.targets import TargetError, definitions, load_target
 from verifai_jax.training.sweeps import Study
 from verifai_jax.training.sweeps import running as driver
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.text import (
+from verifai_jax.core.messages.text import (
     folder_name,
     format_error,
     format_features,

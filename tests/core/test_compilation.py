@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from verifai_jax.core import compilation
-from verifai_jax.core.compilation import (
+from verifai_jax.core.compute import compilation
+from verifai_jax.core.compute.compilation import (
     compile_soon,
     describe_compilation,
     tracing,
     while_compiling,
 )
-from verifai_jax.core.keys import run_keys
+from verifai_jax.core.compute.keys import run_keys
 
 
 class Slow:

@@ -46,7 +46,7 @@ def test_a_full_disk_keeps_no_halves_of_programs(tmp_path):
     code = (
         "import shutil, types, jax\n"
         "shutil.disk_usage = lambda _: types.SimpleNamespace(free=1000)\n"
-        "from verifai_jax.core.devices import enable_compile_cache\n"
+        "from verifai_jax.core.compute.devices import enable_compile_cache\n"
         "enable_compile_cache()\n"
         "print(jax.config.jax_compilation_cache_dir)\n"
     )
@@ -63,10 +63,10 @@ def test_compiled_programs_outlive_the_process(tmp_path):
         "p = vj.Problem('p', space={'a': vj.Box(0, 1)}, system=system, spec='always x < 2')\n"
         "vj.falsify(p, 'uniform', 10, batch=10)\n"
     )
-    from verifai_jax.core import devices
+    from verifai_jax.core.compute import devices
 
     done = run(
-        "import verifai_jax.core.devices as d, jax\n"
+        "import verifai_jax.core.compute.devices as d, jax\n"
         "d.enable_compile_cache()\n"
         "jax.config.update('jax_persistent_cache_min_compile_time_secs', 0.0)\n" + code,
         VERIFAI_JAX_CACHE=str(tmp_path),

@@ -9,8 +9,8 @@ import jaxlib.version
 import numpy as np
 import pytest
 
-from verifai_jax.core import factorizations
-from verifai_jax.core.factorizations import avoid_deadlock
+from verifai_jax.core.compute import factorizations
+from verifai_jax.core.compute.factorizations import avoid_deadlock
 
 GENERAL = np.random.default_rng(0).normal(size=(7, 70, 70))
 SYMMETRIC = GENERAL @ np.swapaxes(GENERAL, 1, 2) + 70 * np.eye(70)

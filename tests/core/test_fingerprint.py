@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from verifai_jax.core.fingerprint import fingerprint, identity
+from verifai_jax.core.compute.fingerprint import fingerprint, identity
 from verifai_jax.search import CrossEntropy, Portfolio
 
 X = jax.ShapeDtypeStruct((3,), jnp.float32)
@@ -123,7 +123,7 @@ def test_plain_values_have_an_identity():
 
 PRINTED = """
 from tests.core.test_fingerprint import TABLE, of, scaled
-from verifai_jax.core.fingerprint import identity
+from verifai_jax.core.compute.fingerprint import identity
 from verifai_jax.search import Portfolio
 print(of(scaled(TABLE)), identity(Portfolio(), {"b": 1, "a": 2.5}, frozenset("xyz")))
 """

@@ -7,7 +7,7 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.mtl import online, read, resample, robustness, satisfied
 from verifai_jax.remote_client import encoded
 from verifai_jax.systems.remote.wire import Frames, trace_of

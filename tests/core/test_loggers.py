@@ -7,8 +7,8 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
-from verifai_jax.core.callbacks import check_callbacks, notify
-from verifai_jax.core.loggers import crc32c
+from verifai_jax.core.store.loggers import crc32c
+from verifai_jax.core.user_code.callbacks import check_callbacks, notify
 
 
 def test_a_csv_file_gets_columns_as_they_come_and_is_continued(tmp_path):

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import verifai_jax as vj
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.layout import chunks_and_lanes

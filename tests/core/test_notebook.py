@@ -58,7 +58,7 @@ def test_results_show_themselves(problem, run):
 def test_results_of_every_verb_show_themselves():
     from verifai_jax import analysis, synthesis
     from verifai_jax.analysis import counterexamples
-    from verifai_jax.core.notebook import InNotebook
+    from verifai_jax.core.display.notebook import InNotebook
     from verifai_jax.estimation.certification.result import Certificate
     from verifai_jax.estimation.comparison.result import Transfer
     from verifai_jax.estimation.sequence_result import SequenceEstimate

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.precision import in_precision, truncate_silently
+from verifai_jax.core.compute.precision import in_precision, truncate_silently
 
 
 def double(features, key):

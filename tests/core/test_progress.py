@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core import progress
-from verifai_jax.core.progress import (
+from verifai_jax.core.display import progress
+from verifai_jax.core.display.progress import (
     SimulationProgress,
     count_done,
     has_viewer,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.keys import run_keys
-from verifai_jax.core.remembered import lower_or_recall, remembered_as
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.compute.remembered import lower_or_recall, remembered_as
 from verifai_jax.evaluation.differentiation import Derivative
 from verifai_jax.evaluation.engine import Engine
 

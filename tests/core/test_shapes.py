@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from verifai_jax.core.compilation import pad_rows, power_of_two
+from verifai_jax.core.compute.compilation import pad_rows, power_of_two
 
 
 @pytest.mark.parametrize(

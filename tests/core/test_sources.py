@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.revisions import load_at_revision
-from verifai_jax.core.source_collection import files_of_model, scan
-from verifai_jax.core.source_objects import is_user_file
-from verifai_jax.core.sources import Sources, file_hash, list_changes
-from verifai_jax.core.targets import load_target
+from verifai_jax.core.user_code.revisions import load_at_revision
+from verifai_jax.core.user_code.source_collection import files_of_model, scan
+from verifai_jax.core.user_code.source_objects import is_user_file
+from verifai_jax.core.user_code.sources import Sources, file_hash, list_changes
+from verifai_jax.core.user_code.targets import load_target
 
 SPEC = """
 import numpy as np

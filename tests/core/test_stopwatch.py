@@ -2,8 +2,8 @@
 
 import pytest
 
-from verifai_jax.core import stopwatch
-from verifai_jax.core.stopwatch import Stopwatch
+from verifai_jax.core.compute import stopwatch
+from verifai_jax.core.compute.stopwatch import Stopwatch
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.mtl import robustness
 
 

@@ -12,8 +12,8 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
-from verifai_jax.core.errors import MissingExtra, require
-from verifai_jax.core.user_errors import explain_user_error, format_user_error, user_line
+from verifai_jax.core.messages.errors import MissingExtra, require
+from verifai_jax.core.user_code.user_errors import explain_user_error, format_user_error, user_line
 
 SPACE = vj.FeatureSpace(
     {

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
 import verifai_jax as vj
-from verifai_jax.core.waveform import Waveform, set_durations
+from verifai_jax.core.values.waveform import Waveform, set_durations
 from verifai_jax.remote_client import Waveform as ClientWaveform
 
 KNOTS = np.float32([1, -2, 0.5, 4, 4])

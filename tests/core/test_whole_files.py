@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.atomic_files import append, replacing, unwritable
+from verifai_jax.core.store.atomic_files import append, replacing, unwritable
 from verifai_jax.reports.plotting.style import new_figure, show_or_save
 from verifai_jax.rl import Continuous, Policy
 

@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 
 from envs.arch import fuel_control as model
 from specs.arch import fuel_control as specs
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.values.waveform import Waveform
 
 TIMES, ANGLES = (0.0, 20.0, 35.0), (10.0, 40.0, 5.0)
 SHEET = {20.3: 8.1e-5, 20.5: -4.77e-4, 20.8: -5.03e-4, 22: 1.06e-4, 35.6: 7.97e-4, 36: 1.715e-3,

@@ -8,7 +8,7 @@ import pytest
 import verifai_jax as vj
 from envs.arch import automatic_transmission as at
 from specs.arch import automatic_transmission as specs
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.values.waveform import Waveform
 
 # A trajectory that MATLAB made with the original model, thinned to 0.1 s and the segments' starts.
 MATLAB = np.genfromtxt(Path(__file__).with_name("arch_at_matlab.csv"), delimiter=",", names=True)

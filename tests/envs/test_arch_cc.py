@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 import verifai_jax as vj
 from envs.arch import chasing_cars as cc
 from specs.arch import chasing_cars as specs
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.values.waveform import Waveform
 
 NAMES = [f"y{i}" for i in range(1, 6)]
 

@@ -12,7 +12,7 @@ from scipy.io import savemat
 import verifai_jax as vj
 from envs.arch.lstm import HEADER, STEPS, Lstm, read_lstm
 from specs.arch import lstm as specs
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.values.waveform import Waveform
 
 INPUTS = {"sb1": (2, 1), "sb2": (1, 1), "sb3": (2, 1), "sb4": (2, 2), "sb5": (1, 2)}
 

@@ -6,7 +6,7 @@ import pytest
 import verifai_jax as vj
 from envs.arch import neural_network_controller as nn
 from specs.arch import neural_network_controller as specs
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.values.waveform import Waveform
 
 
 @pytest.fixture(autouse=True)

@@ -6,7 +6,7 @@ import pytest
 import verifai_jax as vj
 from envs.arch.pacemaker import pacemaker
 from specs.arch import pacemaker as specs
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.values.waveform import Waveform
 
 
 @pytest.fixture(scope="module")

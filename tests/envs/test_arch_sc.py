@@ -8,8 +8,8 @@ from scipy.integrate import solve_ivp
 
 from envs.arch import steam_condenser as model
 from specs.arch import steam_condenser as specs
-from verifai_jax.core.precision import in_precision
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.values.waveform import Waveform
 
 REFERENCE = {0: 90, 1: 89.967437, 2: 89.888320, 3: 88.703232, 5: 86.490329, 10: 87.304953,
              20: 87.302569, 30: 87.292889, 35: 87.293300}  # fmt: skip

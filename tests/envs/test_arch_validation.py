@@ -9,7 +9,7 @@ import pytest
 import verifai_jax as vj
 from benchmarks import arch_validation
 from specs.arch import automatic_transmission, fuel_control
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.values.waveform import Waveform
 
 
 def read(text):

@@ -7,7 +7,7 @@ import pytest
 
 from envs import ball
 from specs import ball as specs
-from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.evaluation.host_engine import HostEngine
 
 

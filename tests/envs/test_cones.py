@@ -12,8 +12,8 @@ from envs import cones as ec
 from envs import train_cones
 from envs.cones_drawing import film_strip
 from specs import cones as specs
-from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.core.figure import new_figure
+from verifai_jax.core.display.figure import new_figure
+from verifai_jax.core.messages.errors import UnknownNameError
 
 KEY = jax.random.key(0)
 PROBLEMS = [p for name in dir(specs) if isinstance(p := getattr(specs, name), vj.Problem)]

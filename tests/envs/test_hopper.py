@@ -12,7 +12,7 @@ import verifai_jax as vj
 from envs import hopper as h
 from envs import train_hopper, training
 from specs import hopper as specs
-from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.evaluation.replay import replay
 from verifai_jax.rl import Discrete, Training, evaluate, load_policy, policy_notes
 

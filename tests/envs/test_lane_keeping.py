@@ -9,7 +9,7 @@ import verifai_jax as vj
 from envs import lane_keeping as lk
 from envs.lane_keeping_drawing import draw
 from specs import lane_keeping as specs
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.values.waveform import Waveform
 from verifai_jax.reports.plotting.style import new_figure
 from verifai_jax.rl import Continuous, Discrete, Policy, evaluate, load_policy, policy_notes
 from verifai_jax.rl.policy import new_layers

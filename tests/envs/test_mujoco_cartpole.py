@@ -12,8 +12,8 @@ from envs import cartpole as analytic
 from envs import mujoco_cartpole
 from specs import cartpole as paper
 from specs import mujoco_cartpole as specs
-from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.core.trace import Status
+from verifai_jax.core.messages.errors import UnknownNameError
+from verifai_jax.core.values.trace import Status
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.verdicts import trace_verdict
 

@@ -13,7 +13,7 @@ import verifai_jax as vj
 from envs import road
 from envs.road import scenarios
 from specs import road as specs
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.values.waveform import Waveform
 from verifai_jax.reports.plotting.style import new_figure
 from verifai_jax.search import PointList
 

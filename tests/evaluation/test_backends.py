@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.evaluation import backends
 from verifai_jax.evaluation.backends import resolved
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.keys import run_keys
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.evaluation.differentiation import Derivative
 from verifai_jax.evaluation.engine import Engine, engine_for
 from verifai_jax.evaluation.row import Packing, streaming_monitor

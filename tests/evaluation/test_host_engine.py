@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.evaluation.journal import JOURNAL, Journal
 from verifai_jax.evaluation.verdicts import RowVerdict
 from verifai_jax.falsification.loop import Rounds

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.keys import run_keys
-from verifai_jax.core.lifting import CAPACITY, LiftedNumbers, lifted, lifting
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.compute.lifting import CAPACITY, LiftedNumbers, lifted, lifting
 from verifai_jax.evaluation.engine import Engine
 
 KEY = run_keys(0)[1]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.keys import run_keys
+from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.evaluation.confirmer import Confirmer
 from verifai_jax.evaluation.replay import replay
 from verifai_jax.systems.ode.blocks import LookupTable, delay_line

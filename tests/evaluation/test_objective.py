@@ -7,7 +7,7 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
-from verifai_jax.core.keys import run_keys, simulation_key
+from verifai_jax.core.compute.keys import run_keys, simulation_key
 from verifai_jax.evaluation.evaluator import Evaluator
 
 SPACE = {"x0": vj.Box(-1.0, 1.0), "v": vj.Normal(0.0, 0.5), "push": vj.Signal(vj.Box(-1, 1), 3)}

@@ -16,7 +16,7 @@ from envs.arch.chasing_cars import chasing_cars
 from envs.arch.neural_network_controller import neural_network_controller
 from envs.arch.pacemaker import pacemaker
 from envs.mountain_car import mountain_car
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 
 FEATURES = {"a": 1.3, "x0": 2.0}
 

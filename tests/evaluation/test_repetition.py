@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.evaluation.confirmations import Repetitions, came_otherwise
 from verifai_jax.evaluation.confirmer import REPEATED
 from verifai_jax.systems.base import System

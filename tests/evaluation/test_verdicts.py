@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.compilation import ProgramCache, Slot
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.compute.compilation import ProgramCache, Slot
+from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.evaluation.verdicts import Verdicts, trace_verdict, violations
 
 OK, LOST = int(Status.OK), int(Status.NONFINITE)

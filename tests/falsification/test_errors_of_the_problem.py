@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.trace import Status
+from verifai_jax.core.values.trace import Status
 from verifai_jax.evaluation import raising
 from verifai_jax.evaluation.raising import ALIKE, ALWAYS, FEW, SLOW, Raising
 

@@ -12,7 +12,7 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax.core.store.files import sealed
-from verifai_jax.core.targets import load_target
+from verifai_jax.core.user_code.targets import load_target
 from verifai_jax.falsification.shards import Shard, merge, simulate_shard
 
 SPEC = """

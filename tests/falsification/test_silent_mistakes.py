@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.targets import definitions
+from verifai_jax.core.user_code.targets import definitions
 from verifai_jax.mtl import parse
 from verifai_jax.problem.silent_mistakes import (
     difference,

@@ -6,7 +6,7 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import PointList
 from verifai_jax.testing import check_batch_independence, check_search
 

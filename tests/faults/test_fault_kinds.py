@@ -9,8 +9,8 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax import faults
-from verifai_jax.core.fingerprint import programs_in
-from verifai_jax.core.trace import Status
+from verifai_jax.core.compute.fingerprint import programs_in
+from verifai_jax.core.values.trace import Status
 
 DT, STEPS = 0.1, 30
 WINDOW = {"onset": vj.Box(-1, 4), "duration": vj.Box(0, 2)}

@@ -9,7 +9,7 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax import faults
-from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.remote_client import serve
 
 KEY = jax.random.key(3)

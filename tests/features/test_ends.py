@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.precision import in_precision
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.values.waveform import Waveform
 from verifai_jax.features.ends import ends_within
 
 # In single precision 61.2 is rounded up, -0.3 down, 0.1 up and 0.7 down.

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from checked_types import unchecked
 
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.values.waveform import Waveform
 from verifai_jax.features import (
     Array,
     Box,

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from verifai_jax.core.clauses import CLAUSES
-from verifai_jax.core.clauses import CLAUSES as TOLD
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.clauses import CLAUSES
+from verifai_jax.core.values.clauses import CLAUSES as TOLD
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import parse, robustness, smooth
 from verifai_jax.mtl.clauses import ABSENT, GOALS, goals_of
 from verifai_jax.search.clause_values import NOTHING

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from verifai_jax.core.text import format_time
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.messages.text import format_time
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import SamplingError, explain, read, resample, robustness, satisfied
 from verifai_jax.mtl.setting import period
 

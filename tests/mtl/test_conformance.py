@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import boolean, parse, robustness, robustness_signal, satisfied
 
 CASES = json.loads((Path(__file__).parent / "conformance.json").read_text())["cases"]

@@ -16,7 +16,7 @@ import pytest
 from checked_types import unchecked
 from pyarrow import parquet
 
-from verifai_jax.core.errors import MissingExtra, UnknownNameError
+from verifai_jax.core.messages.errors import MissingExtra, UnknownNameError
 from verifai_jax.mtl import judge, read, robustness
 from verifai_jax.mtl.recorded import named_traces
 

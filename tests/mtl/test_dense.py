@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from verifai_jax import mtl
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.expression import Number, signal
 

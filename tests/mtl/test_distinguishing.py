@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from verifai_jax import mtl
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 
 PAIRS = [
     # How far an operator reaches.

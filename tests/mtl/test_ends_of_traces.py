@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mtl_oracle import DT, Oracle
 
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import HorizonError, online, parse, robustness, robustness_signal, satisfied
 
 PAGE = Path(__file__).parents[2] / "docs" / "formulas.md"

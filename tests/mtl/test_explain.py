@@ -8,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 from mtl_oracle import DT, Oracle
 
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import draw, explain, parse, robustness
 from verifai_jax.mtl import formula as ast
 

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 import verifai_jax as vj
 from verifai_jax.cli.main import main
-from verifai_jax.core.machine_code import Unavailable
+from verifai_jax.core.compute.machine_code import Unavailable
 from verifai_jax.mtl import fmu_monitor
 
 pytestmark = pytest.mark.skipif(

@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.messages.errors import UnknownNameError
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import explain, judge, parse, read, read_requirements, robustness
 
 TOML = """

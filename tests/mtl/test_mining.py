@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from mtl_oracle import DT, Oracle, formulas, recordings
 
 from verifai_jax import mtl
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.mtl.parametric import read_parametric
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
-from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.messages.errors import UnknownNameError
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import anneal, normalize, parse, robustness, satisfied
 
 FORMULA = parse("G (abs(x) <= 2.4 & abs(theta) <= 0.2) & F (x > 0)")

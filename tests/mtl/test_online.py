@@ -8,8 +8,8 @@ from checked_types import unchecked
 from hypothesis import HealthCheck, given, settings
 from mtl_oracle import DT, Oracle, formulas, recordings
 
-from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.messages.errors import UnknownNameError
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import IntervalError, online, robustness
 
 UNCOMPILED = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from verifai_jax import mtl
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl import parse
 from verifai_jax.mtl.clauses import goals_of

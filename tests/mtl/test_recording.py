@@ -7,8 +7,8 @@ import pytest
 from checked_types import unchecked
 from pyarrow import parquet
 
-from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.messages.errors import UnknownNameError
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import read, resample, robustness
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import explain, read, resample, robustness, robustness_signal
 
 SPIKE = Trace(

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
-from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.messages.errors import UnknownNameError
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import (
     HorizonError,
     IntervalError,

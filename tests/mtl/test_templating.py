@@ -3,7 +3,7 @@
 import pytest
 
 from verifai_jax import mtl
-from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.messages.errors import UnknownNameError
 
 LIBRARY = mtl.templates()
 DOMAINS = {"patterns", "control", "driving", "flight", "robots", "medical", "power", "process"}

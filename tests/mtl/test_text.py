@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
-from verifai_jax.core.text import format_seconds
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.messages.text import format_seconds
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import (
     FALSE,
     TRUE,

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from mtl_oracle import DT, Oracle, formulas, recordings
 
 from verifai_jax import mtl
-from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.core.machine_code import COMPILERS
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.compute.machine_code import COMPILERS
+from verifai_jax.core.messages.errors import UnknownNameError
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl.host_values import HostValues
 
 QUICK = settings(

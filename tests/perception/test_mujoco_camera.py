@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.perception import mujoco_camera, mujoco_scene
 
 MJCF = """

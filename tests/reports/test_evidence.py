@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import verifai_jax as vj
 from verifai_jax.cli.main import main
-from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.mtl import parse
 from verifai_jax.mtl.english import formula_words
 from verifai_jax.reports import write_report

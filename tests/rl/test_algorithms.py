@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.control_tasks import Acrobot, Pendulum
-from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.rl import PPO, BatchedTraining, Configuration, Continuous, Discrete, train
 from verifai_jax.rl.algorithm import Algorithm
 from verifai_jax.rl.algorithms import ALGORITHMS, algorithm_named, algorithms_for

@@ -8,7 +8,7 @@ import pytest
 from checked_types import unchecked
 
 from envs import cartpole as cp
-from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.rl import PPO, Continuous, Discrete, Policy, Task, train
 from verifai_jax.rl.policy import new_layers
 from verifai_jax.rl.task.mjx import mjx_task

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import Observations
 from verifai_jax.search.bandit import Bandit, draw_cells, fill_cells
 

@@ -7,7 +7,7 @@ import pytest
 from checked_types import unchecked
 from playing import gain, play
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import Observations
 from verifai_jax.search.cmaes import CMAES
 from verifai_jax.search.evolution import Evolution, recombination, reverse_recombination

@@ -9,7 +9,7 @@ import pytest
 from checked_types import unchecked
 from playing import tell_of
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import (
     CrossEntropy,
     Descent,

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from playing import tell_of
 from scipy.optimize import lsq_linear
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import Descent, Portfolio
 from verifai_jax.search.curvature import advance, begin
 

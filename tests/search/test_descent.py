@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.mtl.clauses import ABSENT
 from verifai_jax.search import Gradient, Observations, Portfolio
 from verifai_jax.search.linear_steps import HALVINGS, minimax_direction

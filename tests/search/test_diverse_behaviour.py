@@ -9,8 +9,8 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
-from verifai_jax.core.clauses import OUTCOME, SEGMENTS
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.clauses import OUTCOME, SEGMENTS
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.guidance import Guidance, outcome_of
 from verifai_jax.mtl import explain, parse

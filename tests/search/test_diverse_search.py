@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import CrossEntropy, Gradient, Observations, Search, Uniform, Wants
 from verifai_jax.search.diverse import Diverse, Points, apart, distinct
 from verifai_jax.testing import check_search

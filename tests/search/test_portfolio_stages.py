@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from playing import tell_of
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import Diverse, Portfolio, descent, portfolio
 from verifai_jax.search.portfolio import MANY, NEVER, PATIENT, PortfolioStage
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from playing import tell_of
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import Portfolio
 from verifai_jax.search.descent import APART
 from verifai_jax.search.portfolio import OPENING, TAKEN

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import verifai_jax as vj
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.repetition import MEMORY, NUDGE, Repetition
 
 MIXED = Cube(levels=(0, 3, 0))

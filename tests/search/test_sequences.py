@@ -7,7 +7,7 @@ import pytest
 from checked_types import unchecked
 from scipy import stats
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import Halton, Uniform, from_json, to_json
 from verifai_jax.search.halton import halton_points, primes
 

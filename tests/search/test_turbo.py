@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import Observations, named
 from verifai_jax.search.halton import halton_points
 from verifai_jax.search.turbo import SIDES, TuRBO, trust_box

@@ -10,7 +10,7 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import (
     Bayes,
     Coverage,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 
 
 def decay(features):

@@ -6,7 +6,7 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.systems.base import System, as_system
 
 SPACE = {"x": vj.Box(-1.0, 1.0)}

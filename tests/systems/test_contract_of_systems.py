@@ -10,7 +10,7 @@ import pytest
 
 import verifai_jax as vj
 from envs import cartpole
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.systems.base import Outcome
 from verifai_jax.testing import check_system
 

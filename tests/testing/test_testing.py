@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.features import Box
 from verifai_jax.search import Search, Uniform
 from verifai_jax.testing import check_batch_independence, check_domain, check_search

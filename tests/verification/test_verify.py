@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.core.store.files import DamagedError
-from verifai_jax.core.text import format_percent
 from verifai_jax.verification.enclosure import Enclosure
 from verifai_jax.verification.sets import MissingRule
 

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from verifai_jax.core.lazy import attach
+from verifai_jax.core.display.lazy import attach
 
 if TYPE_CHECKING:
     from verifai_jax.analysis._boundary import Boundary as Boundary

@@ -22,9 +22,9 @@ import pandas as pd
 from jaxtyping import Bool, Float
 
 from verifai_jax.analysis.data.samples import Samples, Source
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.notebook import InNotebook, frame_html
-from verifai_jax.core.text import format_features, format_percent
+from verifai_jax.core.display.notebook import InNotebook, frame_html
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.text import format_features, format_percent
 
 MIN_ROWS = 10
 """Failures, and safe rows, from which on a boundary between them is learned."""

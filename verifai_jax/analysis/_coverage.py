@@ -19,10 +19,10 @@ from jaxtyping import Float
 from verifai_jax.analysis.data.cells import count_occupied, cut
 from verifai_jax.analysis.data.marginals import Marginal, marginals
 from verifai_jax.analysis.data.samples import Samples, Source
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.text import format_features, format_percent
+from verifai_jax.core.display.figure import Drawn
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.text import format_features, format_percent
 
 MAX_ROWS = 2000
 MAX_ENTRIES = 8e7

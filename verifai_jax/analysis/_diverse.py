@@ -18,9 +18,9 @@ import pandas as pd
 from jaxtyping import Float, Int
 
 from verifai_jax.analysis.data.samples import Samples, Scale, Source, Which, distances, with_columns
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.notebook import InNotebook
+from verifai_jax.core.display.figure import Drawn
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.messages.checks import check_count
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 

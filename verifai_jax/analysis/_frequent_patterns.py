@@ -24,10 +24,10 @@ from jaxtyping import Bool, Int
 
 from verifai_jax.analysis.data.columns import Column
 from verifai_jax.analysis.data.samples import Samples, Source, Which
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.text import counted, format_percent
+from verifai_jax.core.display.figure import Drawn
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.text import counted, format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 

@@ -14,10 +14,10 @@ import pandas as pd
 from jaxtyping import Bool, Float, Int
 
 from verifai_jax.analysis.data.samples import Samples, Source
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.display.figure import Drawn
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.checks import check_count
 
 MAX_TRAINED = 4000
 MAX_TESTED = 2000
@@ -103,7 +103,7 @@ def importance(
       verdict.
     - `repeats`: how often each feature is shuffled.
     - `seed`: the seed of everything that is drawn at random.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** an `Importance`.
 
     Half of the rows (4000 at most) train an ensemble of trees; the loss is measured on others. Two

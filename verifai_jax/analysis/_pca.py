@@ -31,10 +31,10 @@ from verifai_jax.analysis.data.samples import (
     generator,
     with_columns,
 )
-from verifai_jax.core.checks import check_count, check_positive
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.display.figure import Drawn
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.messages.checks import check_count, check_positive
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 

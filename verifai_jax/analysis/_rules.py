@@ -21,10 +21,10 @@ from verifai_jax.analysis.conditions import Condition, Region, everywhere
 from verifai_jax.analysis.data.columns import Column
 from verifai_jax.analysis.data.samples import Samples, Source
 from verifai_jax.analysis.trees import propose_regions
-from verifai_jax.core.checks import check_count, check_fraction
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.display.figure import Drawn
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.messages.checks import check_count, check_fraction
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.falsification.no_rate import why_no_rate
 from verifai_jax.falsification.run import Run
 from verifai_jax.statistics.binomial import Rate, clopper_pearson

@@ -19,9 +19,9 @@ from jaxtyping import Int
 from verifai_jax.analysis.data.samples import Samples, Source
 from verifai_jax.analysis.odd_conditions import Attribute
 from verifai_jax.analysis.operational_domain import OperationalDomain, choices_of, words
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.notebook import Tabular
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.display.notebook import Tabular
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.text import format_percent
 
 DRAWN = 2**15
 """Points of the domain, and of the prior, by which shares are measured: to half a percent."""

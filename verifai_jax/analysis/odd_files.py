@@ -23,9 +23,9 @@ from verifai_jax.analysis.odd_conditions import (
     written,
 )
 from verifai_jax.analysis.operational_domain import OperationalDomain
-from verifai_jax.core.errors import check_names, unknown_name
-from verifai_jax.core.foreign_files import read_yaml
-from verifai_jax.core.reads import documents
+from verifai_jax.core.messages.errors import check_names, unknown_name
+from verifai_jax.core.store.foreign_files import read_yaml
+from verifai_jax.core.user_code.reads import documents
 from verifai_jax.features import FeatureSpace
 
 ABOUT = ("attribute", "unit", "reason", "source")

@@ -25,9 +25,9 @@ from jaxtyping import Bool, Float
 
 from verifai_jax.analysis import odd_conditions
 from verifai_jax.analysis.data.samples import Source
-from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.foreign_files import write_yaml
-from verifai_jax.core.lazy import lazy_import
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.store.atomic_files import replacing
+from verifai_jax.core.store.foreign_files import write_yaml
 from verifai_jax.features import Box, Categorical, DiscreteBox, Domain, FeatureSpace
 
 

@@ -25,11 +25,11 @@ from verifai_jax.analysis._rules import rules
 from verifai_jax.analysis.clustering.clusters import clusters
 from verifai_jax.analysis.data.samples import Samples
 from verifai_jax.analysis.data.verdicts import unconfirmed
-from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.errors import unknown_name
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.progress import shows_progress
-from verifai_jax.core.text import format_features, one_line, printable
+from verifai_jax.core.display.figure import Drawn
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.errors import unknown_name
+from verifai_jax.core.messages.text import format_features, one_line, printable
+from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.falsification.no_rate import why_no_rate
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.table import ErrorTable
@@ -154,7 +154,7 @@ def analyze(
     **Arguments:**
     - `source`: a run, its table, or a DataFrame with feature columns.
     - `seed`: the seed of everything that is drawn at random.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** an `Analysis`.
 
     Failures, rules, importance of features, clusters, principal components, frequent patterns,

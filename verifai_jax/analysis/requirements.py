@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from verifai_jax.core.progress import shows_progress
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.falsification import falsify
 from verifai_jax.falsification.run import Run
 from verifai_jax.mtl.distinguishing import Distinction, distinction

@@ -31,7 +31,7 @@ def analyze(
     count: int,
 ) -> None:
     """Report rules, importance, kinds of failures and coverage of the run in RUN."""
-    from verifai_jax.core.text import printable
+    from verifai_jax.core.messages.text import printable
 
     run = load_judged_run(folder, target)
     analysis = run.analyze()

@@ -15,7 +15,7 @@ from verifai_jax.cli.exit_codes import BROKEN, CommandError
 
 if TYPE_CHECKING:
     from verifai_jax import Problem, Run
-    from verifai_jax.core.executors import Executor
+    from verifai_jax.core.compute.executors import Executor
 Command = TypeVar("Command", bound=Callable[..., object])
 COMMON = ("as_json", "pictures", "progress", "keep_going")
 """Options about what a command prints and draws, and whether it goes on, not about its result."""
@@ -200,7 +200,7 @@ def on_cluster(address: str | None) -> "Iterator[Executor | None]":
 def load_problem(target: str, only: str | None = None) -> "Problem":
     """Load the problem FILE.py:NAME, with only some of its features varied."""
     from verifai_jax import Problem
-    from verifai_jax.core.targets import load_target
+    from verifai_jax.core.user_code.targets import load_target
 
     problem = load_target(target, Problem)
     return problem if only is None else problem.only(*split_names(only))
@@ -226,7 +226,7 @@ def load_run(folder: Path, target: str | None) -> "Run":
 def read_run(folder: Path, problem: "Problem | None" = None) -> "Run":
     """Read the run in a folder; say what the folder is where it holds none."""
     from verifai_jax import load
-    from verifai_jax.core.text import printable
+    from verifai_jax.core.messages.text import printable
 
     read_record(folder)
     run = load(folder, problem)
@@ -241,7 +241,7 @@ def read_run(folder: Path, problem: "Problem | None" = None) -> "Run":
 
 def recorded_target(folder: Path, remedy: str = "--problem specs/FILE.py:NAME") -> str:
     """Return the target that a run records, if it is a file of the user's own project."""
-    from verifai_jax.core.targets import target_of_project
+    from verifai_jax.core.user_code.targets import target_of_project
 
     target = read_record(folder).get("target")
     return target_of_project(target, folder, kind="problem", remedy=remedy)
@@ -329,7 +329,7 @@ def refuse_others(allowed: Container[str], why: str) -> None:
 
 def target_apart(folder: Path, target: str | None) -> str | None:
     """Return the target of a run where its folder alone does not name it for a command."""
-    from verifai_jax.core.targets import TargetError, target_of_project
+    from verifai_jax.core.user_code.targets import TargetError, target_of_project
 
     if target is None:
         return None

@@ -33,7 +33,7 @@ def confirm(
 ) -> None:
     """Replay the counterexamples of the run in RUN, or its ROW, at a finer step."""
     import verifai_jax as vj
-    from verifai_jax.core.text import printable
+    from verifai_jax.core.messages.text import printable
 
     run = load_judged_run(folder, target)
     result = vj.confirm(run, row, engines=engines or None)

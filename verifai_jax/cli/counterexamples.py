@@ -43,7 +43,7 @@ def replay_counterexamples(
 ) -> None:
     """Simulate the saved counterexamples in FOLDER (or one file) again, on TARGET as it is now."""
     from verifai_jax import replay_counterexamples as replay
-    from verifai_jax.core.text import printable
+    from verifai_jax.core.messages.text import printable
 
     names = dict(arguments.split_pairs("--rename", rename))
     result = replay(arguments.load_problem(target), folder, rename=names)

@@ -14,7 +14,7 @@ import click
 
 from verifai_jax._version import __version__
 from verifai_jax.cli.json_output import command, give_result
-from verifai_jax.core.cores import available_cores
+from verifai_jax.core.compute.cores import available_cores
 
 PACKAGES = ("jax", "jaxlib", "numpy", "optax", "lark", "pandas", "pyarrow", "matplotlib", "rich")
 """Required packages whose versions are reported."""
@@ -243,7 +243,7 @@ def _rendering() -> str:
 
 
 def _cache_state() -> str:
-    from verifai_jax.core.devices import CACHE_ROOM, cache_folder
+    from verifai_jax.core.compute.devices import CACHE_ROOM, cache_folder
 
     folder = cache_folder()
     if folder is None:

@@ -58,7 +58,7 @@ def estimate(
 ) -> None:
     """Estimate the probability that TARGET (FILE.py:NAME) fails, with an interval and a bound."""
     from verifai_jax import estimate as run
-    from verifai_jax.core.text import printable
+    from verifai_jax.core.messages.text import printable
 
     if fail_on is not None and fail_on.name == "p0" and p0 is None:
         raise click.UsageError("--fail-on p0 goes with --p0")

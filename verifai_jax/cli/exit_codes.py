@@ -17,7 +17,7 @@ import traceback
 
 import click
 
-from verifai_jax.core.errors import MissingExtra
+from verifai_jax.core.messages.errors import MissingExtra
 
 GATE_FAILED = 1
 WRONG_USAGE = 2
@@ -80,7 +80,7 @@ def command_error(error: BaseException, show_traceback: bool = False) -> Command
     A traceback is printed where it is asked for, and where the error is a bug of this package:
     neither a refusal, nor a failure that the package foresees, nor raised by the user's own code.
     """
-    from verifai_jax.core.text import printable
+    from verifai_jax.core.messages.text import printable
 
     message, code = _message_and_code(error)
     if show_traceback or not message:
@@ -108,7 +108,11 @@ def _message_and_code(error: BaseException) -> tuple[str, int]:
         return str(error), BROKEN
     if isinstance(error, MemoryError):
         return "the machine has not enough memory; a smaller --batch needs less", BROKEN
-    from verifai_jax.core.user_errors import explain_user_error, raised_in_callback, user_line
+    from verifai_jax.core.user_code.user_errors import (
+        explain_user_error,
+        raised_in_callback,
+        user_line,
+    )
 
     if (raised := raised_in_callback(error)) is not None:
         return raised, BROKEN

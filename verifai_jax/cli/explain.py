@@ -28,7 +28,7 @@ def explain(
     import textwrap
 
     import verifai_jax as vj
-    from verifai_jax.core.text import printable
+    from verifai_jax.core.messages.text import printable
 
     run = arguments.load_judged_run(folder, target)
     why = vj.explain(run, row)

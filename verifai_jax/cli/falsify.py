@@ -107,8 +107,8 @@ def falsify(
 ) -> None:
     """Search for inputs under which TARGET (specs/FILE.py:NAME) breaks its property."""
     from verifai_jax import falsification
-    from verifai_jax.core import figure
-    from verifai_jax.core.compilation import while_compiling
+    from verifai_jax.core.compute.compilation import while_compiling
+    from verifai_jax.core.display import figure
     from verifai_jax.search import named
 
     if pictures:
@@ -185,7 +185,7 @@ def _simulate_shard(
     **options: Any,
 ) -> None:
     """Simulate one part of a run, and say what makes the run of the parts."""
-    from verifai_jax.core.text import folder_name
+    from verifai_jax.core.messages.text import folder_name
     from verifai_jax.falsification.shards import Shard, simulate_shard
 
     part = Shard.parse(shard)
@@ -257,7 +257,7 @@ def print_run(
         raise CommandError("interrupted before the first batch was finished", INTERRUPTED)
     if not run.simulations:
         raise CommandError("no simulation was finished, so nothing is known of it", BROKEN)
-    from verifai_jax.core.text import one_line
+    from verifai_jax.core.messages.text import one_line
 
     counts = ", ".join(f"{n:,} {status}" for status, n in failed["status"].value_counts().items())
     messages = [text for text in failed["message"] if text] if "message" in failed else []

@@ -27,7 +27,7 @@ from verifai_jax.cli.json_output import command, draw, give_result
 def fmea(target: str, folder: Path | None, plot: Path | None, **options: Any) -> None:
     """Table what each fault of TARGET (FILE.py:NAME) does, and how probable that is."""
     from verifai_jax import fmea as run
-    from verifai_jax.core.text import printable
+    from verifai_jax.core.messages.text import printable
 
     problem = arguments.load_problem(target)
     into = folder or Path("runs") / f"fmea-{target.rpartition(':')[2]}"

@@ -15,7 +15,7 @@ import click
 
 from verifai_jax.cli.exit_codes import fail_gate
 from verifai_jax.cli.json_output import give_result
-from verifai_jax.core.errors import nearest_names
+from verifai_jax.core.messages.errors import nearest_names
 
 Command = TypeVar("Command", bound=Callable[..., object])
 RATE = "rate"

@@ -58,7 +58,7 @@ def kept_until_done() -> Iterator[Kept]:
 
     Where nothing can be written, or the same command is at work, nothing is kept.
     """
-    from verifai_jax.core.progress import goes_on_with
+    from verifai_jax.core.display.progress import goes_on_with
     from verifai_jax.evaluation.unfinished import keeping
 
     context = click.get_current_context()

@@ -34,8 +34,8 @@ def harden(
     """Train a policy of the study TARGET (FILE.py:NAME), go on where it fails, certify it."""
     from verifai_jax import Study
     from verifai_jax import harden as run
-    from verifai_jax.core.targets import load_target
-    from verifai_jax.core.text import printable
+    from verifai_jax.core.messages.text import printable
+    from verifai_jax.core.user_code.targets import load_target
     from verifai_jax.statistics.confidence_sequences import safe_at
 
     study = load_target(target, Study)

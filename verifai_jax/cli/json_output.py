@@ -75,7 +75,7 @@ def show_result(found: Any, plot: Path | None, *names: str) -> None:
     - `plot`: the file of its picture, whose folder is made; None for no picture.
     - `names`: attributes to give; all fields that its `repr` shows when left out.
     """
-    from verifai_jax.core.text import printable
+    from verifai_jax.core.messages.text import printable
 
     click.echo(printable(str(found)))
     give_result(**({name: getattr(found, name) for name in names} or as_plain(found)))

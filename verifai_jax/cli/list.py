@@ -21,8 +21,8 @@ def list_targets(location: str | None) -> None:
     Its Python files are run for that, those of inner folders are not.
     """
     from verifai_jax import Problem, Study
-    from verifai_jax.core.errors import MissingExtra
-    from verifai_jax.core.targets import NothingDefined, TargetError, definitions
+    from verifai_jax.core.messages.errors import MissingExtra
+    from verifai_jax.core.user_code.targets import NothingDefined, TargetError, definitions
     from verifai_jax.search import names
 
     path = Path(location or "specs")

@@ -48,7 +48,7 @@ from verifai_jax.cli.synthesize import synthesize
 from verifai_jax.cli.trace import trace
 from verifai_jax.cli.trials import trials
 from verifai_jax.cli.verify import verify
-from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.messages.errors import unknown_name
 
 COMMANDS = (
     falsify,

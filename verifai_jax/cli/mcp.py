@@ -230,7 +230,7 @@ class Server:
         path.parent.mkdir(exist_ok=True)
         text = (
             "from dataclasses import replace\n\nimport verifai_jax as vj\n"
-            "from verifai_jax.core.targets import load_target\n\n"
+            "from verifai_jax.core.user_code.targets import load_target\n\n"
             f"base = load_target({values['problem']!r}, vj.Problem)\n"
             f"problem = replace(\n    base,\n    name={name!r},\n"
             f"    spec={{{name!r}: {values['formula']!r}}},\n"

@@ -33,7 +33,7 @@ def merge(
     fail_on: Gate | None,
 ) -> None:
     """Make one run of PARTS, the folders that `falsify --shard` has written."""
-    from verifai_jax.core.targets import target_of_project
+    from verifai_jax.core.user_code.targets import target_of_project
     from verifai_jax.falsification.shards import merge as merge_parts
     from verifai_jax.falsification.shards import read_shard
 

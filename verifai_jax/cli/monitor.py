@@ -23,13 +23,13 @@ from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result
 from verifai_jax.cli.monitor_fleet import fleet_options, is_fleet, monitor_fleet
-from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.errors import UnknownNameError, missing_name, nearest_names
-from verifai_jax.core.text import format_time, printable
+from verifai_jax.core.messages.errors import UnknownNameError, missing_name, nearest_names
+from verifai_jax.core.messages.text import format_time, printable
+from verifai_jax.core.store.atomic_files import replacing
 
 if TYPE_CHECKING:
     from verifai_jax import Formula
-    from verifai_jax.core.trace import Trace
+    from verifai_jax.core.values.trace import Trace
     from verifai_jax.mtl.resampling import Missing
 
 

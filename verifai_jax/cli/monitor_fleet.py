@@ -12,7 +12,7 @@ import click
 from verifai_jax.cli.arguments import option
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.json_output import give_result
-from verifai_jax.core.text import printable
+from verifai_jax.core.messages.text import printable
 
 if TYPE_CHECKING:
     from verifai_jax.mtl import Judgement, Requirement

@@ -9,7 +9,7 @@ import click
 
 from verifai_jax.cli.arguments import PATH
 from verifai_jax.cli.json_output import command, give_result
-from verifai_jax.core.atomic_files import replacing
+from verifai_jax.core.store.atomic_files import replacing
 
 FILES = {
     "README.md": "README.md.txt",

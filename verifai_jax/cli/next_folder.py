@@ -20,7 +20,7 @@ def given_or_next(
       this one.
     - `record`: file that the folder has from when on that is possible.
     """
-    from verifai_jax.core.progress import goes_on_with
+    from verifai_jax.core.display.progress import goes_on_with
 
     with contextlib.ExitStack() as held:
         path = held.enter_context(next_folder(parent, name)) if folder is None else folder
@@ -35,8 +35,8 @@ def next_folder(parent: str, name: str) -> Iterator[Path]:
 
     A command that ends without a file in it removes it.
     """
+    from verifai_jax.core.messages.text import folder_name
     from verifai_jax.core.store.locks import writing
-    from verifai_jax.core.text import folder_name
 
     name, number, first = folder_name(name), 1, not Path(parent).exists()
     while True:

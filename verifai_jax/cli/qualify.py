@@ -24,7 +24,7 @@ def qualify(folder: Path, only: tuple[str, ...]) -> None:
     replays bit for bit. It ends with code 3 if one falls.
     """
     from verifai_jax import qualify as run
-    from verifai_jax.core.text import printable
+    from verifai_jax.core.messages.text import printable
 
     found = run(only)
     path = found.save(folder)

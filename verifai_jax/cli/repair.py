@@ -45,7 +45,7 @@ def repair(
 ) -> None:
     """Change parameters of TARGET (specs/FILE.py:NAME) as little as removes its failures."""
     from verifai_jax import repair as run_repair
-    from verifai_jax.core.text import printable
+    from verifai_jax.core.messages.text import printable
 
     problem = arguments.load_problem(target)
     with kept_until_done() as kept:

@@ -68,9 +68,9 @@ def sweep(
 ) -> None:
     """Train configurations of the study TARGET (specs/FILE.py:NAME), certify their policies."""
     from verifai_jax import Study
+    from verifai_jax.core.messages.text import printable
     from verifai_jax.core.store.cache import cache_file
-    from verifai_jax.core.targets import load_target, target_of_project
-    from verifai_jax.core.text import printable
+    from verifai_jax.core.user_code.targets import load_target, target_of_project
     from verifai_jax.training.sweeps._sweep import sweep as run_sweep
 
     if resume is not None:
@@ -217,7 +217,7 @@ def _describe_folder(folder: Path) -> str:
 
 def _format_table(result: "Sweep") -> str:
     """Write the most preferable rows of the table."""
-    from verifai_jax.core.text import printable
+    from verifai_jax.core.messages.text import printable
     from verifai_jax.training.sweeps.ranking import preference_order
 
     table = result.table

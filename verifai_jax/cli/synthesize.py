@@ -38,7 +38,7 @@ def synthesize(
         )  # fmt: skip
         kept.stopped(result.stopped)
     if table is not None:
-        from verifai_jax.core.atomic_files import replacing
+        from verifai_jax.core.store.atomic_files import replacing
 
         with replacing(table) as partial:
             result.candidates.to_csv(partial, index=False)

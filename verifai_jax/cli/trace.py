@@ -46,7 +46,7 @@ def trace(
     Files of problems, and of tests, are run for that. pyproject.toml's vj_specs are tests too.
     """
     from verifai_jax import trace_matrix
-    from verifai_jax.core.text import printable
+    from verifai_jax.core.messages.text import printable
 
     asked = {
         "tests": [*(tests or _usual("tests")), *_tested_files()],

@@ -1,1 +1,1 @@
-"""The ground of every room, which imports none: traces, errors, keys, devices, checks, text."""
+"""The ground of every room, in six folders; it imports no other room."""

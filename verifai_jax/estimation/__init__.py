@@ -7,7 +7,7 @@ simulations_until(1e-6, failures=0, simulations=50_000)
 
 from typing import TYPE_CHECKING
 
-from verifai_jax.core.lazy import attach
+from verifai_jax.core.display.lazy import attach
 
 if TYPE_CHECKING:
     from verifai_jax.estimation._estimate import estimate as estimate

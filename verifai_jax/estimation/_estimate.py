@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from verifai_jax._version import __version__
-from verifai_jax.core.checks import check_fraction, check_options
-from verifai_jax.core.errors import suggests_options, unknown_name
-from verifai_jax.core.precision import in_precision
-from verifai_jax.core.progress import SimulationProgress, shows_progress
+from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.display.progress import SimulationProgress, shows_progress
+from verifai_jax.core.messages.checks import check_fraction, check_options
+from verifai_jax.core.messages.errors import suggests_options, unknown_name
 from verifai_jax.estimation import answers
 from verifai_jax.estimation.double_precision import DoublePrecisionEvaluator
 from verifai_jax.estimation.methods import (
@@ -40,7 +40,7 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.binomial import clopper_pearson
 
 if TYPE_CHECKING:
-    from verifai_jax.core.executors import Executor
+    from verifai_jax.core.compute.executors import Executor
     from verifai_jax.verification import Verification
     from verifai_jax.verification.rest import Rest
 GRADIENTS_FROM = 3

@@ -15,10 +15,10 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.core.checks import check_count, check_fraction
-from verifai_jax.core.errors import check_names, suggests_options
-from verifai_jax.core.progress import shows_progress
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.checks import check_count, check_fraction
+from verifai_jax.core.messages.errors import check_names, suggests_options
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.estimation.sequence_result import PartEstimate, SequenceEstimate
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.verdicts import Verdicts
@@ -72,7 +72,7 @@ def sequence(
     - `seed`: the seed of samples and random keys.
     - `batch`: simulations at once.
     - `precision`: `"float32"` or `"float64"`.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** a `SequenceEstimate`.
     **Raises:** before anything is simulated, `ValueError` for fewer than two parts, for a run whose
     rows are no samples of the prior and for numbers out of range; `UnknownNameError` for features

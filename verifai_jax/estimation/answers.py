@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float
 
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.estimation import importance, monte_carlo
 from verifai_jax.estimation.importance import STEADY
 from verifai_jax.estimation.initial_proposal import Agreement

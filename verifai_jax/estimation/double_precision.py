@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from verifai_jax.core.compilation import Slot
-from verifai_jax.core.keys import run_keys, simulation_key
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.compute.compilation import Slot
+from verifai_jax.core.compute.keys import run_keys, simulation_key
+from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator, Sent
 from verifai_jax.evaluation.kept_work import present_part
@@ -27,7 +27,7 @@ from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
-    from verifai_jax.core.executors import Executor
+    from verifai_jax.core.compute.executors import Executor
     from verifai_jax.evaluation.host_engine import HostEngine
     from verifai_jax.evaluation.unfinished import Part
 EXACT = 2**24

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from verifai_jax.core.compilation import power_of_two
+from verifai_jax.core.compute.compilation import power_of_two
 from verifai_jax.estimation.answers import Cheap
 from verifai_jax.estimation.normal_space import to_unit_cube
 from verifai_jax.search.gaussian_process import GaussianProcess, Hyper, Posterior, TrainingData

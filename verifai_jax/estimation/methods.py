@@ -12,7 +12,7 @@ left goes to the prior, and only its bound is claimed.
 
 import numpy as np
 
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.estimation import importance
 from verifai_jax.estimation.anchors import anchors_of, join_explorations
 from verifai_jax.estimation.answers import (

@@ -16,7 +16,7 @@ reliability analysis, Probabilistic Engineering Mechanics 33 (2013), for the res
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.estimation import importance
 from verifai_jax.estimation.answers import WORST_TAIL, Answer, Plan, bound_answer, bound_from_pilot
 from verifai_jax.estimation.components import Prior

@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import jax
 import numpy as np
 
-from verifai_jax.core.compilation import Slot
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.keys import run_keys
-from verifai_jax.core.text import format_error
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.compute.compilation import Slot
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.messages.errors import check_names
+from verifai_jax.core.messages.text import format_error
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.evaluation.confirmations import ENGINE
 from verifai_jax.evaluation.engine import Engine, engine_for
 from verifai_jax.problem.problem import Problem

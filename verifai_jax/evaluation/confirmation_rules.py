@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.text import listed
+from verifai_jax.core.messages.text import listed
 from verifai_jax.evaluation import confirmations
 from verifai_jax.evaluation.verdicts import Verdicts
 

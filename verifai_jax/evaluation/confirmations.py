@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.text import listed
-from verifai_jax.core.trace import Status
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.messages.text import listed
+from verifai_jax.core.values.trace import Status
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -24,8 +24,8 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.core.keys import run_keys
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.evaluation.backends import Engines, engines_for
 from verifai_jax.evaluation.confirmation_rules import decide, hold_to_run, lowest_failing
 from verifai_jax.evaluation.confirmations import (
@@ -49,7 +49,7 @@ from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
-    from verifai_jax.core.executors import Executor
+    from verifai_jax.core.compute.executors import Executor
 ROWS = 256
 """Rows that are examined in any case, ..."""
 COST = 4096

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
 
-from verifai_jax.core.compilation import (
+from verifai_jax.core.compute.compilation import (
     Compilation,
     Slot,
     XlaOptimization,
@@ -28,10 +28,10 @@ from verifai_jax.core.compilation import (
     pad_rows,
     tracing,
 )
-from verifai_jax.core.fingerprint import as_traced, fingerprint
-from verifai_jax.core.keys import as_key
-from verifai_jax.core.precision import in_precision
-from verifai_jax.core.remembered import is_kept, lower_or_recall, remembered_as
+from verifai_jax.core.compute.fingerprint import as_traced, fingerprint
+from verifai_jax.core.compute.keys import as_key
+from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.compute.remembered import is_kept, lower_or_recall, remembered_as
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.layout import Layout
 from verifai_jax.evaluation.row import CubePoints, Inputs
@@ -245,7 +245,7 @@ class Engine:
         self.compile_seconds += time.perf_counter() - started
 
     def _lower(self, mode: Mode, layout: Layout) -> jax.stages.Lowered:
-        """Lower a program without derivatives, or recall it; see `core.remembered`."""
+        """Lower a program without derivatives, or recall it; see `core.compute.remembered`."""
         traced = self.program.trace(mode)
         if self.alone:
             return traced.lower()
@@ -272,7 +272,7 @@ class Engine:
         return self._kept_as("gradients", self.program.derivatives[0], self.program.derivative)
 
     def _lower_gradient(self) -> jax.stages.Lowered:
-        """Lower the program of derivatives, or recall it; see `core.remembered`."""
+        """Lower the program of derivatives, or recall it; see `core.compute.remembered`."""
         one_row = self.program.derivatives[1]
         program = one_row if self.alone else self.layout.spread(one_row, self.own_keys)
         return self.program.differentiable(

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from verifai_jax.core.compilation import power_of_two
-from verifai_jax.core.keys import run_keys
-from verifai_jax.core.progress import count_done
+from verifai_jax.core.compute.compilation import power_of_two
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.display.progress import count_done
 from verifai_jax.evaluation.engine import FIRST, Engine, Wanted, engine_for
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.kept_work import present_part
@@ -26,7 +26,7 @@ from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
-    from verifai_jax.core.executors import Executor
+    from verifai_jax.core.compute.executors import Executor
     from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
     from verifai_jax.evaluation.host_engine import HostEngine
     from verifai_jax.evaluation.journal import Journal

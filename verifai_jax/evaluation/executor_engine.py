@@ -18,9 +18,9 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
 
-from verifai_jax.core import executors
-from verifai_jax.core.compilation import Slot, power_of_two
-from verifai_jax.core.devices import describe_processor
+from verifai_jax.core.compute import executors
+from verifai_jax.core.compute.compilation import Slot, power_of_two
+from verifai_jax.core.compute.devices import describe_processor
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal

@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from verifai_jax.core.clauses import OUTCOME, SEGMENTS, SIGNALS
-from verifai_jax.core.trace import Trace, as_array
+from verifai_jax.core.values.clauses import OUTCOME, SEGMENTS, SIGNALS
+from verifai_jax.core.values.trace import Trace, as_array
 from verifai_jax.mtl.deciding import deciding_instant
 from verifai_jax.problem.problem import Problem
 
@@ -24,7 +24,7 @@ class Guidance(NamedTuple):
     """The parts of it that are wanted.
 
     - `guide`: the value of the guide's term.
-    - `outcome`: what happened, as in `core.clauses`.
+    - `outcome`: what happened, as in `core.values.clauses`.
     - `trace`: the monitored signals, of a system that JAX traces.
     - `signals`: others that the trace is to have.
     """
@@ -71,7 +71,7 @@ NOTHING = Guidance()
 
 
 def outcome_of(problem: Problem, trace: Trace) -> Float[Array, " outcome"]:
-    """Return the outcome of one simulation; see `core.clauses`. It is not differentiated."""
+    """Return the outcome of one simulation; see `core.values.clauses`. It is not differentiated."""
     signals = {name: jax.lax.stop_gradient(as_array(trace.signals[name])) for name in trace.signals}
     formulas = tuple(problem.formulas.values())
     predicate, sample = deciding_instant(formulas, trace, problem.end)

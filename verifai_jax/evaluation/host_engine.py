@@ -19,12 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Integer, Key, PyTree
 
-from verifai_jax.core.compilation import pad_rows, power_of_two
-from verifai_jax.core.keys import simulation_key
-from verifai_jax.core.precision import in_precision
-from verifai_jax.core.text import storable
-from verifai_jax.core.trace import Status, Trace, without_wrapping
-from verifai_jax.core.user_errors import format_user_error
+from verifai_jax.core.compute.compilation import pad_rows, power_of_two
+from verifai_jax.core.compute.keys import simulation_key
+from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.messages.text import storable
+from verifai_jax.core.user_code.user_errors import format_user_error
+from verifai_jax.core.values.trace import Status, Trace, without_wrapping
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.host_monitor import MONITORS, HostMonitor
 from verifai_jax.evaluation.journal import Journal

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from verifai_jax.core.compilation import Slot, pad_rows
-from verifai_jax.core.trace import Trace, without_wrapping
+from verifai_jax.core.compute.compilation import Slot, pad_rows
+from verifai_jax.core.values.trace import Trace, without_wrapping
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.verdicts import boolean_semantics, trace_coverage_ids, trace_verdict
 from verifai_jax.problem.problem import Problem

@@ -18,8 +18,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from verifai_jax.core.compilation import Slot
-from verifai_jax.core.machine_code import Unavailable, compiler
+from verifai_jax.core.compute.compilation import Slot
+from verifai_jax.core.compute.machine_code import Unavailable, compiler
 from verifai_jax.evaluation.engine import FIRST, Engine, Wanted
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.mtl.expression import durations_in

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from verifai_jax.core.keys import IMPLEMENTATION, simulation_key
-from verifai_jax.core.machine_code import Unavailable
-from verifai_jax.core.precision import in_precision
-from verifai_jax.core.trace import Status
+from verifai_jax.core.compute.keys import IMPLEMENTATION, simulation_key
+from verifai_jax.core.compute.machine_code import Unavailable
+from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.values.trace import Status
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.native_code.library import (
     Library,

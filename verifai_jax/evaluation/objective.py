@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.keys import IMPLEMENTATION
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.compute.keys import IMPLEMENTATION
+from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.messages.errors import check_names
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.verdicts import trace_verdict
 from verifai_jax.mtl import hard

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Integer
 
-from verifai_jax.core.text import one_line
-from verifai_jax.core.trace import Status
+from verifai_jax.core.messages.text import one_line
+from verifai_jax.core.values.trace import Status
 
 ALWAYS = 64
 """Simulations that have to raise, with none that does not: where nine of ten raise by chance, that

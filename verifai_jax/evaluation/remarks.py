@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from verifai_jax.core.text import MAX_MESSAGE_LENGTH, storable
+from verifai_jax.core.messages.text import MAX_MESSAGE_LENGTH, storable
 
 
 @dataclass

@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Key
 
-from verifai_jax.core.keys import simulation_key
-from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.notebook import InNotebook, picture_html
-from verifai_jax.core.precision import in_precision
-from verifai_jax.core.progress import shows_progress
-from verifai_jax.core.text import format_features
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.compute.keys import simulation_key
+from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.display.notebook import InNotebook, picture_html
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.text import format_features
+from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.evaluation.verdicts import boolean_semantics, trace_verdict, violations
 from verifai_jax.mtl import Explanation, explain
 from verifai_jax.problem.problem import Problem

@@ -20,13 +20,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Key, PyTree, UInt32
 
-from verifai_jax.core.compilation import Slot
-from verifai_jax.core.devices import enable_compile_cache
-from verifai_jax.core.keys import as_key, simulation_key
-from verifai_jax.core.precision import in_precision, reproducible_settings
-from verifai_jax.core.progress import count_done
-from verifai_jax.core.text import format_error
-from verifai_jax.core.trace import Status
+from verifai_jax.core.compute.compilation import Slot
+from verifai_jax.core.compute.devices import enable_compile_cache
+from verifai_jax.core.compute.keys import as_key, simulation_key
+from verifai_jax.core.compute.precision import in_precision, reproducible_settings
+from verifai_jax.core.display.progress import count_done
+from verifai_jax.core.messages.text import format_error
+from verifai_jax.core.values.trace import Status
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.row import TableRows
 from verifai_jax.evaluation.verdicts import Verdicts
@@ -34,7 +34,7 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import System
 
 if TYPE_CHECKING:
-    from verifai_jax.core.executors import Executor, Shipment
+    from verifai_jax.core.compute.executors import Executor, Shipment
 ONE_BY_ONE = 16
 """Rows up to which they are replayed one by one: that program is compiled much sooner."""
 SEEDS = 32
@@ -224,7 +224,7 @@ class HostReplays:
         self._engine = HostEngine(problem, precision)
         self._executor = executor
         if executor is not None:
-            from verifai_jax.core.executors import check_executor, ship
+            from verifai_jax.core.compute.executors import check_executor, ship
             from verifai_jax.evaluation.executor_engine import SHIPMENTS, identity
 
             check_executor(executor)
@@ -280,7 +280,7 @@ class HostReplays:
     def _sent(
         self, features: PyTree, numbers: Int[np.ndarray, " n"], factor: int, anew: bool
     ) -> Verdicts:
-        from verifai_jax.core.executors import gather
+        from verifai_jax.core.compute.executors import gather
         from verifai_jax.evaluation.executor_engine import TOGETHER
 
         executor, system = self._executor, self.problem.system

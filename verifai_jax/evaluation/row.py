@@ -21,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from verifai_jax.core.clauses import ABSENT, CLAUSES
-from verifai_jax.core.lifting import lifting
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.compute.lifting import lifting
+from verifai_jax.core.values.clauses import ABSENT, CLAUSES
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.evaluation.differentiation import Derivative
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.verdicts import (

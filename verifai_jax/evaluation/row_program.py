@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from verifai_jax.core.compilation import tracing
-from verifai_jax.core.fingerprint import as_traced, fingerprint, identity
-from verifai_jax.core.keys import IMPLEMENTATION
-from verifai_jax.core.lifting import CAPACITY, LiftedNumbers
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.compute.compilation import tracing
+from verifai_jax.core.compute.fingerprint import as_traced, fingerprint, identity
+from verifai_jax.core.compute.keys import IMPLEMENTATION
+from verifai_jax.core.compute.lifting import CAPACITY, LiftedNumbers
+from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.evaluation.differentiation import Derivative, reverse_refused
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.row import Inputs, Packing, Row, RowFunction

@@ -21,10 +21,10 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.core.progress import write_line
-from verifai_jax.core.sources import Sources, list_changes
+from verifai_jax.core.display.progress import write_line
 from verifai_jax.core.store.cache import Cache, CacheError, locked_cache
 from verifai_jax.core.store.log import Arrays
+from verifai_jax.core.user_code.sources import Sources, list_changes
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.kept_work import PRESENT
 from verifai_jax.evaluation.verdicts import RowVerdict, Verdicts

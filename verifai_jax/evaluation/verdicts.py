@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.mtl import hard, robustness, satisfied
 from verifai_jax.mtl.semantics import Semantics
 from verifai_jax.problem.problem import Problem

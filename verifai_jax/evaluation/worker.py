@@ -15,11 +15,11 @@ import jax
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from verifai_jax.core.compilation import Slot
-from verifai_jax.core.devices import describe_processor
-from verifai_jax.core.executors import Shipment
-from verifai_jax.core.keys import as_key
-from verifai_jax.core.precision import reproducible_settings
+from verifai_jax.core.compute.compilation import Slot
+from verifai_jax.core.compute.devices import describe_processor
+from verifai_jax.core.compute.executors import Shipment
+from verifai_jax.core.compute.keys import as_key
+from verifai_jax.core.compute.precision import reproducible_settings
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.guidance import Guidance
 from verifai_jax.evaluation.host_engine import HostEngine

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from verifai_jax import search as searches
-from verifai_jax.core.callbacks import Callback, check_callbacks
-from verifai_jax.core.checks import check_options
-from verifai_jax.core.compilation import tracing
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.precision import in_precision, reproducible_settings
-from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.compute.compilation import tracing
+from verifai_jax.core.compute.precision import in_precision, reproducible_settings
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.checks import check_options
+from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.store.locks import write_lock, writing
+from verifai_jax.core.user_code.callbacks import Callback, check_callbacks
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification import cheap as cheaply
 from verifai_jax.falsification.derived import as_simulated
@@ -59,7 +59,7 @@ from verifai_jax.search.suggested import without_suggestions
 if TYPE_CHECKING:
     import pandas as pd
 
-    from verifai_jax.core.executors import Executor
+    from verifai_jax.core.compute.executors import Executor
     from verifai_jax.features.given import Rows
     from verifai_jax.statistics.stopping import StoppingRule
     from verifai_jax.verification import Verification

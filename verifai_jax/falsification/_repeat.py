@@ -19,15 +19,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from verifai_jax.core.checks import check_options
-from verifai_jax.core.compilation import Slot
-from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.keys import run_keys, simulation_key
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.precision import in_precision, reproducible_settings
-from verifai_jax.core.progress import count_done, say_done, shows_progress
-from verifai_jax.core.trace import Status
+from verifai_jax.core.compute.compilation import Slot
+from verifai_jax.core.compute.devices import enable_compile_cache, spread_over_devices
+from verifai_jax.core.compute.keys import run_keys, simulation_key
+from verifai_jax.core.compute.precision import in_precision, reproducible_settings
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.display.progress import count_done, say_done, shows_progress
+from verifai_jax.core.messages.checks import check_options
+from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.values.trace import Status
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.verdicts import violations
@@ -158,7 +158,7 @@ def repeat(
       each seed only the first violations are replayed, until one is claimed (all of them without
       `stop_early`), those of all seeds together. False to count violations as simulated, which
       compiles nothing but the search.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
 
     A search that plans its rounds learns that an unclaimed violation is none, as in `falsify`. Any
     other that learns has its rounds compiled together and learns from them as simulated: after a

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Int, Shaped
 
+from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store.files import checksum
-from verifai_jax.core.text import one_line
-from verifai_jax.core.trace import Status
+from verifai_jax.core.values.trace import Status
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 

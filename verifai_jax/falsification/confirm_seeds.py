@@ -11,8 +11,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.core.compilation import Slot, pad_rows
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.compute.compilation import Slot, pad_rows
+from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.evaluation.confirmer import LIMIT, Confirmer
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.problem.problem import Problem

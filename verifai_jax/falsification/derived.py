@@ -9,7 +9,7 @@ own, `--only` holds features. Whoever goes on with the run names the problem as 
 from collections.abc import Mapping
 from typing import Any
 
-from verifai_jax.core.lazy import lazy_import
+from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.problem.problem import Problem
 
 

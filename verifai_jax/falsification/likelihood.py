@@ -12,7 +12,7 @@ failures that it has found.
 import numpy as np
 from jaxtyping import Bool, Float
 
-from verifai_jax.core.clauses import ABSENT
+from verifai_jax.core.values.clauses import ABSENT
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.features import FeatureSpace
 from verifai_jax.features.improbability import Improbability

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.core.clauses import CLAUSES
-from verifai_jax.core.compilation import Slot, options_of
-from verifai_jax.core.keys import run_keys, simulation_key
-from verifai_jax.core.progress import count_done
+from verifai_jax.core.compute.compilation import Slot, options_of
+from verifai_jax.core.compute.keys import run_keys, simulation_key
+from verifai_jax.core.display.progress import count_done
+from verifai_jax.core.values.clauses import CLAUSES
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.verdicts import Verdicts

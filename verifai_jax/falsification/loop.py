@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from verifai_jax.core.compilation import while_compiling
-from verifai_jax.core.keys import run_keys
-from verifai_jax.core.stopwatch import Stopwatch
+from verifai_jax.core.compute.compilation import while_compiling
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.compute.stopwatch import Stopwatch
 from verifai_jax.evaluation.confirmer import Confirmer
 from verifai_jax.evaluation.engine import Wanted
 from verifai_jax.evaluation.evaluator import Evaluator
@@ -40,7 +40,7 @@ from verifai_jax.search.search_program import compiled_search
 if TYPE_CHECKING:
     import pandas as pd
 
-    from verifai_jax.core.executors import Executor
+    from verifai_jax.core.compute.executors import Executor
     from verifai_jax.falsification.prefetch import Prefetch
     from verifai_jax.falsification.suggestions import Suggestions
     from verifai_jax.search import Suggested

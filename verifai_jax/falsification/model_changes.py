@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from verifai_jax.core.sources import Change, Sources, list_changes
-from verifai_jax.core.trace import Status
+from verifai_jax.core.user_code.sources import Change, Sources, list_changes
+from verifai_jax.core.values.trace import Status
 from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:

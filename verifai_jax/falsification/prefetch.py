@@ -19,7 +19,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.precision import reproducible_settings
+from verifai_jax.core.compute.precision import reproducible_settings
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
 from verifai_jax.evaluation.verdicts import Verdicts

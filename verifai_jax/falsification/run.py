@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from verifai_jax.core.keys import run_keys
-from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.sources import Change
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.user_code.sources import Change
 from verifai_jax.evaluation.confirmations import describe_checks
 from verifai_jax.falsification.model_changes import (
     NEAR,

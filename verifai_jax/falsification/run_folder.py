@@ -20,13 +20,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.sources import Sources
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store import files
 from verifai_jax.core.store.files import DamagedError
 from verifai_jax.core.store.locks import write_lock
 from verifai_jax.core.store.log import Log, write_log
-from verifai_jax.core.text import one_line
+from verifai_jax.core.user_code.sources import Sources
 from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.segments import FAILURES, SEGMENTS, list_segments

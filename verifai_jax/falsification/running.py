@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from verifai_jax import search as searches
 from verifai_jax._version import __version__
-from verifai_jax.core.callbacks import Callback, notify
-from verifai_jax.core.compilation import tracing
-from verifai_jax.core.progress import SimulationProgress, write_line
-from verifai_jax.core.sources import Sources
-from verifai_jax.core.stopwatch import Stopwatch
+from verifai_jax.core.compute.compilation import tracing
+from verifai_jax.core.compute.stopwatch import Stopwatch
+from verifai_jax.core.display.progress import SimulationProgress, write_line
+from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store.locks import writing
-from verifai_jax.core.text import one_line
-from verifai_jax.core.user_errors import explain_user_error, format_user_error
+from verifai_jax.core.user_code.callbacks import Callback, notify
+from verifai_jax.core.user_code.sources import Sources
+from verifai_jax.core.user_code.user_errors import explain_user_error, format_user_error
 from verifai_jax.evaluation.backends import Choice
 from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
 from verifai_jax.falsification.run import Run

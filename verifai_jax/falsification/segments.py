@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Int
 
+from verifai_jax.core.messages.text import format_error, printable
 from verifai_jax.core.store.files import DamagedError, checksum, write_complete
-from verifai_jax.core.text import format_error, printable
 from verifai_jax.falsification.columns import ROW, Columns, column_to_arrow
 
 if TYPE_CHECKING:

@@ -23,16 +23,16 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax import search as searches
-from verifai_jax.core.checks import check_count, check_options
-from verifai_jax.core.devices import describe_processor
-from verifai_jax.core.keys import run_keys
-from verifai_jax.core.precision import reproducible_settings
-from verifai_jax.core.progress import SimulationProgress
-from verifai_jax.core.sources import Sources, list_changes
+from verifai_jax.core.compute.devices import describe_processor
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.compute.precision import reproducible_settings
+from verifai_jax.core.display.progress import SimulationProgress
+from verifai_jax.core.messages.checks import check_count, check_options
+from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store.files import DamagedError
 from verifai_jax.core.store.locks import LOCK, write_lock, writing
 from verifai_jax.core.store.log import Log
-from verifai_jax.core.text import one_line
+from verifai_jax.core.user_code.sources import Sources, list_changes
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.executor_engine import TOGETHER

@@ -14,7 +14,7 @@ from typing import cast
 import jax
 import numpy as np
 
-from verifai_jax.core.compilation import Slot, compile_soon
+from verifai_jax.core.compute.compilation import Slot, compile_soon
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.falsification.table import ErrorTable

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.compilation import power_of_two
+from verifai_jax.core.compute.compilation import power_of_two
 from verifai_jax.evaluation.engine import Wanted
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.guidance import Guidance
@@ -27,7 +27,7 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 
 if TYPE_CHECKING:
-    from verifai_jax.core.executors import Executor
+    from verifai_jax.core.compute.executors import Executor
     from verifai_jax.evaluation.journal import Journal
 MAX_DIFFERENTIATED = 16
 """Rows whose clauses are differentiated in one call of the engine."""

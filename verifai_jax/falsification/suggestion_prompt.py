@@ -15,8 +15,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Key
 
-from verifai_jax.core.text import format_error, one_line
-from verifai_jax.core.trace import Status
+from verifai_jax.core.messages.text import format_error, one_line
+from verifai_jax.core.values.trace import Status
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.features import Domain
 from verifai_jax.features.plain import to_plain

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from verifai_jax.core.forks import returning_once
-from verifai_jax.core.text import format_error, one_line
+from verifai_jax.core.messages.text import format_error, one_line
+from verifai_jax.core.user_code.forks import returning_once
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.features.given import given_features, given_rows
 from verifai_jax.problem.problem import Problem

@@ -8,8 +8,8 @@ failure rate 3.02 % (95 % interval 2.79 % to 3.27 %) as simulated
 
 import numpy as np
 
-from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.text import format_features, format_percent, one_line, printable
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.messages.text import format_features, format_percent, one_line, printable
 from verifai_jax.evaluation.confirmations import UNDECIDED
 from verifai_jax.falsification.no_rate import remedy, why_no_rate
 from verifai_jax.falsification.run import Run

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
-from verifai_jax.core.compilation import Slot
-from verifai_jax.core.cube import Cube
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.compute.compilation import Slot
+from verifai_jax.core.values.cube import Cube
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.trace_form import TraceForm, signals_of
 from verifai_jax.mtl import hard, smooth

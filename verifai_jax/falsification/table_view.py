@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Int
 
-from verifai_jax.core.notebook import InNotebook, frame_html
+from verifai_jax.core.display.notebook import InNotebook, frame_html
 from verifai_jax.core.store.files import record_checksum
 from verifai_jax.falsification import segments
 from verifai_jax.falsification.columns import (

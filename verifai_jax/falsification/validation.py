@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax import search as searches
-from verifai_jax.core.errors import check_names, unknown_name
+from verifai_jax.core.messages.errors import check_names, unknown_name
+from verifai_jax.core.messages.text import format_error, one_line
 from verifai_jax.core.store.locks import LOCK, write_lock
-from verifai_jax.core.text import format_error, one_line
 from verifai_jax.evaluation.engine import WANTED, Wanted
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.run_folder import RECORD
@@ -26,7 +26,7 @@ from verifai_jax.systems.base import System
 if TYPE_CHECKING:
     import pandas as pd
 
-    from verifai_jax.core.executors import Executor
+    from verifai_jax.core.compute.executors import Executor
     from verifai_jax.statistics.stopping import StoppingRule
 MAX_AT_ONCE = 131_072
 """Simulations of a round at most, by default. A million cart-poles take 0.77 of the processor time

@@ -9,7 +9,7 @@ vj.falsify(faulty)
 
 from typing import TYPE_CHECKING
 
-from verifai_jax.core.lazy import attach
+from verifai_jax.core.display.lazy import attach
 
 if TYPE_CHECKING:
     from verifai_jax.faults.fault import AtMost as AtMost

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from verifai_jax.core.checks import check_count, check_name, is_number
+from verifai_jax.core.messages.checks import check_count, check_name, is_number
 from verifai_jax.features import Categorical, Domain, Struct
 from verifai_jax.systems.delays import line_of
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PyTree
 
-from verifai_jax.core.errors import check_names
+from verifai_jax.core.messages.errors import check_names
 from verifai_jax.faults.chance import uniform
 from verifai_jax.faults.fault import AtMost, Fault, FaultFeatures, Moment
 from verifai_jax.faults.kinds import WrongChannel

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
-from verifai_jax.core.text import format_percent
-from verifai_jax.core.user_errors import explain_user_error
+from verifai_jax.core.messages.text import format_percent
+from verifai_jax.core.user_code.user_errors import explain_user_error
 
 SAMPLES = 65_536
 """Greatest number of samples of the prior: if it accepts none of them, at most 0.005 % of the prior

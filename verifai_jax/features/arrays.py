@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.values.waveform import Waveform
 from verifai_jax.features.domain import Domain, Row, as_numbers, cell, centre, dotted, indexed
 from verifai_jax.features.facts import Facts, integer_facts
 

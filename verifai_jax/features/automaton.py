@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import unknown_name
-from verifai_jax.core.events import ABSENT, Events
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.errors import unknown_name
+from verifai_jax.core.values.events import ABSENT, Events
 from verifai_jax.features.domain import Domain, Row, as_real, cell, centre, dotted, indexed
 from verifai_jax.features.event_tables import EventTables
 from verifai_jax.features.facts import Facts, integer_facts, joined_facts

@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from verifai_jax.core.lifting import is_lifting, lifted
+from verifai_jax.core.compute.lifting import is_lifting, lifted
 from verifai_jax.features.domain import (
     MAX_LEVELS,
     MAX_REAL,

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree, Shaped
 
-from verifai_jax.core.checks import check_name
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.messages.checks import check_name
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.features.domain import (
     MAX_LEVELS,
     MAX_REAL,

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
-from verifai_jax.core.checks import check_name
-from verifai_jax.core.errors import check_names
+from verifai_jax.core.messages.checks import check_name
+from verifai_jax.core.messages.errors import check_names
 from verifai_jax.features.box import Box
 from verifai_jax.features.domain import Domain, Row, dotted
 

@@ -15,7 +15,7 @@ from jax.scipy.special import ndtri
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, PyTree
 
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.features.domain import (
     MAX_REAL,
     MIN_REAL,

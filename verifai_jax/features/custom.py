@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.features.continuous import HIGHEST, OUTERMOST, Continuous, at_least
 from verifai_jax.features.ends import replace_where
 from verifai_jax.features.english import quantile_words

@@ -23,8 +23,8 @@ import numpy as np
 from jax import dtypes
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from verifai_jax.core.notebook import ForUsers
-from verifai_jax.core.text import one_line
+from verifai_jax.core.display.notebook import ForUsers
+from verifai_jax.core.messages.text import one_line
 from verifai_jax.features.facts import Facts, drawn_facts
 
 MAX_LEVELS = 2**20

@@ -17,7 +17,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
-from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.messages.errors import unknown_name
 
 CLOSED = ("both", "left", "right", "neither")
 """Which ends of an interval belong to it, as in pandas."""

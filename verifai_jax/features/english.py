@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from verifai_jax.core.text import one_line
+from verifai_jax.core.messages.text import one_line
 
 
 def number(value: Any) -> str:

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.core.events import ABSENT
+from verifai_jax.core.values.events import ABSENT
 from verifai_jax.features.domain import Domain
 from verifai_jax.features.transitions import Graph, Transition
 

@@ -8,7 +8,7 @@
 An `Automaton` is a domain like any other; a system gets an `Events`.
 """
 
-from verifai_jax.core.events import Events as Events
+from verifai_jax.core.values.events import Events as Events
 from verifai_jax.features.automaton import Automaton as Automaton
 from verifai_jax.features.transitions import Past as Past
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.features.domain import Domain, Row, as_scalar
 from verifai_jax.features.english import number
 

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PyTree
 
-from verifai_jax.core.errors import check_names, unknown_name
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.messages.errors import check_names, unknown_name
 from verifai_jax.features.arrays import Array, VariableArray
 from verifai_jax.features.box import Box
 from verifai_jax.features.compound import Struct

@@ -17,8 +17,8 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.core.compilation import pad_rows
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.compute.compilation import pad_rows
+from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.features.arrays import Array, VariableArray
 from verifai_jax.features.box import Box, DiscreteBox
 from verifai_jax.features.choice import Categorical, Constant

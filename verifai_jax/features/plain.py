@@ -9,8 +9,8 @@ from typing import Any
 
 from jaxtyping import PyTree
 
-from verifai_jax.core.errors import unknown_name
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.messages.errors import unknown_name
 from verifai_jax.features.arrays import Array, VariableArray
 from verifai_jax.features.automaton import Automaton
 from verifai_jax.features.box import Box

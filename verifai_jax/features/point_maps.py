@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from verifai_jax.core.cube import Cube
-from verifai_jax.core.errors import unknown_name
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.messages.errors import unknown_name
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.features.arrays import Array as ArrayDomain
 from verifai_jax.features.arrays import Items, VariableArray
 from verifai_jax.features.box import Box

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.features.space import FeatureSpace
 
 ROUNDINGS = 8

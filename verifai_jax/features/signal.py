@@ -10,9 +10,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
-from verifai_jax.core.errors import unknown_name
-from verifai_jax.core.text import format_seconds
-from verifai_jax.core.waveform import (
+from verifai_jax.core.messages.errors import unknown_name
+from verifai_jax.core.messages.text import format_seconds
+from verifai_jax.core.values.waveform import (
     HELD,
     HOLDS,
     Waveform,

@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
-from verifai_jax.core.errors import check_names, unknown_name
-from verifai_jax.core.notebook import ForUsers, rows_html
+from verifai_jax.core.display.notebook import ForUsers, rows_html
+from verifai_jax.core.messages.errors import check_names, unknown_name
 from verifai_jax.features.acceptance import acceptance_rate
 from verifai_jax.features.compound import Struct
 from verifai_jax.features.custom import Distribution

@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int, PyTree
 
-from verifai_jax.core.checks import check_count, check_positive
-from verifai_jax.core.errors import nearest_names, unknown_name
-from verifai_jax.core.events import ABSENT, Events
+from verifai_jax.core.messages.checks import check_count, check_positive
+from verifai_jax.core.messages.errors import nearest_names, unknown_name
+from verifai_jax.core.values.events import ABSENT, Events
 from verifai_jax.features.domain import Domain, Row, as_numbers, as_real, dotted, indexed
 from verifai_jax.features.event_tables import EventTables
 from verifai_jax.features.transitions import Past, Transition

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.text import LONG, STAMPS, format_seconds, format_time
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.messages.text import LONG, STAMPS, format_seconds, format_time
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl._robustness import satisfied
 from verifai_jax.mtl.evaluate import End, Evaluator
 from verifai_jax.mtl.formula import Formula, surface

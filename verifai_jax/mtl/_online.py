@@ -24,8 +24,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from verifai_jax.core.errors import missing_name
-from verifai_jax.core.gaps import with_gaps
+from verifai_jax.core.messages.errors import missing_name
+from verifai_jax.core.values.gaps import with_gaps
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import Evaluator
 from verifai_jax.mtl.expression import durations_in

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from decimal import Decimal, DecimalException
 from typing import Any
 
-from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.messages.errors import unknown_name
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.expression_builder import MAX_DEPTH, ExpressionBuilder, Part
 from verifai_jax.mtl.formula import Formula, Interval

@@ -20,8 +20,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PyTree
 
-from verifai_jax.core.text import format_seconds
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.messages.text import format_seconds
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import windows
 from verifai_jax.mtl._smoothing_error import error_of_setting
 from verifai_jax.mtl.evaluate import End

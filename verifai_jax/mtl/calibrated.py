@@ -23,8 +23,8 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.errors import missing_name
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.messages.errors import missing_name
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.formula import Formula, Interval

@@ -18,8 +18,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from verifai_jax.core.clauses import ABSENT, CLAUSES
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.clauses import ABSENT, CLAUSES
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._robustness import robustness
 from verifai_jax.mtl.evaluate import End, Evaluator

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from verifai_jax.core.errors import require
+from verifai_jax.core.messages.errors import require
 
 Table: TypeAlias = Any
 """An Arrow table, whose package has no types."""

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl.evaluate import End, Evaluator
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.semantics import hard

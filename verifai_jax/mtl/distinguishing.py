@@ -12,11 +12,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.notebook import InNotebook, picture_html
-from verifai_jax.core.text import counted
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.display.figure import Drawn
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.display.notebook import InNotebook, picture_html
+from verifai_jax.core.messages.text import counted
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.free_traces import GENERATIONS, LANES, FreeTraces

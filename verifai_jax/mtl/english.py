@@ -7,7 +7,7 @@ formula_words(parse("always[0, 4] abs(x) <= 2.4"))
 import functools
 import math
 
-from verifai_jax.core.text import format_seconds
+from verifai_jax.core.messages.text import format_seconds
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.expression import Duration
 from verifai_jax.mtl.formula import Formula, Interval, Term, surface

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from verifai_jax.core.text import format_seconds
+from verifai_jax.core.messages.text import format_seconds
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl import windows
 from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal

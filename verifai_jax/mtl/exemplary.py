@@ -20,9 +20,9 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.notebook import InNotebook, picture_html
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.display.figure import Drawn
+from verifai_jax.core.display.notebook import InNotebook, picture_html
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._robustness import robustness
 from verifai_jax.mtl.evaluate import End

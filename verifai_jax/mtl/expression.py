@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from operator import methodcaller
 
-from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.messages.errors import unknown_name
 from verifai_jax.mtl.formula import Formula, Next, Predicate, Prev, Term, Witness, formula
 from verifai_jax.mtl.tree import Node, postorder
 from verifai_jax.mtl.words import FUNCTIONS, NUMBERS, name_text, number_text

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
-from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.messages.errors import unknown_name
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.expression import (
     Arithmetic,

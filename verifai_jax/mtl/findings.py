@@ -5,8 +5,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from verifai_jax.core.notebook import InNotebook, frame_html
-from verifai_jax.core.text import counted, listed
+from verifai_jax.core.display.notebook import InNotebook, frame_html
+from verifai_jax.core.messages.text import counted, listed
 from verifai_jax.mtl.requirements import Requirement
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
-from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.machine_code import Unavailable, compile_library
-from verifai_jax.core.text import counted
+from verifai_jax.core.compute.machine_code import Unavailable, compile_library
+from verifai_jax.core.messages.text import counted
+from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.mtl.c_monitor import export_c
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.margins import margins

@@ -17,8 +17,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import ClassVar, TypeAlias, Union
 
-from verifai_jax.core.errors import unknown_name
-from verifai_jax.core.lazy import lazy_import
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.messages.errors import unknown_name
 from verifai_jax.mtl.tree import EVERYTHING as EVERYTHING
 from verifai_jax.mtl.tree import Interval as Interval
 from verifai_jax.mtl.tree import Node, Tree

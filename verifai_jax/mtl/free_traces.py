@@ -16,7 +16,7 @@ from fractions import Fraction
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl.bounds import predicates_of, signal_bounds
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.expression import (

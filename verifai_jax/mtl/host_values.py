@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.errors import missing_name
-from verifai_jax.core.trace import Trace, without_wrapping
+from verifai_jax.core.messages.errors import missing_name
+from verifai_jax.core.values.trace import Trace, without_wrapping
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.evaluate import End, check_scalar, check_vector, samples, seconds_held
 from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal

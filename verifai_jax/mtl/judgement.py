@@ -10,10 +10,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.notebook import InNotebook, frame_html
-from verifai_jax.core.text import counted, printable, shorten
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.display.notebook import InNotebook, frame_html
+from verifai_jax.core.messages.text import counted, printable, shorten
+from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.mtl.requirements import Requirement
 
 if TYPE_CHECKING:

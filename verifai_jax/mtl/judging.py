@@ -16,11 +16,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.errors import missing_name
-from verifai_jax.core.executors import Executor, check_executor, gather
-from verifai_jax.core.progress import count_done, shows_progress
-from verifai_jax.core.text import format_time, one_line
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.compute.executors import Executor, check_executor, gather
+from verifai_jax.core.display.progress import count_done, shows_progress
+from verifai_jax.core.messages.errors import missing_name
+from verifai_jax.core.messages.text import format_time, one_line
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl._robustness import first_nan
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.formula import Formula
@@ -81,7 +81,7 @@ def judge(
     - `executor`: anything with `concurrent.futures`' `submit` to read and judge in parallel; the
       process pool must not fork.
     - `ended`: called with the index and the rows of each recording as it ends.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Raises:** `ValueError` for no requirement, no recording, `resample_to` without `method`;
     `FileNotFoundError` for a folder or a file that does not exist.
     """

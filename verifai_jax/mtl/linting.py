@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from verifai_jax.core.errors import nearest_names
-from verifai_jax.core.text import counted, format_seconds, listed
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.messages.errors import nearest_names
+from verifai_jax.core.messages.text import counted, format_seconds, listed
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.bounds import predicates_of
 from verifai_jax.mtl.distinguishing import free_difference

@@ -21,12 +21,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from verifai_jax.core.checks import check_fraction
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.text import format_percent
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.display.figure import Drawn
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.messages.checks import check_fraction
+from verifai_jax.core.messages.text import format_percent
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.host_values import HostValues
@@ -126,7 +126,7 @@ def mine(
     - `constants`, `definitions`: as of `parse`; a constant can fix a parameter's value.
     - `confidence`: the confidence of the interval for the rate of recordings that break it.
     - `budget`, `seed`: simulations of the search at most, and its seed, for a problem.
-    - `progress`: whether to show one line of progress for a problem; see `core.progress`.
+    - `progress`: whether to show one line of progress for a problem; see `core.display.progress`.
     **Raises:** `FormulaSyntaxError`; `ValueError` for more than two parameters, one in which the
     formula is not monotone, or one that nothing bounds or that no value satisfies.
     """

@@ -14,9 +14,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeAlias
 
-from verifai_jax.core.notebook import Tabular
-from verifai_jax.core.text import counted
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.display.notebook import Tabular
+from verifai_jax.core.messages.text import counted
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.distinguishing import free_difference
 from verifai_jax.mtl.evaluate import End, IntervalError

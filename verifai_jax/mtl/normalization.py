@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Real
 
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.messages.errors import check_names
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.evaluate import Evaluator
 from verifai_jax.mtl.expression import Expression, Number, expression

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
 
-from verifai_jax.core.errors import check_names
+from verifai_jax.core.messages.errors import check_names
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.expression import (

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.figure import Axes, Figure, new_figure
-from verifai_jax.core.text import format_seconds
+from verifai_jax.core.display.figure import Axes, Figure, new_figure
+from verifai_jax.core.messages.text import format_seconds
+from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.mtl._explain import Explanation, Node, heading
 from verifai_jax.mtl.evaluate import Evaluator
 from verifai_jax.mtl.formula import Term

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeAlias, Union, runtime_checkable
 
-from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl.containers import Episode, episodes_of, lerobot_files
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.recording import ENDINGS, read

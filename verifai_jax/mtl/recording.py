@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from verifai_jax.core.errors import missing_name
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.messages.errors import missing_name
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import containers
 from verifai_jax.mtl.columns import LeftOut, epoch_unit, is_numeric, numbers_of, seconds_of
 from verifai_jax.mtl.containers import UNIT, Episode, Table

@@ -21,10 +21,10 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
-from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.foreign_files import read_xml, read_yaml
-from verifai_jax.core.reads import documents
+from verifai_jax.core.messages.errors import check_names
+from verifai_jax.core.store.atomic_files import replacing
+from verifai_jax.core.store.foreign_files import read_xml, read_yaml
+from verifai_jax.core.user_code.reads import documents
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.setting import as_formula

@@ -14,9 +14,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.text import format_seconds, format_time
-from verifai_jax.core.trace import Trace, check_period
+from verifai_jax.core.messages.errors import check_names
+from verifai_jax.core.messages.text import format_seconds, format_time
+from verifai_jax.core.values.trace import Trace, check_period
 from verifai_jax.mtl.setting import since_first
 
 Method = Literal["hold", "linear"]

@@ -10,9 +10,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Real
 
-from verifai_jax.core.errors import missing_name
-from verifai_jax.core.text import format_seconds, format_time
-from verifai_jax.core.trace import Samples, Trace, as_array, check_period
+from verifai_jax.core.messages.errors import missing_name
+from verifai_jax.core.messages.text import format_seconds, format_time
+from verifai_jax.core.values.trace import Samples, Trace, as_array, check_period
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.columns import LeftOut
 from verifai_jax.mtl.evaluate import End, Evaluator

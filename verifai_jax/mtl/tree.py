@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
-from verifai_jax.core.notebook import ForUsers
+from verifai_jax.core.display.notebook import ForUsers
 from verifai_jax.mtl.words import OPERATORS, Operator, number_text
 
 N = TypeVar("N", bound="Node")

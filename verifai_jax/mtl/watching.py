@@ -19,9 +19,9 @@ from typing import Any, Generic, TypeAlias, TypeVar, overload
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.errors import missing_name
-from verifai_jax.core.gaps import with_gaps
-from verifai_jax.core.machine_code import Unavailable, compiler, library_file
+from verifai_jax.core.compute.machine_code import Unavailable, compiler, library_file
+from verifai_jax.core.messages.errors import missing_name
+from verifai_jax.core.values.gaps import with_gaps
 from verifai_jax.mtl.c_monitor import HEAD, HELPERS, monitor_code
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.margins import Margins, margins

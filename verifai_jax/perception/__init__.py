@@ -6,7 +6,7 @@ folder, `compositional`, is imported when it is first used.
 
 from typing import Any
 
-from verifai_jax.core.lazy import lazy_import
+from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.perception._detector import (
     Detection,
     Detector,

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from verifai_jax.core.atomic_files import replacing
+from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.perception.camera import STATIC, described
 
 FORMAT = "verifai_jax detector 1"

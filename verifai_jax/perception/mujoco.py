@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from verifai_jax.core.errors import missing_name
+from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.perception.camera import Camera
 from verifai_jax.perception.ground import Ground
 from verifai_jax.perception.light import Sky, Sun

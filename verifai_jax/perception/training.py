@@ -15,9 +15,9 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.progress import say_done, shows_progress
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.display.progress import say_done, shows_progress
+from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.perception._detector import Detection, Detector, Layer, detector
 
 
@@ -61,7 +61,7 @@ def train_detector(
     - `learning_rate`: the learning rate of the first step.
     - `noise`: standard deviation of what is added to each pixel, anew in each step.
     - `seed`: the seed of the weights, the order of the images and the noise.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** the network, and the loss of each step.
     **Raises:** `ValueError` where images and labels do not fit.
     """

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from verifai_jax.core.checks import check_count, is_number
-from verifai_jax.core.trace import Trace, as_array
+from verifai_jax.core.messages.checks import check_count, is_number
+from verifai_jax.core.values.trace import Trace, as_array
 from verifai_jax.mtl import Formula
 from verifai_jax.mtl.clauses import Goals, goals_of
 from verifai_jax.mtl.evaluate import End

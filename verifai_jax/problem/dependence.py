@@ -27,10 +27,10 @@ import jax.numpy as jnp
 from jax.interpreters import ad
 from jaxtyping import Array, Key, PyTree
 
-from verifai_jax.core import fingerprint
-from verifai_jax.core.compilation import Slot
-from verifai_jax.core.jaxprs import CALLS, called
-from verifai_jax.core.precision import truncate_silently
+from verifai_jax.core.compute import fingerprint
+from verifai_jax.core.compute.compilation import Slot
+from verifai_jax.core.compute.jaxprs import CALLS, called
+from verifai_jax.core.compute.precision import truncate_silently
 from verifai_jax.problem.problem import Problem
 
 

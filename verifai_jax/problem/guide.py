@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from verifai_jax.core.checks import check_fraction, check_positive
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.messages.checks import check_fraction, check_positive
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import Formula, hard, parse, robustness
 from verifai_jax.mtl.evaluate import End
 

@@ -2,8 +2,8 @@
 
 import jax
 
-from verifai_jax.core.fingerprint import fingerprint, identity, stable_text
-from verifai_jax.core.precision import truncate_silently
+from verifai_jax.core.compute.fingerprint import fingerprint, identity, stable_text
+from verifai_jax.core.compute.precision import truncate_silently
 from verifai_jax.problem.problem import Problem
 
 

@@ -17,23 +17,23 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from verifai_jax.core.checks import check_name
-from verifai_jax.core.compilation import ProgramCache, Slot
-from verifai_jax.core.errors import missing_name
-from verifai_jax.core.fingerprint import alone_only, describe_step
-from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.notebook import InNotebook, text_html
-from verifai_jax.core.precision import truncate_silently
-from verifai_jax.core.source_collection import made_here, sources_of
-from verifai_jax.core.sources import Maker, Sources
-from verifai_jax.core.text import is_control, printable
-from verifai_jax.core.trace import Trace
-from verifai_jax.core.user_errors import (
+from verifai_jax.core.compute.compilation import ProgramCache, Slot
+from verifai_jax.core.compute.fingerprint import alone_only, describe_step
+from verifai_jax.core.compute.precision import truncate_silently
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.display.notebook import InNotebook, text_html
+from verifai_jax.core.messages.checks import check_name
+from verifai_jax.core.messages.errors import missing_name
+from verifai_jax.core.messages.text import is_control, printable
+from verifai_jax.core.user_code.source_collection import made_here, sources_of
+from verifai_jax.core.user_code.sources import Maker, Sources
+from verifai_jax.core.user_code.user_errors import (
     check_called_with,
     defined_at,
     explain_user_error,
     user_line,
 )
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.mtl import Formula, hard, parse, robustness
 from verifai_jax.mtl.deciding import leaves_of

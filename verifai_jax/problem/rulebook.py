@@ -19,7 +19,7 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from verifai_jax.core.errors import check_names
+from verifai_jax.core.messages.errors import check_names
 
 Violation: TypeAlias = Sequence[float] | Shaped[np.ndarray, " k"]
 """By how much a row breaks each rule: numbers, 0 where a rule is kept, or truth values."""

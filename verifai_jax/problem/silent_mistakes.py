@@ -17,11 +17,11 @@ import numpy as np
 from jax.extend.core import Jaxpr, JaxprEqn, Literal
 from jaxtyping import PyTree
 
-from verifai_jax.core.compilation import Slot
-from verifai_jax.core.fingerprint import PROGRAM, used_inputs
-from verifai_jax.core.precision import truncate_silently
-from verifai_jax.core.text import format_seconds
-from verifai_jax.core.user_errors import source_line
+from verifai_jax.core.compute.compilation import Slot
+from verifai_jax.core.compute.fingerprint import PROGRAM, used_inputs
+from verifai_jax.core.compute.precision import truncate_silently
+from verifai_jax.core.messages.text import format_seconds
+from verifai_jax.core.user_code.user_errors import source_line
 from verifai_jax.features import Domain
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import System

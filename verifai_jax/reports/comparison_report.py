@@ -1,6 +1,6 @@
 """The report on a comparison: which candidate fails more often, by how much, and where."""
 
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.estimation.comparison.result import BETTER, SAME, WORSE, Comparison
 from verifai_jax.features.english import number
 from verifai_jax.problem.problem import Problem

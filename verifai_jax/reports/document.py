@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from verifai_jax.analysis import OperationalDomain
-from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.errors import check_names
+from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.estimation.comparison.result import Comparison, Transfer
 from verifai_jax.estimation.error_budgets.result import ErrorBudget
 from verifai_jax.estimation.result import Estimate
@@ -76,7 +76,7 @@ def write_report(
       its units, and its reasons with their sources, are those of features without others.
     - `assessment`: whether sections for an assessor follow: the claims as a tree, the nine steps of
       credibility with boxes to be filled in, and a page to be signed.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Raises:** `UnknownNameError` for a unit or a reason of a feature that does not exist;
     `ValueError` for a number of simulations that is none, and for a run whose rows have changed
     since they were written;

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.estimation.result import METHODS, Estimate
 from verifai_jax.problem.model_digest import digest_of_model
 from verifai_jax.problem.problem import Problem

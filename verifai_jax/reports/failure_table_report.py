@@ -1,6 +1,6 @@
 """The report on a failure table: what each fault does, how probable that is, and its replay."""
 
-from verifai_jax.core.text import format_percent, format_seconds
+from verifai_jax.core.messages.text import format_percent, format_seconds
 from verifai_jax.faults.failure_table.result import Effect, FailureTable
 from verifai_jax.problem.problem import Problem
 from verifai_jax.reports.claims import Claim

@@ -2,7 +2,7 @@
 
 import math
 
-from verifai_jax.core.text import counted, format_time
+from verifai_jax.core.messages.text import counted, format_time
 from verifai_jax.mtl.judgement import Judgement, Row
 from verifai_jax.reports.claims import Claim, claims_json
 from verifai_jax.reports.markup import Child, Markup, bullets, element, table

@@ -13,7 +13,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
-from verifai_jax.core.text import printable
+from verifai_jax.core.messages.text import printable
 
 VOID = frozenset({"br", "hr", "img", "meta", "input"})
 """Elements without content and without an end tag."""

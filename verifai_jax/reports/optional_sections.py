@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from verifai_jax.analysis import OddCoverage
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.estimation.error_budgets.result import ErrorBudget
 from verifai_jax.estimation.failure_modes import Mode, Modes
 from verifai_jax.features.english import number

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from verifai_jax._version import __version__
-from verifai_jax.core.atomic_files import replacing
+from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.reports.markup import Markup, bullets, data_block, element, join
 
 

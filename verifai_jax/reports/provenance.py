@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from verifai_jax._version import __version__
-from verifai_jax.core.sources import Change, Sources, file_hash, list_changes
-from verifai_jax.core.sources import Source as Input
+from verifai_jax.core.user_code.sources import Change, Sources, file_hash, list_changes
+from verifai_jax.core.user_code.sources import Source as Input
 
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "pandas", "scikit-learn", "matplotlib", "mujoco")
 """Packages whose versions decide numbers and pictures."""

@@ -3,8 +3,8 @@
 import math
 from collections.abc import Iterable
 
-from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.messages.errors import UnknownNameError
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.evaluation.confirmations import MEANING, NOT_CLAIMED, VERDICTS
 from verifai_jax.falsification.no_rate import what_lies_between, why_no_rate
 from verifai_jax.falsification.run import Run

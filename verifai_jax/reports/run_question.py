@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from verifai_jax.core.text import format_seconds, one_line
+from verifai_jax.core.messages.text import format_seconds, one_line
 from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
 from verifai_jax.features.english import number

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from verifai_jax.core.text import format_features
+from verifai_jax.core.messages.text import format_features
 from verifai_jax.evaluation.confirmations import UNDECIDED, describe_checks
 from verifai_jax.falsification.no_rate import why_no_rate
 from verifai_jax.falsification.run import Run

@@ -10,8 +10,8 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
-from verifai_jax.core.sources import Sources
-from verifai_jax.core.text import one_line
+from verifai_jax.core.messages.text import one_line
+from verifai_jax.core.user_code.sources import Sources
 from verifai_jax.estimation.comparison.result import Compared, Comparison
 from verifai_jax.estimation.result import METHODS, Estimate
 from verifai_jax.features import FeatureSpace

@@ -14,8 +14,8 @@ import numpy as np
 
 from verifai_jax.analysis import Analysis, analyze
 from verifai_jax.analysis.counterexamples import Explained, Shrunk, explain, shrink
-from verifai_jax.core.figure import Figure
-from verifai_jax.core.text import format_error, one_line
+from verifai_jax.core.display.figure import Figure
+from verifai_jax.core.messages.text import format_error, one_line
 from verifai_jax.estimation.failure_modes import Modes
 from verifai_jax.estimation.failure_modes import modes as find_modes
 from verifai_jax.evaluation.replay import Replay

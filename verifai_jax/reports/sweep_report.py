@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.features.english import number
 from verifai_jax.reports.claims import Claim
 from verifai_jax.reports.commands import report_command

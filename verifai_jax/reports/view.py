@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Int
 
-from verifai_jax.core.text import one_line
+from verifai_jax.core.messages.text import one_line
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.falsification.counts import claimed_rows, violating_rows
 from verifai_jax.falsification.run import Run

@@ -7,7 +7,7 @@ import functools
 import logging
 from typing import Any
 
-from verifai_jax.core.text import format_error, one_line
+from verifai_jax.core.messages.text import format_error, one_line
 from verifai_jax.falsification.run import Run
 from verifai_jax.reports.page import asset
 from verifai_jax.reports.plotting.scatter import plot_features

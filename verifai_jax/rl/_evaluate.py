@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from verifai_jax.core.devices import Device, enable_compile_cache, spread_over_devices
-from verifai_jax.core.keys import IMPLEMENTATION
-from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.compute.devices import Device, enable_compile_cache, spread_over_devices
+from verifai_jax.core.compute.keys import IMPLEMENTATION
+from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.rl.batched_training import StaticTask, numbers_of
 from verifai_jax.rl.policy import Policy
 from verifai_jax.rl.task.task import State, Task
@@ -42,7 +42,7 @@ def evaluate(
     - `policy`: the policy to measure.
     - `seed`: the seed of the episodes' starts and of what is random in their steps.
     - `episodes`: their number.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** `[episodes]`, the sum of rewards of each episode.
     """
     numbers, _ = numbers_of(task)

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.core.callbacks import Callback, check_callbacks, notify
-from verifai_jax.core.progress import say_done, shows_progress
+from verifai_jax.core.display.progress import say_done, shows_progress
+from verifai_jax.core.user_code.callbacks import Callback, check_callbacks, notify
 from verifai_jax.rl.algorithm import Algorithm
 from verifai_jax.rl.batched_training import BatchedTraining, Configuration
 from verifai_jax.rl.policy import Policy
@@ -75,7 +75,7 @@ def train(
     - `callbacks`: functions called for each update, in groups every two seconds, with the
       environment steps so far and a dictionary of plain numbers: `update`, and `mean_return` where
       an episode ended in it.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** the policy with its learning curve.
     **Raises:** `ValueError` for hyper-parameters that cannot train, an algorithm that does not fit
     the task's actions, no steps, or checkpoints outside of the training.

@@ -6,7 +6,7 @@ algorithms_for(Discrete(2))               # ("ppo", "pqn")
 
 from typing import TypeAlias
 
-from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.messages.errors import unknown_name
 from verifai_jax.rl.ppo import PPO
 from verifai_jax.rl.pqn import PQN
 from verifai_jax.rl.sac import SAC

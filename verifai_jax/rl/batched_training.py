@@ -24,8 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Integer, PyTree
 
-from verifai_jax.core.compilation import power_of_two
-from verifai_jax.core.devices import (
+from verifai_jax.core.compute.compilation import power_of_two
+from verifai_jax.core.compute.devices import (
     Device,
     enable_compile_cache,
     split_sharding,

@@ -23,12 +23,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
-from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.checks import check_count, is_number
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.source_collection import made_here, sources_of
-from verifai_jax.core.text import one_line
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.messages.checks import check_count, is_number
+from verifai_jax.core.messages.errors import check_names
+from verifai_jax.core.messages.text import one_line
+from verifai_jax.core.store.atomic_files import replacing
+from verifai_jax.core.user_code.source_collection import made_here, sources_of
 from verifai_jax.rl.task.task import Action, Continuous, Discrete
 
 Layer = tuple[Float[Array | np.ndarray, "... _ _"], Float[Array | np.ndarray, "... _"]]

@@ -9,11 +9,11 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, cast
 
-from verifai_jax.core.errors import check_names, unknown_name
-from verifai_jax.core.lazy import attach, lazy_import
+from verifai_jax.core.display.lazy import attach, lazy_import
+from verifai_jax.core.messages.errors import check_names, unknown_name
 
 if TYPE_CHECKING:
-    from verifai_jax.core.cube import Cube as Cube
+    from verifai_jax.core.values.cube import Cube as Cube
     from verifai_jax.search._split import Split as Split
     from verifai_jax.search.annealing import Annealing as Annealing
     from verifai_jax.search.bandit import Bandit as Bandit

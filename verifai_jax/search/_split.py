@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from verifai_jax.core.cube import Cube
-from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.messages.errors import unknown_name
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Asked, Observations, Plan, Search, Wants
 
 

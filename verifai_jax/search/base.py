@@ -18,10 +18,10 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from verifai_jax.core.checks import check_count, check_fraction, check_positive
-from verifai_jax.core.clauses import CLAUSES, OUTCOME
-from verifai_jax.core.cube import Cube
-from verifai_jax.core.notebook import ForUsers
+from verifai_jax.core.display.notebook import ForUsers
+from verifai_jax.core.messages.checks import check_count, check_fraction, check_positive
+from verifai_jax.core.values.clauses import CLAUSES, OUTCOME
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.best_points import keep_best
 
 KIND = 1 << 16
@@ -41,7 +41,7 @@ class Observations(NamedTuple):
       very low where there are fewer than `CLAUSES`.
     - `clause_gradients`: their gradients with respect to `u`; zero in rounds whose plan does not
       differentiate.
-    - `outcomes`: what happened (`core.clauses`), NaN if unknown.
+    - `outcomes`: what happened (`core.values.clauses`), NaN if unknown.
     - `coverage_ids`: numbers of what each simulation covered, -1 for nothing; `coverage_ids //
       KIND` is the kind of thing.
 

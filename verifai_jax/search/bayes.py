@@ -26,7 +26,7 @@ import numpy as np
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float, Int, Key, UInt32
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Asked, Observations, Search, Wants, check_options
 from verifai_jax.search.draws import draw_uniform, standard_normal
 from verifai_jax.search.gaussian_process import Posterior, TrainingData

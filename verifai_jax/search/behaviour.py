@@ -4,8 +4,8 @@
     seen = seen.widened(outcomes).recorded(outcomes)
     seen.unlike(outcomes, others)                       # [n, m], from 0 to 1
 
-Outcomes are those of `core.clauses`: the predicate that decides, the instant, the shape of the
-trace.
+Outcomes are those of `core.values.clauses`: the predicate that decides, the instant, the trace's
+shape.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from verifai_jax.core.clauses import OUTCOME, SEGMENTS, SIGNALS
+from verifai_jax.core.values.clauses import OUTCOME, SEGMENTS, SIGNALS
 
 MEMORY = 256
 """Outcomes that are remembered; the last ones. As many as `Diverse` archives failures by

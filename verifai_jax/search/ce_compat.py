@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt32
 
-from verifai_jax.core.checks import check_count, check_fraction
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.messages.checks import check_count, check_fraction
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Asked, Observations, Search
 from verifai_jax.search.draws import draw_uniform
 

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from verifai_jax.core.clauses import ABSENT
+from verifai_jax.core.values.clauses import ABSENT
 from verifai_jax.search.base import Observations
 
 NOTHING = ABSENT / 10

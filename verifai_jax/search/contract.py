@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from verifai_jax.core.cube import Cube
-from verifai_jax.core.user_errors import explain_user_error
+from verifai_jax.core.user_code.user_errors import explain_user_error
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Search
 
 BATCH = 16

@@ -32,7 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Asked, Observations, Plan, SlopeSearch, check_options, choose
 from verifai_jax.search.clause_values import comparable_clauses
 from verifai_jax.search.curvature import Curvature, advance

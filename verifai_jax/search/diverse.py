@@ -28,9 +28,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from verifai_jax.core.clauses import OUTCOME
-from verifai_jax.core.cube import Cube
-from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.messages.errors import unknown_name
+from verifai_jax.core.values.clauses import OUTCOME
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Observations, Search, Wants, check_options
 from verifai_jax.search.behaviour import SeenBehaviour, is_known
 from verifai_jax.search.clause_values import NOTHING

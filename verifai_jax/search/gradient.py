@@ -30,9 +30,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from verifai_jax.core.checks import check_positive
-from verifai_jax.core.clauses import CLAUSES
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.messages.checks import check_positive
+from verifai_jax.core.values.clauses import CLAUSES
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Asked, Observations, Plan, SlopeSearch, check_options, choose
 from verifai_jax.search.clause_values import NOTHING, comparable_clauses
 from verifai_jax.search.draws import draw_uniform

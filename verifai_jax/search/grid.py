@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
 
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Asked, PointSequence
 
 MAX_POINTS = 2**31 - 1

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from verifai_jax.core.clauses import CLAUSES
+from verifai_jax.core.values.clauses import CLAUSES
 from verifai_jax.search.clause_values import NOTHING
 
 HALVINGS = 24

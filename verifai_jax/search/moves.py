@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 
 MAX_CELLS = 8
 """Ordered cells up to which a coordinate is discrete; more are stepped over as if continuous.

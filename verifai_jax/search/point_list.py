@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Asked, Origin, PointSequence
 
 

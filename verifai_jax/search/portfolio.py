@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Asked, Observations, Plan, Search, Wants, choose
 from verifai_jax.search.clause_values import without_clauses
 from verifai_jax.search.cross_entropy import CrossEntropy, CrossEntropyState

@@ -20,9 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from verifai_jax.core.clauses import ABSENT, CLAUSES
-from verifai_jax.core.compilation import Compilation
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.compute.compilation import Compilation
+from verifai_jax.core.values.clauses import ABSENT, CLAUSES
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Observations, Plan, Search
 from verifai_jax.search.contract import check_points, is_user_defined
 from verifai_jax.search.repetition import Repetition

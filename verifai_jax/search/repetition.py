@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, UInt64
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 
 MEMORY = 1 << 16
 """Maximum number of remembered points, the first of a run: later ones are seldom repeated."""

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import jax
 from jaxtyping import Array, PyTree
 
-from verifai_jax.core.compilation import XlaOptimization, compile_soon, tracing
-from verifai_jax.core.cube import Cube
-from verifai_jax.core.fingerprint import identity
-from verifai_jax.core.remembered import lower_or_recall, remembered_as
+from verifai_jax.core.compute.compilation import XlaOptimization, compile_soon, tracing
+from verifai_jax.core.compute.fingerprint import identity
+from verifai_jax.core.compute.remembered import lower_or_recall, remembered_as
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Plan, Search
 from verifai_jax.search.contract import is_user_defined
 

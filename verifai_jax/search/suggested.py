@@ -18,7 +18,7 @@ from typing import Any, NoReturn, TypeAlias
 
 from jaxtyping import PyTree
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Search, check_options
 from verifai_jax.search.portfolio import Portfolio
 from verifai_jax.search.wrapper import Wrapper

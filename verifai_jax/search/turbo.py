@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from verifai_jax.core.checks import check_positive
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.messages.checks import check_positive
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Asked, Observations, Search, Wants, check_options, choose
 from verifai_jax.search.draws import draw_uniform
 from verifai_jax.search.halton import halton_points

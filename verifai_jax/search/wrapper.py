@@ -17,7 +17,7 @@ from typing import Any, TypeAlias, cast
 
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Asked, Observations, Origin, Plan, Search, State, Wants
 
 Learn: TypeAlias = Callable[[PyTree, Cube, Observations], PyTree]

@@ -13,8 +13,8 @@ is `confidence_sequences`.
 import math
 from dataclasses import dataclass
 
-from verifai_jax.core.checks import check_fraction
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.messages.checks import check_fraction
+from verifai_jax.core.messages.text import format_percent
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Real
 
-from verifai_jax.core.checks import check_count, check_fraction
+from verifai_jax.core.messages.checks import check_count, check_fraction
 from verifai_jax.statistics.binomial import Rate, check_counts
 
 ATOM = 0.75

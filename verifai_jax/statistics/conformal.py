@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from verifai_jax.core.checks import check_fraction
+from verifai_jax.core.messages.checks import check_fraction
 
 
 def conformal_threshold(scores: ArrayLike, alpha: float) -> float:

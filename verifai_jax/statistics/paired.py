@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.checks import check_fraction
+from verifai_jax.core.messages.checks import check_fraction
 
 
 @dataclass(frozen=True)

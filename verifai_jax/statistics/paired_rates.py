@@ -17,7 +17,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from verifai_jax.core.checks import check_fraction
+from verifai_jax.core.messages.checks import check_fraction
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
 from verifai_jax.statistics.confidence_sequences import anytime_interval
 

@@ -10,7 +10,7 @@ together (`confidence_sequences`).
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from verifai_jax.core.checks import check_fraction
+from verifai_jax.core.messages.checks import check_fraction
 from verifai_jax.statistics.confidence_sequences import anytime_interval
 
 

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.core.checks import check_fraction
+from verifai_jax.core.messages.checks import check_fraction
 from verifai_jax.statistics.binomial import exact_interval
 from verifai_jax.statistics.confidence_sequences import (
     anytime_interval,

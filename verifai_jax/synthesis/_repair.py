@@ -19,11 +19,11 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.budget import Budget, split_budget
-from verifai_jax.core.checks import check_options
-from verifai_jax.core.errors import check_names, suggests_options
-from verifai_jax.core.progress import shows_progress
-from verifai_jax.core.source_collection import sources_of
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.checks import check_options
+from verifai_jax.core.messages.errors import check_names, suggests_options
+from verifai_jax.core.user_code.source_collection import sources_of
+from verifai_jax.core.values.budget import Budget, split_budget
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.validation import usual_batch
 from verifai_jax.problem.problem import Problem
@@ -88,7 +88,7 @@ def repair(
     - `gradient`: whether to follow gradients; by default where the system has them without
       changing the backend.
     - `max_seconds`: wall-clock seconds; a fifth is reserved for the check.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     - all other arguments: as in `falsify`.
     **Returns:** a `Repair`; after Ctrl-C what is finished, without the check.
     **Raises:** `ValueError` before anything compiles for unknown features, parameters without a

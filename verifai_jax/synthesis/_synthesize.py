@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.budget import Budget, split_budget
-from verifai_jax.core.checks import check_options, check_positive
-from verifai_jax.core.errors import check_names, suggests_options
-from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.checks import check_options, check_positive
+from verifai_jax.core.messages.errors import check_names, suggests_options
+from verifai_jax.core.values.budget import Budget, split_budget
 from verifai_jax.falsification.validation import usual_batch
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
@@ -91,7 +91,7 @@ def synthesize(
       changing the backend.
     - `batch`: simulations at once.
     - `max_seconds`: wall-clock seconds; a fifth is reserved for the check.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     - all other arguments: as in `falsify`.
     **Returns:** a `Synthesis`; after Ctrl-C what is finished, without the check.
     **Raises:** `ValueError` before anything compiles for unknown features and options out of range.

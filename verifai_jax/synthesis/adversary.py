@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from verifai_jax.core.budget import Budget
+from verifai_jax.core.values.budget import Budget
 from verifai_jax.search import Search
 from verifai_jax.search.proposals import Proposals
 from verifai_jax.synthesis.parametric import Pairs, Parametric

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax import search as searches
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.errors import check_names
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification.validation import check_search
 from verifai_jax.problem.dependence import without_derivative

@@ -12,7 +12,7 @@ cross-entropy, then the best candidates in many fresh samples, which decide.
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.budget import Budget
+from verifai_jax.core.values.budget import Budget
 from verifai_jax.synthesis.held_out import draw
 from verifai_jax.synthesis.optimize import Choice, typical_size, worst_case
 from verifai_jax.synthesis.parametric import FeatureParameters

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.budget import Budget
+from verifai_jax.core.values.budget import Budget
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
 from verifai_jax.synthesis.parametric import Parametric
 

@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.budget import Budget
+from verifai_jax.core.values.budget import Budget
 from verifai_jax.synthesis.parametric import Pairs, Parametric, accepted
 
 ACTIVE = 16

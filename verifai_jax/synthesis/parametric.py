@@ -20,10 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from verifai_jax.core.compilation import pad_rows
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.keys import run_keys
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.compute.compilation import pad_rows
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.messages.errors import check_names
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.row import WithParameters

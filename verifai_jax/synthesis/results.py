@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.notebook import InNotebook
+from verifai_jax.core.display.figure import Drawn
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.problem.problem import Problem
 from verifai_jax.synthesis.held_out import HeldOut
 from verifai_jax.synthesis.parametric import held

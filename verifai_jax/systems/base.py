@@ -16,11 +16,11 @@ import jax
 import numpy as np
 from jaxtyping import Array, Int, Key, PyTree
 
-from verifai_jax.core.compilation import XlaOptimization
-from verifai_jax.core.forks import returning_once
-from verifai_jax.core.notebook import ForUsers
-from verifai_jax.core.trace import Status, Trace
-from verifai_jax.core.user_errors import format_user_error
+from verifai_jax.core.compute.compilation import XlaOptimization
+from verifai_jax.core.display.notebook import ForUsers
+from verifai_jax.core.user_code.forks import returning_once
+from verifai_jax.core.user_code.user_errors import format_user_error
+from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.systems.channels import Link, Passing
 
 KnownSignals: TypeAlias = tuple[str, ...] | Mapping[str, int] | None

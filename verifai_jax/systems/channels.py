@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.messages.errors import unknown_name
 
 Side: TypeAlias = Literal["observation", "action"]
 SIDES: tuple[Side, Side] = ("observation", "action")

@@ -12,7 +12,7 @@ Each raises `AssertionError` that says which law is broken.
 
 from typing import TYPE_CHECKING
 
-from verifai_jax.core.lazy import attach
+from verifai_jax.core.display.lazy import attach
 
 if TYPE_CHECKING:
     from verifai_jax.testing.domains import check_domain as check_domain

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from verifai_jax.core.clauses import ABSENT, CLAUSES, OUTCOME
-from verifai_jax.core.cube import Cube
+from verifai_jax.core.values.clauses import ABSENT, CLAUSES, OUTCOME
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import Observations, Search
 from verifai_jax.testing.laws import same, same_type
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.features import FeatureSpace
 from verifai_jax.systems.base import System, as_system
 from verifai_jax.systems.blackbox._blackbox import plain_leaves

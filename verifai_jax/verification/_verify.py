@@ -4,10 +4,10 @@ import time
 from pathlib import Path
 
 from verifai_jax._version import __version__
-from verifai_jax.core.checks import check_count, check_fraction, check_positive
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.precision import in_precision
-from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.checks import check_count, check_fraction, check_positive
+from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.problem.problem import Problem
 from verifai_jax.verification.boxes import Boxes
 from verifai_jax.verification.branch_and_bound import BranchAndBound

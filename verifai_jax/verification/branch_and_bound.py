@@ -11,8 +11,8 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.core.cores import available_cores
-from verifai_jax.core.progress import say_done
+from verifai_jax.core.compute.cores import available_cores
+from verifai_jax.core.display.progress import say_done
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.problem.problem import Problem
 from verifai_jax.verification.boxes import BROKEN, OPEN, OUTSIDE, PROVED, Boxes

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from verifai_jax.core.cores import available_cores
-from verifai_jax.core.fingerprint import without_unused
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.compute.cores import available_cores
+from verifai_jax.core.compute.fingerprint import without_unused
+from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.verdicts import boolean_semantics, trace_verdict
 from verifai_jax.features.ranges import FeatureRanges

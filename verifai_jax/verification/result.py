@@ -15,10 +15,10 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 
-from verifai_jax.core.figure import Drawn, Reported
-from verifai_jax.core.notebook import InNotebook, frame_html, picture_html
+from verifai_jax.core.display.figure import Drawn, Reported
+from verifai_jax.core.display.notebook import InNotebook, frame_html, picture_html
+from verifai_jax.core.messages.text import counted, format_percent
 from verifai_jax.core.store.files import DamagedError, read_record, write_record
-from verifai_jax.core.text import counted, format_percent
 from verifai_jax.problem.model_digest import digest_of_model
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.confidence_sequences import anytime_interval

@@ -155,7 +155,7 @@ def test_numbers_and_spans_are_written_so_that_they_differ():
 @pytest.mark.thorough
 def test_the_command(tmp_path):
     from verifai_jax.cli.explain import explain as command
-    from verifai_jax.core.targets import load_target
+    from verifai_jax.core.user_code.targets import load_target
 
     (tmp_path / "other.py").write_text(
         "import verifai_jax as vj\nimport jax.numpy as jnp\n"

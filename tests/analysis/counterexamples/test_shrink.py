@@ -14,7 +14,7 @@ import verifai_jax as vj
 from verifai_jax.analysis.counterexamples import Shrunk, shrink
 from verifai_jax.analysis.counterexamples.fixed_key import fix_key, key_of
 from verifai_jax.analysis.counterexamples.nominal import Nominal
-from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.statistics.smallest_change import shortest_in_box
 
 
@@ -303,7 +303,7 @@ def test_the_command(edges, tmp_path):
         "p = vj.Problem('p', {'x': vj.Box(0.0, 1.0), 'y': vj.Box(0.0, 1.0)}, system,"
         " 'always m >= 0', nominal={'x': 0.2, 'y': 0.5})\n"
     )
-    from verifai_jax.core.targets import load_target
+    from verifai_jax.core.user_code.targets import load_target
 
     target = f"{tmp_path / 'mine.py'}:p"
     run = vj.falsify(load_target(target, vj.Problem), "uniform", 64, batch=64, progress=False)

@@ -5,7 +5,7 @@ import pytest
 from checked_types import unchecked
 
 from verifai_jax.analysis.data.samples import Samples, generator
-from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.features import (

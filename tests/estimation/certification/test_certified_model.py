@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.targets import load_target
+from verifai_jax.core.user_code.targets import load_target
 
 SPEC = """
 import numpy as np

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.estimation.certification import certify
 from verifai_jax.estimation.certification import simulators as programs
 from verifai_jax.estimation.certification.blocks import Blocks

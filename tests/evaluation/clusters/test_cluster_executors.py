@@ -10,8 +10,8 @@ import pandas as pd
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.errors import MissingExtra, UnknownNameError
-from verifai_jax.core.targets import load_target
+from verifai_jax.core.messages.errors import MissingExtra, UnknownNameError
+from verifai_jax.core.user_code.targets import load_target
 from verifai_jax.evaluation.clusters import RayExecutor, connect
 
 ROWS = 100_000

@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from verifai_jax.core.machine_code import COMPILERS
+from verifai_jax.core.compute.machine_code import COMPILERS
 
 
 @pytest.fixture(scope="module", autouse=True)

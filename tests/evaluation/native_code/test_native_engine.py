@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core import machine_code
-from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.core.keys import run_keys
+from verifai_jax.core.compute import machine_code
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.evaluation import native_engine, native_program
 from verifai_jax.evaluation.engine import engine_for
 from verifai_jax.evaluation.native_engine import FIRST, NativeEngine

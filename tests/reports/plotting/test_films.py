@@ -9,7 +9,7 @@ import pytest
 from PIL import Image, ImageSequence
 
 import verifai_jax as vj
-from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.evaluation.replay import replay
 from verifai_jax.reports.plotting.film import HEADER, film_samples, labelled
 from verifai_jax.reports.plotting.mujoco_motion import record

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image, ImageSequence
 
 import verifai_jax as vj
-from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.evaluation.replay import replay
 from verifai_jax.reports.plotting import animate, mujoco_motion
 from verifai_jax.reports.plotting import film as films

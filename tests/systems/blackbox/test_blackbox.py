@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.systems.blackbox import blackbox
 from verifai_jax.systems.blackbox._blackbox import stack_traces
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.remote_client import answer
 from verifai_jax.systems.base import Outcome, outcome_of
 from verifai_jax.systems.blackbox import blackbox, workers

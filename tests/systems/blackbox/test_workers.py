@@ -14,9 +14,9 @@ import host_systems
 import numpy as np
 import pytest
 
-from verifai_jax.core import targets
-from verifai_jax.core.trace import Status
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.user_code import targets
+from verifai_jax.core.values.trace import Status
+from verifai_jax.core.values.waveform import Waveform
 from verifai_jax.systems.base import Outcome
 from verifai_jax.systems.blackbox import blackbox, workers
 from verifai_jax.systems.blackbox._blackbox import single_trace
@@ -215,7 +215,7 @@ def test_ways_in_which_a_worker_dies_are_named():
 SCRIPT = """
     import numpy as np
     from verifai_jax.systems.blackbox import blackbox
-    from verifai_jax.core.trace import Trace
+    from verifai_jax.core.values.trace import Trace
 
     def simulate(features):
         return Trace({"x": np.array([features["a"]])}, dt=1.0)

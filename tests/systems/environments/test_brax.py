@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.errors import MissingExtra, UnknownNameError
-from verifai_jax.core.trace import Status
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.messages.errors import MissingExtra, UnknownNameError
+from verifai_jax.core.values.trace import Status
+from verifai_jax.core.values.waveform import Waveform
 from verifai_jax.rl import Discrete, Policy
 from verifai_jax.rl.policy import new_layers
 from verifai_jax.systems.environments.episode import episode_keys

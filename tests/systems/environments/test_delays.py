@@ -8,7 +8,7 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
-from verifai_jax.core.trace import Status
+from verifai_jax.core.values.trace import Status
 from verifai_jax.systems.channels import Instant
 from verifai_jax.systems.delays import Delay, as_delay
 from verifai_jax.systems.environments._gymnasium import gymnasium

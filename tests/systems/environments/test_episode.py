@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from verifai_jax.core.trace import Status
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.values.trace import Status
+from verifai_jax.core.values.waveform import Waveform
 from verifai_jax.systems.environments.episode import (
     Episode,
     Moment,

@@ -10,9 +10,9 @@ from host_systems import balancing, cartpole_start, light_touch, pendulum
 
 import verifai_jax as vj
 from envs import cartpole
-from verifai_jax.core.precision import in_precision
-from verifai_jax.core.trace import Status
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.values.trace import Status
+from verifai_jax.core.values.waveform import Waveform
 from verifai_jax.systems.environments._gymnasium import gymnasium
 
 NAMES = ("x", "x_dot", "theta", "theta_dot")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.errors import MissingExtra, UnknownNameError
+from verifai_jax.core.messages.errors import MissingExtra, UnknownNameError
 
 HAS = bool(__import__("importlib.util").util.find_spec("mujoco_playground"))
 needed = pytest.mark.skipif(not HAS, reason="MuJoCo Playground is not installed")

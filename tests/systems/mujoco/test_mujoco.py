@@ -10,9 +10,9 @@ import pytest
 from checked_types import unchecked
 
 from envs import cartpole as analytic
-from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.core.trace import Status
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.messages.errors import UnknownNameError
+from verifai_jax.core.values.trace import Status
+from verifai_jax.core.values.waveform import Waveform
 from verifai_jax.systems.mujoco.bindings import Scaled
 from verifai_jax.systems.mujoco.system import mjx, native
 from verifai_jax.systems.mujoco.system import mujoco as model

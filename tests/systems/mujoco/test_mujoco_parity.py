@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.values.waveform import Waveform
 from verifai_jax.systems.mujoco.system import mujoco as model
 
 TEXT = """

@@ -9,8 +9,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import verifai_jax as vj
-from verifai_jax.core.errors import MissingExtra, UnknownNameError
-from verifai_jax.core.trace import Status
+from verifai_jax.core.messages.errors import MissingExtra, UnknownNameError
+from verifai_jax.core.values.trace import Status
 from verifai_jax.systems.ode import ode
 from verifai_jax.systems.ode.adaptive import adaptive_solvers
 from verifai_jax.systems.ode.blocks import adaptive

@@ -9,7 +9,7 @@ import pytest
 from checked_types import unchecked
 from scipy.integrate import solve_ivp
 
-from verifai_jax.core.trace import Status
+from verifai_jax.core.values.trace import Status
 from verifai_jax.systems.ode import ode
 from verifai_jax.systems.ode.blocks import Switch, hysteresis, latch
 

@@ -24,8 +24,8 @@ from hypothesis import strategies as st
 
 import verifai_jax as vj
 from verifai_jax import remote_client
-from verifai_jax.core.trace import Status
-from verifai_jax.core.waveform import Waveform
+from verifai_jax.core.values.trace import Status
+from verifai_jax.core.values.waveform import Waveform
 from verifai_jax.systems.blackbox.trace_form import TraceForm
 from verifai_jax.systems.remote import connection, server, wire
 from verifai_jax.systems.remote._remote import remote

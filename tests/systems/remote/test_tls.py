@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from verifai_jax import remote_client
-from verifai_jax.core.trace import Status
+from verifai_jax.core.values.trace import Status
 from verifai_jax.systems.remote._remote import remote
 from verifai_jax.systems.remote.connection import Client
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.errors import MissingExtra
+from verifai_jax.core.messages.errors import MissingExtra
 from verifai_jax.systems.scenic import ProgramError
 
 GALLERY = Path(__file__).parent / "gallery"

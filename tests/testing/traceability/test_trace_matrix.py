@@ -68,7 +68,7 @@ def project(tmp_path, monkeypatch):
         (tmp_path / folder).mkdir()
     write_spec()
     (tmp_path / "tests" / "test_brake.py").write_text(TEST)
-    from verifai_jax.core.targets import load_target
+    from verifai_jax.core.user_code.targets import load_target
 
     problem = load_target("specs/brake.py:brake", vj.Problem)
     run = vj.falsify(problem, "uniform", 8, progress=False, folder="runs/brake-1")
@@ -129,7 +129,7 @@ def test_a_whole_chain_and_every_change_of_it(project):
 
     write_spec()
     # A run that goes on is another one than its report is about.
-    from verifai_jax.core.targets import load_target
+    from verifai_jax.core.user_code.targets import load_target
 
     vj.resume("runs/brake-1", load_target("specs/brake.py:brake", vj.Problem), budget=16,
               progress=False)  # fmt: skip

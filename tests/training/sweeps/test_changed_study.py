@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 from drifting import drifting, quick_certificates
 
-from verifai_jax.core.sources import Source
 from verifai_jax.core.store.cache import CacheError
+from verifai_jax.core.user_code.sources import Source
 from verifai_jax.rl import policy_sources
 from verifai_jax.training.sweeps import running as driver
 from verifai_jax.training.sweeps._sweep import sweep

@@ -6,7 +6,7 @@ from checked_types import unchecked
 from drifting import Drift, Picks, Point, closed_loop, drifting
 
 import verifai_jax as vj
-from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.features import Constant, FeatureSpace
 from verifai_jax.rl import PPO
 from verifai_jax.training.sweeps.hyperparameters import values_at

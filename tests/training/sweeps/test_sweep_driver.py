@@ -10,7 +10,7 @@ from checked_types import unchecked
 from drifting import Drift, Point, drifting, quick_certificates
 
 import verifai_jax as vj
-from verifai_jax.core.errors import MissingExtra, UnknownNameError
+from verifai_jax.core.messages.errors import MissingExtra, UnknownNameError
 from verifai_jax.core.store.cache import Cache, CacheError
 from verifai_jax.rl import evaluate, train
 from verifai_jax.rl._evaluate import mean_returns

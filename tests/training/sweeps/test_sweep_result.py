@@ -11,7 +11,7 @@ from checked_types import unchecked
 from planted_sweep import SPACE, ToyStudy, ToyTrainer, curve_to, planted_rows, record_of
 
 import verifai_jax as vj
-from verifai_jax.core.errors import MissingExtra, UnknownNameError
+from verifai_jax.core.messages.errors import MissingExtra, UnknownNameError
 from verifai_jax.rl import load_policy
 from verifai_jax.statistics.pareto import fronts
 from verifai_jax.training.sweeps.record import AFTER, BEFORE

@@ -5,7 +5,7 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
-from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.training.sweeps.curves import check_curve, curve_robustness, curve_trace
 
 STEPS = 1000 * np.arange(1, 9)

@@ -15,8 +15,8 @@ import numpy as np
 import pandas as pd
 
 from verifai_jax.analysis.counterexamples.selection import Row
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.evaluation.backends import Engines, resolved
 from verifai_jax.evaluation.confirmations import Confirmation, Confirmations, Repetitions
 from verifai_jax.evaluation.confirmer import Confirmer
@@ -66,7 +66,7 @@ def confirm(
     - `max_rows`: how many rows are replayed at least, by default 256, and more where a row takes
       few replays; of more, the worst and those nearest to zero, until the rest
       is far from it (see `evaluation.confirmer.Confirmer`).
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** a `Confirmation` for a row, `Confirmations` for all; after Ctrl-C what is finished.
     **Raises:** `ValueError` for a run without its problem, a row that is not a counterexample, an
     engine that does not fit; `IndexError` for a row that is not in the table.

@@ -23,12 +23,12 @@ from verifai_jax.analysis.counterexamples.fixed_key import fix_key, note_on_key
 from verifai_jax.analysis.counterexamples.influence import Influence, spans_of
 from verifai_jax.analysis.counterexamples.nominal import Nominal
 from verifai_jax.analysis.counterexamples.selection import Row, problem_of, select_row
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.keys import run_keys
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.precision import in_precision
-from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.display.figure import Drawn
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
@@ -97,7 +97,7 @@ def explain(
     - `run`: a run of a problem, with a counterexample.
     - `row`: the number of one, or a row of the table; the worst when left out.
     - `nominal`: features that are ordinary, where the problem does not say or others are meant.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
 
     Takes one simulation for each feature and each unit coordinate, and one gradient. Without
     nominal features only the gradient tells what matters.

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from verifai_jax.analysis.counterexamples.corpus import SavedCounterexample, read_corpus, renamed
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.keys import run_keys
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.progress import shows_progress
-from verifai_jax.core.sources import Change, Sources
-from verifai_jax.core.text import format_error, one_line, printable
-from verifai_jax.core.trace import Status
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.messages.text import format_error, one_line, printable
+from verifai_jax.core.user_code.sources import Change, Sources
+from verifai_jax.core.values.trace import Status
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.resimulate import HostReplays, Replays
 from verifai_jax.features import FeatureSpace
@@ -149,7 +149,7 @@ def replay_counterexamples(
     - `problem`: as it is now.
     - `folder`: that `run.save_counterexamples` wrote into, or one file of it.
     - `rename`: new names of features by their old ones.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Raises:** `FileNotFoundError` for a place that does not exist; `TypeError` for something that
     is no `Problem`.
     """

@@ -25,10 +25,10 @@ from verifai_jax.analysis.counterexamples.minimize_distance import minimize_dist
 from verifai_jax.analysis.counterexamples.nominal import Likeliest, Nominal
 from verifai_jax.analysis.counterexamples.remove_items import remove_items
 from verifai_jax.analysis.counterexamples.shrunk import LogDensities, Shrunk, Step
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import suggests_options, unknown_name
-from verifai_jax.core.keys import run_keys
-from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.errors import suggests_options, unknown_name
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.run import Run
 from verifai_jax.features.density import log_density
@@ -83,7 +83,7 @@ def shrink(
     - `others`: whether other counterexamples of the run are looked at too.
     - `stay`: whether every real feature stays on the side of nominal on which the row has it, so
       that failures of several kinds are shrunk each by itself.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
 
     All simulations have the random key of the row. The result was simulated alone and failed, in
     the precision of the run, and in float64 too unless the system draws random numbers or is a

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from verifai_jax.analysis.counterexamples.nominal import Nominal
-from verifai_jax.core.text import one_line
+from verifai_jax.core.messages.text import one_line
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.problem.problem import Problem
 

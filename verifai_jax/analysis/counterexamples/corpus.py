@@ -22,11 +22,11 @@ import numpy as np
 
 from verifai_jax.analysis.counterexamples._shrink import shrink as shrink_row
 from verifai_jax.analysis.counterexamples.selection import columns_at, problem_of
-from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.checks import check_count, is_number
-from verifai_jax.core.keys import run_keys
-from verifai_jax.core.progress import shows_progress
-from verifai_jax.core.text import format_error, one_line
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.checks import check_count, is_number
+from verifai_jax.core.messages.text import format_error, one_line
+from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.evaluation.replay import replay
 from verifai_jax.falsification.model_changes import sources_of_row
 from verifai_jax.falsification.run import Run
@@ -187,7 +187,7 @@ def save_counterexamples(
     - `max_count`: counterexamples at most.
     - `shrink`: whether each is first shrunk towards the nominal features, where these are known.
     - `budget`: simulations to shrink one with, at most.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** the paths of the files, none twice.
     **Raises:** `ValueError` for a run without its problem or without a counterexample.
     """

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from verifai_jax.analysis.counterexamples.influence import Influence, Span
-from verifai_jax.core.text import format_seconds, listed
+from verifai_jax.core.messages.text import format_seconds, listed
 from verifai_jax.mtl import Explanation, robustness_signal
 from verifai_jax.mtl._explain import heading
 from verifai_jax.mtl.formula import Formula, Term

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Key
 
-from verifai_jax.core.keys import run_keys, simulation_key
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.compute.keys import run_keys, simulation_key
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.falsification.run import Run
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.core.compilation import pad_rows
-from verifai_jax.core.cube import Cube
-from verifai_jax.core.errors import check_names
+from verifai_jax.core.compute.compilation import pad_rows
+from verifai_jax.core.messages.errors import check_names
+from verifai_jax.core.values.cube import Cube
 from verifai_jax.features import FeatureSpace
 from verifai_jax.features.improbability import Improbability
 from verifai_jax.problem.problem import Problem

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from verifai_jax.analysis.counterexamples.candidates import Candidates
-from verifai_jax.core.compilation import power_of_two
+from verifai_jax.core.compute.compilation import power_of_two
 
 EXHAUSTIVE = 8
 """Items of which all subsets are tried."""

@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from verifai_jax.analysis.counterexamples.selection import columns_at
-from verifai_jax.core.events import Events
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.text import format_seconds
+from verifai_jax.core.display.figure import Drawn
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.messages.text import format_seconds
+from verifai_jax.core.values.events import Events
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.problem.problem import Problem
 

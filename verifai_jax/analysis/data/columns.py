@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Int
 
-from verifai_jax.core.errors import check_names
+from verifai_jax.core.messages.errors import check_names
 from verifai_jax.falsification.table import RESERVED
 from verifai_jax.features import FeatureSpace
 from verifai_jax.features.domain import as_scalar

@@ -23,8 +23,8 @@ from jaxtyping import Bool, Float, Int
 
 from verifai_jax.analysis.data.columns import Column, describe_columns, feature_columns
 from verifai_jax.analysis.data.verdicts import explain_empty, select_rows, verdicts
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import check_names
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.errors import check_names
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.features import FeatureSpace

@@ -3,8 +3,8 @@
 import numpy as np
 
 from verifai_jax.analysis.sensitivity import sensitivity
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.checks import check_count
 from verifai_jax.problem.problem import Problem
 
 
@@ -28,7 +28,7 @@ def gradient_sensitivity(
     - `temperature`: the temperature of the smooth robustness that is differentiated; by default a
       hundredth of the standard deviation of the robustness. The bound holds for the smooth
       robustness, and as far as the gradients of the system are its true ones.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
 
     Source: Sobol and Kucherenko, Derivative based global sensitivity measures and their link with
     global sensitivity indices, Mathematics and Computers in Simulation 79 (2009).

@@ -16,8 +16,8 @@ from verifai_jax.analysis.sensitivity.sensitivity import (
     ranked,
     variance_of,
 )
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.checks import check_count
 from verifai_jax.problem.problem import Problem
 
 
@@ -43,7 +43,7 @@ def morris(
       probable cells, so that long-tailed features stay finite. A discrete one takes all of its
       values.
     - `of`: name of the formula; the least robustness of all when left out.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
 
     Sources: Morris, Factorial sampling plans for preliminary computational experiments,
     Technometrics 33 (1991); `mu_star` of Campolongo, Cariboni and Saltelli, An effective screening

@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from verifai_jax.analysis.sensitivity import sensitivity
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.checks import check_count
 from verifai_jax.problem.problem import Problem
 
 NOISE = "(simulation noise)"
@@ -30,7 +30,7 @@ def sobol_indices(
     - `samples`: base points `N`, best a power of two; `N (d + 2)` simulations for `d` coordinates,
       and `N` more where simulations are random.
     - `of`: name of the formula; the least robustness of all when left out.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
 
     Sources: first-order estimator of Saltelli et al., Variance based sensitivity analysis of model
     output, Computer Physics Communications 181 (2010); total of Jansen, Analysis of variance

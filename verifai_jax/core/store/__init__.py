@@ -1,1 +1,1 @@
-"""All that is on disk: files that are whole, logs of entries, caches of finished work, locks."""
+"""Persistence: files written whole, logs of entries, caches of finished work, locks."""

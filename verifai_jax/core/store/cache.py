@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from verifai_jax.core.atomic_files import reason
-from verifai_jax.core.sources import Sources, list_changes
+from verifai_jax.core.store.atomic_files import reason
 from verifai_jax.core.store.files import DamagedError
 from verifai_jax.core.store.locks import write_lock
 from verifai_jax.core.store.log import Arrays, Log
+from verifai_jax.core.user_code.sources import Sources, list_changes
 
 log = logging.getLogger("verifai_jax.cache")
 _NOTE = "note:"

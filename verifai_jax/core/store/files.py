@@ -14,8 +14,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from verifai_jax.core.atomic_files import replacing, unwritable
-from verifai_jax.core.text import one_line
+from verifai_jax.core.messages.text import one_line
+from verifai_jax.core.store.atomic_files import replacing, unwritable
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from io import FileIO
 from pathlib import Path
 
-from verifai_jax.core.atomic_files import reason
+from verifai_jax.core.store.atomic_files import reason
 
 try:
     import fcntl

@@ -26,7 +26,7 @@ from typing import IO, Any, TypeAlias
 
 import numpy as np
 
-from verifai_jax.core.atomic_files import append_to, unwritable
+from verifai_jax.core.store.atomic_files import append_to, unwritable
 from verifai_jax.core.store.files import DamagedError, checksum, write_complete
 
 Arrays: TypeAlias = Mapping[str, np.ndarray]

@@ -19,12 +19,12 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from verifai_jax.core.checks import check_count, check_fraction
-from verifai_jax.core.compilation import power_of_two
-from verifai_jax.core.devices import enable_compile_cache
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.executors import Executor
-from verifai_jax.core.progress import say_done, shows_progress
+from verifai_jax.core.compute.compilation import power_of_two
+from verifai_jax.core.compute.devices import enable_compile_cache
+from verifai_jax.core.compute.executors import Executor
+from verifai_jax.core.display.progress import say_done, shows_progress
+from verifai_jax.core.messages.checks import check_count, check_fraction
+from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.estimation.certification.allocation import Allocation, find_leader
 from verifai_jax.estimation.certification.attack import PolicyRecord, attack_policies, check_attack
 from verifai_jax.estimation.certification.blocks import Blocks, Remember

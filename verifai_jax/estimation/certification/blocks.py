@@ -17,10 +17,10 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.core.executors import Executor, Shipment, ship
-from verifai_jax.core.precision import truncate_silently
-from verifai_jax.core.source_collection import sources_of
-from verifai_jax.core.trace import Status
+from verifai_jax.core.compute.executors import Executor, Shipment, ship
+from verifai_jax.core.compute.precision import truncate_silently
+from verifai_jax.core.user_code.source_collection import sources_of
+from verifai_jax.core.values.trace import Status
 from verifai_jax.estimation.certification.executor_simulator import ExecutorSimulator
 from verifai_jax.estimation.certification.policy_groups import digest, group_policies
 from verifai_jax.estimation.certification.simulators import (

@@ -16,9 +16,9 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt32
 
-from verifai_jax.core import executors
-from verifai_jax.core.keys import as_key
-from verifai_jax.core.precision import truncate_silently
+from verifai_jax.core.compute import executors
+from verifai_jax.core.compute.keys import as_key
+from verifai_jax.core.compute.precision import truncate_silently
 from verifai_jax.estimation.certification.policy_groups import PolicyGroup
 from verifai_jax.estimation.certification.simulators import (
     SeparateSimulators,

@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from verifai_jax.core.compilation import power_of_two
+from verifai_jax.core.compute.compilation import power_of_two
 from verifai_jax.rl import Policy
 
 MIN_WIDTH = 64

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.statistics.binomial import Rate
 from verifai_jax.statistics.confidence_sequences import UNSAFE, safe_at
 

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key, PyTree
 
-from verifai_jax.core.devices import Device, enable_compile_cache, spread_over_devices
-from verifai_jax.core.keys import IMPLEMENTATION, simulation_key
+from verifai_jax.core.compute.devices import Device, enable_compile_cache, spread_over_devices
+from verifai_jax.core.compute.keys import IMPLEMENTATION, simulation_key
 from verifai_jax.estimation.certification.policy_groups import PolicyGroup
 from verifai_jax.evaluation.engine import Engine, Mode
 from verifai_jax.evaluation.evaluator import Evaluator

@@ -18,14 +18,14 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Array, Bool, Float, Key
 
-from verifai_jax.core.checks import check_count, check_fraction
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.executors import Executor
-from verifai_jax.core.keys import run_keys
-from verifai_jax.core.precision import reproducible_settings
-from verifai_jax.core.progress import shows_progress
-from verifai_jax.core.revisions import load_at_revision, split_revision
-from verifai_jax.core.trace import Status
+from verifai_jax.core.compute.executors import Executor
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.compute.precision import reproducible_settings
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.checks import check_count, check_fraction
+from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.user_code.revisions import load_at_revision, split_revision
+from verifai_jax.core.values.trace import Status
 from verifai_jax.estimation.comparison.result import UNDECIDED, Compared, Comparison, judge
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.evaluator import Evaluator
@@ -75,7 +75,7 @@ def compare(
     - `seed`: the seed of the samples; the same seed gives the same pairs.
     - `max_seconds`: wall-clock seconds after which finished pairs give the verdict.
     - `precision`: as in `falsify`.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     - `executor`: whose workers simulate, as in `falsify`; the comparison is the same.
     **Returns:** the comparison; after Ctrl-C that of the finished pairs.
     **Raises:** before anything is simulated, `TypeError` for anything but a `Problem`;

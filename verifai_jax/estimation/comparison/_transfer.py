@@ -17,12 +17,12 @@ import pandas as pd
 from jaxtyping import Bool, Float
 
 from verifai_jax import search as searches
-from verifai_jax.core.checks import check_count, check_positive
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.keys import run_keys
-from verifai_jax.core.precision import reproducible_settings
-from verifai_jax.core.progress import shows_progress
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.compute.precision import reproducible_settings
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.checks import check_count, check_positive
+from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.estimation.comparison.result import Transfer
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.evaluator import Evaluator
@@ -83,7 +83,7 @@ def transfer(
     - `seed`: the seed of samples, search and random keys.
     - `batch`: pairs at once.
     - `precision`: the precision of the simulations.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** a `Transfer` with the table of all pairs.
     **Raises:** before anything is simulated, `ProblemError` for problems without a common feature
     or signal; `TypeError` for anything but a `Problem`; `ValueError` for numbers out of range

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Array, Key
 
-from verifai_jax.core.figure import Drawn, Reported
-from verifai_jax.core.keys import run_keys, simulation_key
-from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.notebook import InNotebook, picture_html
-from verifai_jax.core.text import format_percent
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.compute.keys import run_keys, simulation_key
+from verifai_jax.core.display.figure import Drawn, Reported
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.display.notebook import InNotebook, picture_html
+from verifai_jax.core.messages.text import format_percent
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.features import FeatureSpace
 from verifai_jax.statistics.paired_rates import PairedRates
 

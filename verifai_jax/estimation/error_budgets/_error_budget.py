@@ -16,9 +16,9 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float
 
-from verifai_jax.core.checks import check_count, check_fraction
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.messages.checks import check_count, check_fraction
+from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.estimation import estimate
 from verifai_jax.estimation.certification.result import Certificate
 from verifai_jax.estimation.comparison.result import Compared

@@ -9,8 +9,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from verifai_jax.core.notebook import Tabular
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.display.notebook import Tabular
+from verifai_jax.core.messages.text import format_percent
 
 if TYPE_CHECKING:
     import pandas as pd

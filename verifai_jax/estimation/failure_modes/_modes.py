@@ -24,12 +24,12 @@ from verifai_jax.analysis.counterexamples import confirm
 from verifai_jax.analysis.counterexamples.description import describe_predicate
 from verifai_jax.analysis.counterexamples.fixed_key import hold_key
 from verifai_jax.analysis.counterexamples.selection import problem_of
-from verifai_jax.core.checks import check_fraction, check_options
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.keys import run_keys, simulation_key
-from verifai_jax.core.precision import in_precision
-from verifai_jax.core.progress import SimulationProgress, shows_progress
-from verifai_jax.core.text import format_seconds
+from verifai_jax.core.compute.keys import run_keys, simulation_key
+from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.display.progress import SimulationProgress, shows_progress
+from verifai_jax.core.messages.checks import check_fraction, check_options
+from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.messages.text import format_seconds
 from verifai_jax.estimation._estimate import one_thread
 from verifai_jax.estimation.answers import Answer, Plan, bound_from_pilot, chains_for
 from verifai_jax.estimation.double_precision import DoublePrecisionEvaluator

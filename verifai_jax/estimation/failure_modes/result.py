@@ -13,10 +13,10 @@ from jaxtyping import Array, Key
 from verifai_jax.analysis.counterexamples import explain, shrink
 from verifai_jax.analysis.counterexamples._explain import Explained
 from verifai_jax.analysis.counterexamples.shrunk import Shrunk
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.keys import simulation_key
-from verifai_jax.core.notebook import InNotebook, picture_html
-from verifai_jax.core.text import format_percent, format_probability
+from verifai_jax.core.compute.keys import simulation_key
+from verifai_jax.core.display.figure import Drawn
+from verifai_jax.core.display.notebook import InNotebook, picture_html
+from verifai_jax.core.messages.text import format_percent, format_probability
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.run import Run
 from verifai_jax.problem.problem import Problem

@@ -8,7 +8,7 @@ vj.calibrate(problem, "trials.csv", ["friction"])   # features that agree with t
 
 from typing import TYPE_CHECKING
 
-from verifai_jax.core.lazy import attach
+from verifai_jax.core.display.lazy import attach
 
 if TYPE_CHECKING:
     from verifai_jax.estimation.trials._real_trials import real_trials as real_trials

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Real
 
-from verifai_jax.core.checks import check_count, check_fraction
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.text import counted
+from verifai_jax.core.messages.checks import check_count, check_fraction
+from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.messages.text import counted
 from verifai_jax.estimation.trials.reading import TrialTable, read_trials
 from verifai_jax.estimation.trials.result import RealTrials
 from verifai_jax.falsification import falsify, simulate
@@ -27,7 +27,7 @@ from verifai_jax.statistics.stratified_rate import stratified_rate
 if TYPE_CHECKING:
     import pandas as pd
 
-    from verifai_jax.core.executors import Executor
+    from verifai_jax.core.compute.executors import Executor
 UNLIKELY = 1e-3
 """Probability below which trials are not taken for samples of the prior."""
 MIN_TRIALS = 10

@@ -16,9 +16,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import check_names, suggests_options
-from verifai_jax.core.notebook import InNotebook
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.errors import check_names, suggests_options
 from verifai_jax.estimation.fitting import effective_size
 from verifai_jax.estimation.trials.reading import FAILED, TrialTable, table_of, verdicts_of
 from verifai_jax.falsification import simulate

@@ -9,9 +9,9 @@ Both policies of a pair meet the same features. The interval holds at any time
 from dataclasses import dataclass
 from pathlib import Path
 
-from verifai_jax.core.checks import check_fraction
-from verifai_jax.core.errors import missing_name, unknown_name
-from verifai_jax.core.notebook import InNotebook
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.messages.checks import check_fraction
+from verifai_jax.core.messages.errors import missing_name, unknown_name
 from verifai_jax.estimation.comparison.result import UNDECIDED, judge
 from verifai_jax.estimation.trials.reading import TrialTable, table_of, verdicts_of
 from verifai_jax.statistics.paired_rates import PairedRates, paired_rates

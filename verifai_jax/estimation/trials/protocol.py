@@ -13,9 +13,9 @@ import jax
 import numpy as np
 
 from verifai_jax._version import __version__
-from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:

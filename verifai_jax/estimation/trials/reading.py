@@ -7,7 +7,7 @@ read_trials(problem, frame)                         # ... or `recording`, which 
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-from verifai_jax.core.errors import missing_name
+from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.mtl.judging import judge
 from verifai_jax.problem.problem import Problem
 

@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 from jax.extend.core import Literal
 
-from verifai_jax.core.fingerprint import operands_of_scan, programs_in
+from verifai_jax.core.compute.fingerprint import operands_of_scan, programs_in
 from verifai_jax.evaluation.native_code.translation import SINGLE, Translator, pairs, rule, words_of
 from verifai_jax.evaluation.native_code.values import (
     KEY,

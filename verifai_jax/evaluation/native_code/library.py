@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from verifai_jax.core import machine_code
-from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.remembered import remembered_as
+from verifai_jax.core.compute import machine_code
+from verifai_jax.core.compute.remembered import remembered_as
+from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.evaluation.native_code.source import OTHERS, PRELUDE
 
 FLAGS = (

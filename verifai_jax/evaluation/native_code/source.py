@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from verifai_jax.core.fingerprint import without_unused
+from verifai_jax.core.compute.fingerprint import without_unused
 from verifai_jax.evaluation.native_code import arrays as arrays
 from verifai_jax.evaluation.native_code import control_flow as control_flow
 from verifai_jax.evaluation.native_code import indexing as indexing

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from verifai_jax.core.jaxprs import called, run_through
+from verifai_jax.core.compute.jaxprs import called, run_through
 from verifai_jax.evaluation.native_code import elementary
 from verifai_jax.evaluation.native_code.code import Code, widened
 from verifai_jax.evaluation.native_code.values import (

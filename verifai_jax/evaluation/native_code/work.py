@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from verifai_jax.core.fingerprint import programs_in
+from verifai_jax.core.compute.fingerprint import programs_in
 from verifai_jax.evaluation.native_code.values import Program
 
 

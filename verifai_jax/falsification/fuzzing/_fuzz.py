@@ -12,9 +12,9 @@ the formulas that is nearest to breaking.
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.progress import shows_progress
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.falsification import falsify
 from verifai_jax.falsification.fuzzing.implicit import with_implicit
 from verifai_jax.falsification.fuzzing.run import FuzzRun, as_fuzz_run

@@ -8,10 +8,10 @@ from typing import cast
 import numpy as np
 from jaxtyping import Bool, Int
 
-from verifai_jax.core.figure import Figure
-from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.trace import Status
+from verifai_jax.core.display.figure import Figure
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.values.trace import Status
 from verifai_jax.features import Automaton, Domain
 from verifai_jax.problem.problem import Problem
 

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
 
-from verifai_jax.core.checks import is_number
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.messages.checks import is_number
+from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.mtl import Formula, always, signal
 from verifai_jax.problem.behaviour import Behaviour

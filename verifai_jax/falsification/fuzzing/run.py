@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from verifai_jax.core.text import printable
+from verifai_jax.core.messages.text import printable
 from verifai_jax.falsification.coverage_counts import SEEN
 from verifai_jax.falsification.fuzzing.coverage import FuzzCoverage
 from verifai_jax.falsification.run import Run

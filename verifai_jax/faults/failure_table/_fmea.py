@@ -19,9 +19,9 @@ import numpy as np
 import pandas as pd
 
 from verifai_jax.analysis.counterexamples import confirm
-from verifai_jax.core.checks import check_count, check_fraction, is_number
-from verifai_jax.core.errors import check_names, suggests_options
-from verifai_jax.core.progress import shows_progress
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.checks import check_count, check_fraction, is_number
+from verifai_jax.core.messages.errors import check_names, suggests_options
 from verifai_jax.core.store.cache import locked_cache
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification import simulate
@@ -33,7 +33,7 @@ from verifai_jax.faults.fault import AtMost, Fault, FaultFeatures
 from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
-    from verifai_jax.core.executors import Executor
+    from verifai_jax.core.compute.executors import Executor
 
 
 @suggests_options
@@ -73,7 +73,7 @@ def fmea(
       off goes on there.
     - `executor`: whose workers simulate, as in `falsify`.
     - `target`: `FILE.py:NAME` of the problem with its faults, for the commands that replay.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** the table, the most probable failure first.
     **Raises:** `ValueError` for no fault, one that cannot be off, rates out of range or without a
     mission time; as `Problem.with_faults`.

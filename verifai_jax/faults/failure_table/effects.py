@@ -8,8 +8,8 @@ from dataclasses import replace
 import jax
 import numpy as np
 
-from verifai_jax.core.keys import run_keys
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.evaluation.replay import replay as simulate_again
 from verifai_jax.falsification.run import Run

@@ -5,10 +5,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.figure import Drawn, Reported
-from verifai_jax.core.notebook import Tabular
-from verifai_jax.core.text import format_percent, format_seconds
+from verifai_jax.core.display.figure import Drawn, Reported
+from verifai_jax.core.display.notebook import Tabular
+from verifai_jax.core.messages.errors import check_names
+from verifai_jax.core.messages.text import format_percent, format_seconds
 from verifai_jax.falsification.run import Run
 
 if TYPE_CHECKING:

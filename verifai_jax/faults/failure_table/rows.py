@@ -19,7 +19,7 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.binomial import clopper_pearson
 
 if TYPE_CHECKING:
-    from verifai_jax.core.executors import Executor
+    from verifai_jax.core.compute.executors import Executor
 LEVELS = 33
 """Severities of one line at once; two lines, one within the other, tell a thousandth apart."""
 FOLLOWED = 6

@@ -24,11 +24,11 @@ import pandas as pd
 from jaxtyping import Array
 
 from verifai_jax._version import __version__
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.precision import reproducible_settings
-from verifai_jax.core.progress import ProgressBar
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.compute.precision import reproducible_settings
+from verifai_jax.core.display.progress import ProgressBar
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.falsification import Run, falsify, resume, simulate
 from verifai_jax.falsification.validation import check_search
 from verifai_jax.features import FeatureSpace

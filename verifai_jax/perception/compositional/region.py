@@ -17,8 +17,8 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Array, Bool, Float, Int
 
-from verifai_jax.core.keys import run_keys
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.evaluation.verdicts import boolean_semantics, trace_verdict
 from verifai_jax.mtl import Formula, boolean, robustness_signal
 from verifai_jax.problem import Problem

@@ -12,10 +12,10 @@ from typing import Any
 
 import pandas as pd
 
-from verifai_jax.core.figure import Figure
-from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.text import format_features, format_percent
+from verifai_jax.core.display.figure import Figure
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.messages.text import format_features, format_percent
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.falsification import Run
 from verifai_jax.perception.compositional.region import FAILS_ANYWAY, NO_VERDICT, SAFE, UNCERTAIN

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
-from verifai_jax.core.atomic_files import replacing
+from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.reports.plotting.film import LAST, MAX_FRAMES, MAX_WANTED, check_film
 from verifai_jax.reports.plotting.gymnasium_film import episode_of, film_episode

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.figure import Figure
+from verifai_jax.core.display.figure import Figure
+from verifai_jax.core.messages.checks import check_count
 from verifai_jax.reports.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
 from verifai_jax.training.augmentation.examples import Examples
 from verifai_jax.training.augmentation.outcome import SHARES

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from verifai_jax.analysis._diverse import Diverse
 from verifai_jax.analysis.clustering.clusters import Clusters
 from verifai_jax.analysis.neighbours import Neighbours
-from verifai_jax.core.figure import Figure
+from verifai_jax.core.display.figure import Figure
 from verifai_jax.reports.plotting.rows import (
     PALETTE,
     draw_rows,

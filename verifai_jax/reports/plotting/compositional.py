@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.figure import Figure
+from verifai_jax.core.display.figure import Figure
+from verifai_jax.core.messages.errors import check_names
 from verifai_jax.perception.compositional.region import FAILS_ANYWAY, NO_VERDICT, SAFE, UNCERTAIN
 from verifai_jax.perception.compositional.result import Compositional
 from verifai_jax.reports.plotting import style

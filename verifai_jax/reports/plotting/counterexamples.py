@@ -14,9 +14,15 @@ from jaxtyping import Float
 from verifai_jax.analysis.counterexamples._explain import Explained, Influence
 from verifai_jax.analysis.counterexamples.description import format_apart, format_number
 from verifai_jax.analysis.counterexamples.shrunk import Shrunk
-from verifai_jax.core.figure import Axes, Figure
-from verifai_jax.core.text import format_seconds
-from verifai_jax.core.waveform import HELD, Waveform, acting_spans, control_times, is_waveform
+from verifai_jax.core.display.figure import Axes, Figure
+from verifai_jax.core.messages.text import format_seconds
+from verifai_jax.core.values.waveform import (
+    HELD,
+    Waveform,
+    acting_spans,
+    control_times,
+    is_waveform,
+)
 from verifai_jax.mtl import Explanation, robustness_signal
 from verifai_jax.mtl.bounds import constant_bounds
 from verifai_jax.mtl.formula import formula

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from verifai_jax.analysis._coverage import Coverage
-from verifai_jax.core.figure import Figure
+from verifai_jax.core.display.figure import Figure
 from verifai_jax.reports.plotting import style
 from verifai_jax.reports.plotting.panels import draw_samples, two_features
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.estimation.result import Estimate
 from verifai_jax.reports.plotting import style
 

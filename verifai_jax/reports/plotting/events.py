@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from verifai_jax.core.figure import Figure
+from verifai_jax.core.display.figure import Figure
 from verifai_jax.falsification.fuzzing.coverage import FuzzCoverage
 from verifai_jax.reports.plotting.style import FAILING, new_figure, show_or_save
 

@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from verifai_jax.core.checks import check_count
+from verifai_jax.core.messages.checks import check_count
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.reports.plotting.replay import decisive_instant
 

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from verifai_jax.analysis._frequent_patterns import FrequentPatterns
-from verifai_jax.core.figure import Figure
-from verifai_jax.core.text import shorten
+from verifai_jax.core.display.figure import Figure
+from verifai_jax.core.messages.text import shorten
 from verifai_jax.reports.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
 
 BARS = 16

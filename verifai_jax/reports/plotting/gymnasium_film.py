@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from verifai_jax.core.atomic_files import replacing
+from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.reports.plotting import film
 from verifai_jax.systems.blackbox._blackbox import plain_leaves, seed_of

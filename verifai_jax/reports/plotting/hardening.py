@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from verifai_jax.core.figure import Figure
+from verifai_jax.core.display.figure import Figure
 from verifai_jax.reports.plotting.style import BOUND, SAFE, new_figure, show_or_save, tidy
 from verifai_jax.training.hardening.result import HARDENED, Hardening
 

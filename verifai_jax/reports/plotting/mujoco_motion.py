@@ -12,8 +12,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.compilation import Slot
-from verifai_jax.core.waveform import set_durations
+from verifai_jax.core.compute.compilation import Slot
+from verifai_jax.core.values.waveform import set_durations
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.reports.plotting.film import caption_of, decided_at
 from verifai_jax.systems.environments import Brax

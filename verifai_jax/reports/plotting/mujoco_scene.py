@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.errors import require, unknown_name
+from verifai_jax.core.messages.errors import require, unknown_name
+from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.reports.plotting.film import (
     BACKGROUND,
     Frame,

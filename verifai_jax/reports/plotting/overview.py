@@ -9,8 +9,8 @@ import pandas as pd
 from verifai_jax.analysis._importance import NAMES, Importance
 from verifai_jax.analysis.overview import Analysis
 from verifai_jax.analysis.sensitivity.sensitivity import Sensitivity
-from verifai_jax.core.figure import Axes, Figure
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.display.figure import Axes, Figure
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.reports.plotting import style
 from verifai_jax.reports.plotting.panels import cells, draw_rule, draw_samples, two_features
 from verifai_jax.reports.plotting.style import BOUND, new_figure, show_or_save

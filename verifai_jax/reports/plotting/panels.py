@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from verifai_jax.analysis._rules import Rule, Rules
 from verifai_jax.analysis.data.columns import Column
 from verifai_jax.analysis.data.samples import Samples
-from verifai_jax.core.figure import Axes, Figure
+from verifai_jax.core.display.figure import Axes, Figure
 from verifai_jax.reports.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
 
 DOTS = 3000

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from verifai_jax.analysis._pca import Components
-from verifai_jax.core.figure import Figure
-from verifai_jax.core.text import format_percent
+from verifai_jax.core.display.figure import Figure
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.reports.plotting import style
 
 DOTS = 3000

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from verifai_jax.core.figure import Figure
+from verifai_jax.core.display.figure import Figure
 from verifai_jax.reports.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
 from verifai_jax.synthesis.results import Repair
 

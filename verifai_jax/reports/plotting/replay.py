@@ -9,11 +9,11 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.figure import Axes, Figure
-from verifai_jax.core.text import format_seconds, shorten
-from verifai_jax.core.trace import Status, Trace
-from verifai_jax.core.waveform import is_waveform
+from verifai_jax.core.display.figure import Axes, Figure
+from verifai_jax.core.messages.errors import check_names
+from verifai_jax.core.messages.text import format_seconds, shorten
+from verifai_jax.core.values.trace import Status, Trace
+from verifai_jax.core.values.waveform import is_waveform
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.mtl import Expression, Formula, explain, nnf, robustness_signal
 from verifai_jax.mtl.bounds import predicates_of, signal_bounds

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from verifai_jax.core.figure import Axes, Figure
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.display.figure import Axes, Figure
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl.bounds import signal_bounds
 from verifai_jax.mtl.distinguishing import Distinction
 from verifai_jax.mtl.exemplary import Examples

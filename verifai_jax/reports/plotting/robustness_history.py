@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.core.figure import Axes, Figure
+from verifai_jax.core.display.figure import Axes, Figure
 from verifai_jax.falsification.run import Run
 from verifai_jax.reports.plotting import style
 

@@ -8,7 +8,7 @@ import pandas as pd
 from jaxtyping import Float, Int
 
 from verifai_jax.analysis.data.samples import Samples
-from verifai_jax.core.figure import Axes
+from verifai_jax.core.display.figure import Axes
 
 DOTS = 3000
 """Rows drawn at most."""

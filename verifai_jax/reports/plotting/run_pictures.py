@@ -3,7 +3,7 @@
 import logging
 from pathlib import Path
 
-from verifai_jax.core.text import format_error
+from verifai_jax.core.messages.text import format_error
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.falsification.run import Run
 from verifai_jax.reports.plotting.animation import animate

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.figure import Figure
+from verifai_jax.core.display.figure import Figure
+from verifai_jax.core.messages.errors import check_names
 from verifai_jax.falsification.run import Run
 from verifai_jax.reports.plotting import style
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from verifai_jax.core.figure import Axes, Figure
+from verifai_jax.core.display.figure import Axes, Figure
 from verifai_jax.reports.plotting.style import new_figure, show_or_save
 
 EGO, OTHERS, GROUND = "#d1495b", "#3a6ea5", "#b8b8b8"

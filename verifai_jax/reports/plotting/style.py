@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core import figure
-from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.figure import Axes, Figure
-from verifai_jax.core.text import shorten
+from verifai_jax.core.display import figure
+from verifai_jax.core.display.figure import Axes, Figure
+from verifai_jax.core.messages.text import shorten
+from verifai_jax.core.store.atomic_files import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axis import Axis

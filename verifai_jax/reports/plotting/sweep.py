@@ -9,7 +9,7 @@ from jaxtyping import Bool
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from verifai_jax.core.text import format_percent, shorten
+from verifai_jax.core.messages.text import format_percent, shorten
 from verifai_jax.reports.plotting import style
 from verifai_jax.statistics.confidence_sequences import verdict_kind
 from verifai_jax.training.sweeps.importance import HyperparameterImportance

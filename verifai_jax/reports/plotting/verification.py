@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.figure import Figure
+from verifai_jax.core.display.figure import Figure
 from verifai_jax.reports.plotting.style import FAILING, NOT_CLAIMED, SAFE, new_figure, show_or_save
 from verifai_jax.verification.result import Verification
 

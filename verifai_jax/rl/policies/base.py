@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.errors import check_names, require
+from verifai_jax.core.messages.errors import check_names, require
+from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.rl.policies.errors import PolicyError
 from verifai_jax.rl.policies.onnx_graph import OPSET, Graph
 from verifai_jax.rl.policies.tracing import number_type, traced

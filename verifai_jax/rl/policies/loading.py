@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import require, suggests_options
-from verifai_jax.core.text import one_line
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.errors import require, suggests_options
+from verifai_jax.core.messages.text import one_line
 from verifai_jax.rl.policies.base import Actions, Normaliser, Policy, bounds, stack_frames
 from verifai_jax.rl.policies.errors import MAX_BYTES, PolicyError
 from verifai_jax.rl.policies.networks import Mlp, activation_name, linear_layers, natural

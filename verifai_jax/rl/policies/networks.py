@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from verifai_jax.core.errors import check_names
+from verifai_jax.core.messages.errors import check_names
 from verifai_jax.rl.policies.errors import PolicyError
 
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {

@@ -20,9 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Key, PyTree
 
-from verifai_jax.core.errors import require
-from verifai_jax.core.text import format_seconds, one_line
-from verifai_jax.core.user_errors import defined_at
+from verifai_jax.core.messages.errors import require
+from verifai_jax.core.messages.text import format_seconds, one_line
+from verifai_jax.core.user_code.user_errors import defined_at
 from verifai_jax.rl.policies.base import Policy
 from verifai_jax.rl.policies.errors import PolicyError
 from verifai_jax.rl.policies.onnx_graph import read_onnx

@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from verifai_jax.core.errors import check_names, require
-from verifai_jax.core.text import one_line
+from verifai_jax.core.messages.errors import check_names, require
+from verifai_jax.core.messages.text import one_line
 from verifai_jax.rl.policies.errors import MAX_BYTES, MAX_NUMBERS, PolicyError
 from verifai_jax.rl.policies.onnx_node import Node
 from verifai_jax.rl.policies.onnx_operators import OPERATORS, output_size

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from verifai_jax.core.fingerprint import operands_of_scan
-from verifai_jax.core.jaxprs import called, run_through
+from verifai_jax.core.compute.fingerprint import operands_of_scan
+from verifai_jax.core.compute.jaxprs import called, run_through
 from verifai_jax.rl.policies.errors import PolicyError
 from verifai_jax.rl.policies.onnx_graph import OPSET, Graph
 from verifai_jax.rl.policies.onnx_node import Node

@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.rl.task.stepping import ObservedState, flat_observation, match_types
 from verifai_jax.rl.task.task import Continuous
 from verifai_jax.systems.environments._brax import Brax, brax

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree, Shaped
 
-from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.rl.task import stepping
 from verifai_jax.rl.task.task import Action
 from verifai_jax.systems.environments._gymnax import Gymnax, gymnax

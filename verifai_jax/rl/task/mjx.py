@@ -21,8 +21,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, Shaped
 
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import check_names, require, suggests_options
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.errors import check_names, require, suggests_options
 from verifai_jax.rl.task.stepping import abstract_action
 from verifai_jax.rl.task.task import Action, Continuous
 from verifai_jax.systems.mujoco.model import load

@@ -20,9 +20,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree, Shaped
 
-from verifai_jax.core.checks import check_count, is_number
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.user_errors import check_called_with, defined_at, explain_user_error
+from verifai_jax.core.messages.checks import check_count, is_number
+from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.user_code.user_errors import check_called_with, defined_at, explain_user_error
 from verifai_jax.rl.task.stepping import abstract_action
 from verifai_jax.rl.task.task import Action, Continuous, Discrete
 from verifai_jax.systems.ode.closed_loop import Ode, substep, updated

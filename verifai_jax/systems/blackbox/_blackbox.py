@@ -18,10 +18,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Key
 
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.forks import returning_once
-from verifai_jax.core.gaps import with_gaps
-from verifai_jax.core.trace import Status, Trace, check_code
+from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.user_code.forks import returning_once
+from verifai_jax.core.values.gaps import with_gaps
+from verifai_jax.core.values.trace import Status, Trace, check_code
 from verifai_jax.systems.base import (
     Features,
     FunctionSystem,

@@ -8,8 +8,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from verifai_jax.core.checks import check_count, is_number
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.messages.checks import check_count, is_number
+from verifai_jax.core.values.trace import Trace
 
 SignalNames = Sequence[str] | Mapping[str, int]
 

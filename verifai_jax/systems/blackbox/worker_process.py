@@ -17,8 +17,8 @@ from multiprocessing import spawn
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from verifai_jax.core.trace import Status, Trace
-from verifai_jax.core.user_errors import format_user_error
+from verifai_jax.core.user_code.user_errors import format_user_error
+from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.systems.base import Features, Outcome
 
 preparing = False

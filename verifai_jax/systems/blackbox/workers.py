@@ -24,8 +24,8 @@ from dataclasses import replace
 from multiprocessing import Pipe
 from typing import Any
 
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.systems.base import Features, Outcome
 from verifai_jax.systems.blackbox import worker_process
 from verifai_jax.systems.blackbox.worker_process import START, main_guard, pickled_setup

@@ -16,8 +16,8 @@ from typing import Any, ClassVar
 import jax
 from jaxtyping import Array, Int, Key, PyTree
 
-from verifai_jax.core.compilation import XlaOptimization
-from verifai_jax.core.errors import require, suggests_options, unknown_name
+from verifai_jax.core.compute.compilation import XlaOptimization
+from verifai_jax.core.messages.errors import require, suggests_options, unknown_name
 from verifai_jax.systems.base import Features
 from verifai_jax.systems.delays import DelayOption
 from verifai_jax.systems.environments import brax_model

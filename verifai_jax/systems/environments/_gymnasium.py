@@ -18,12 +18,12 @@ import jax
 import numpy as np
 from jaxtyping import UInt8
 
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import require, suggests_options, unknown_name
-from verifai_jax.core.gaps import with_gaps
-from verifai_jax.core.trace import Status, Trace
-from verifai_jax.core.user_errors import check_called_with
-from verifai_jax.core.waveform import is_waveform, set_durations
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.errors import require, suggests_options, unknown_name
+from verifai_jax.core.user_code.user_errors import check_called_with
+from verifai_jax.core.values.gaps import with_gaps
+from verifai_jax.core.values.trace import Status, Trace
+from verifai_jax.core.values.waveform import is_waveform, set_durations
 from verifai_jax.systems.base import KnownSignals
 from verifai_jax.systems.blackbox._blackbox import BlackBox, PooledBlackBox, blackbox
 from verifai_jax.systems.channels import Channels, Link, Passing

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
-from verifai_jax.core.errors import check_names, require, suggests_options, unknown_name
+from verifai_jax.core.messages.errors import check_names, require, suggests_options, unknown_name
 from verifai_jax.systems.base import Features
 from verifai_jax.systems.delays import DelayOption
 from verifai_jax.systems.environments.episode import Moment, step_count, used_inputs, vector_action

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
-from verifai_jax.core.errors import suggests_options, unknown_name
+from verifai_jax.core.messages.errors import suggests_options, unknown_name
 from verifai_jax.systems.base import Features
 from verifai_jax.systems.delays import DelayOption
 from verifai_jax.systems.environments._brax import Brax, import_quietly

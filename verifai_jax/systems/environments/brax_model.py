@@ -20,7 +20,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Key
 
-from verifai_jax.core.errors import UnknownNameError, require, unknown_name
+from verifai_jax.core.messages.errors import UnknownNameError, require, unknown_name
 from verifai_jax.systems.environments.episode import used_inputs
 
 Env: TypeAlias = Any

@@ -17,10 +17,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.trace import Status, Trace
-from verifai_jax.core.waveform import is_waveform
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.errors import check_names
+from verifai_jax.core.values.trace import Status, Trace
+from verifai_jax.core.values.waveform import is_waveform
 from verifai_jax.systems.base import Carry, Features, Seed
 from verifai_jax.systems.channels import NOTHING_PASSED, Channels
 from verifai_jax.systems.checkpointing import checkpointed_scan

@@ -7,9 +7,9 @@ import jax
 import numpy as np
 from jaxtyping import PyTree, UInt8
 
-from verifai_jax.core.errors import unknown_name
-from verifai_jax.core.gaps import with_gaps
-from verifai_jax.core.user_errors import check_called_with
+from verifai_jax.core.messages.errors import unknown_name
+from verifai_jax.core.user_code.user_errors import check_called_with
+from verifai_jax.core.values.gaps import with_gaps
 from verifai_jax.systems.base import Features
 from verifai_jax.systems.channels import NamedNumbers
 from verifai_jax.systems.environments.episode import Moment

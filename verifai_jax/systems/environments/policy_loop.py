@@ -13,10 +13,10 @@ from typing import Any, ClassVar
 import jax
 from jaxtyping import Array, Int, Key, PyTree
 
-from verifai_jax.core.errors import MissingExtra
-from verifai_jax.core.trace import Trace
-from verifai_jax.core.user_errors import check_called_with
-from verifai_jax.core.waveform import set_durations
+from verifai_jax.core.messages.errors import MissingExtra
+from verifai_jax.core.user_code.user_errors import check_called_with
+from verifai_jax.core.values.trace import Trace
+from verifai_jax.core.values.waveform import set_durations
 from verifai_jax.systems.base import Carry, Features, Seed, System
 from verifai_jax.systems.channels import Channels, Link, Passing, first_refusal
 from verifai_jax.systems.delays import DelayOption, as_delay, joined, links_of

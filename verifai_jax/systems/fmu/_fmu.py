@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from verifai_jax.core.checks import check_positive
-from verifai_jax.core.errors import missing_name, suggests_options
-from verifai_jax.core.trace import Trace
-from verifai_jax.core.waveform import is_waveform
+from verifai_jax.core.messages.checks import check_positive
+from verifai_jax.core.messages.errors import missing_name, suggests_options
+from verifai_jax.core.values.trace import Trace
+from verifai_jax.core.values.waveform import is_waveform
 from verifai_jax.systems.base import Features, System
 from verifai_jax.systems.blackbox._blackbox import blackbox
 from verifai_jax.systems.fmu.description import Description, read_description

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
-from verifai_jax.core.errors import missing_name
-from verifai_jax.core.foreign_files import read_xml
+from verifai_jax.core.messages.errors import missing_name
+from verifai_jax.core.store.foreign_files import read_xml
 
 MAX_BYTES = 64 << 20
 """Bytes of a description at most."""

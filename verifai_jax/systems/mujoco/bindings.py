@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.waveform import is_waveform
+from verifai_jax.core.messages.errors import check_names
+from verifai_jax.core.values.waveform import is_waveform
 from verifai_jax.systems.mujoco.derived_constants import (
     SolidBody,
     bodies_of_geoms,

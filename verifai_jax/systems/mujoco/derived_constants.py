@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from verifai_jax.core.devices import enable_compile_cache
+from verifai_jax.core.compute.devices import enable_compile_cache
 from verifai_jax.systems.mujoco.model import MjSpec, MjxModel, Model, mjx_module
 from verifai_jax.systems.mujoco.part_paths import GEOM_MASS, MjModel
 

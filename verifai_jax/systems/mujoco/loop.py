@@ -15,8 +15,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.user_errors import explain_user_error
+from verifai_jax.core.messages.errors import check_names
+from verifai_jax.core.user_code.user_errors import explain_user_error
 from verifai_jax.systems.base import Seed
 from verifai_jax.systems.channels import Channels, Link, NamedNumbers, Passing
 from verifai_jax.systems.mujoco.bindings import Bindings, RecordingFeatures

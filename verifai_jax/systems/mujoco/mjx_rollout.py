@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PyTree
 
-from verifai_jax.core.errors import require
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.messages.errors import require
+from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.systems.base import Features, Seed
 from verifai_jax.systems.mujoco.bindings import Bindings
 from verifai_jax.systems.mujoco.derived_constants import recompute_constants

@@ -16,9 +16,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from verifai_jax.core.errors import require, unknown_name
-from verifai_jax.core.source_collection import files_of_model
-from verifai_jax.core.sources import file_hash
+from verifai_jax.core.messages.errors import require, unknown_name
+from verifai_jax.core.user_code.source_collection import files_of_model
+from verifai_jax.core.user_code.sources import file_hash
 from verifai_jax.systems.mujoco.part_paths import MjModel, names
 
 ModelSource: TypeAlias = Any

@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from verifai_jax.core.compilation import power_of_two
-from verifai_jax.core.errors import require
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.compute.compilation import power_of_two
+from verifai_jax.core.messages.errors import require
+from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.systems.base import Features
 from verifai_jax.systems.mujoco.loop import Loop, Progress, Sample
 

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from verifai_jax.core.errors import require, unknown_name
+from verifai_jax.core.messages.errors import require, unknown_name
 
 MjModel: TypeAlias = Any
 """A `mujoco.MjModel`; MuJoCo is an optional package, so its types cannot be imported here."""

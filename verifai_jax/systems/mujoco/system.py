@@ -17,11 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PyTree
 
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import require, suggests_options, unknown_name
-from verifai_jax.core.fingerprint import used_inputs
-from verifai_jax.core.trace import Trace
-from verifai_jax.core.waveform import set_durations
+from verifai_jax.core.compute.fingerprint import used_inputs
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.errors import require, suggests_options, unknown_name
+from verifai_jax.core.values.trace import Trace
+from verifai_jax.core.values.waveform import set_durations
 from verifai_jax.systems.base import Features, Seed, System
 from verifai_jax.systems.channels import Link, Passing, first_refusal
 from verifai_jax.systems.clock import count_periods

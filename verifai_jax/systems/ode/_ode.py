@@ -14,9 +14,9 @@ from typing import Any
 
 from jaxtyping import PyTree
 
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.user_errors import check_called_with
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.user_code.user_errors import check_called_with
 from verifai_jax.systems.clock import count_periods
 from verifai_jax.systems.ode.closed_loop import Ode
 from verifai_jax.systems.ode.integrators import Integrator, integrator

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from verifai_jax.core.checks import check_count, is_number
-from verifai_jax.core.errors import require, unknown_name
+from verifai_jax.core.messages.checks import check_count, is_number
+from verifai_jax.core.messages.errors import require, unknown_name
 from verifai_jax.systems.ode.integrators import Derivative, Integrator, Step, Time
 
 

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
-from verifai_jax.core.trace import Status, Trace
-from verifai_jax.core.user_errors import defined_at
-from verifai_jax.core.waveform import set_durations, within_step
+from verifai_jax.core.user_code.user_errors import defined_at
+from verifai_jax.core.values.trace import Status, Trace
+from verifai_jax.core.values.waveform import set_durations, within_step
 from verifai_jax.systems.base import Carry, Features, Seed, System
 from verifai_jax.systems.channels import Channels, Link, Passing, States, first_refusal
 from verifai_jax.systems.checkpointing import checkpointed_scan

@@ -15,7 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from verifai_jax.core.checks import is_number
+from verifai_jax.core.messages.checks import is_number
 
 
 @jax.tree_util.register_dataclass

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.messages.errors import unknown_name
 
 Time: TypeAlias = Float[Array, ""] | float
 """Seconds."""

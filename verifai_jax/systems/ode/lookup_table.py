@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.messages.errors import unknown_name
 
 BEYOND = ("clip", "extrapolate")
 """Courses beyond the ends of a table: the value at the end, or its last line going on."""

@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from verifai_jax.core.checks import is_number
-from verifai_jax.core.user_errors import check_called_with
+from verifai_jax.core.messages.checks import is_number
+from verifai_jax.core.user_code.user_errors import check_called_with
 from verifai_jax.systems.any_lane import in_any_lane
 from verifai_jax.systems.ode.integrators import Derivative, Integrator, Step, Time, looped_rk4, rk4
 

@@ -18,9 +18,9 @@ import weakref
 from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar
 
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.systems.base import Features, Outcome, Seed, System
 from verifai_jax.systems.blackbox._blackbox import plain_leaves, seed_of, single_trace
 from verifai_jax.systems.blackbox.trace_form import SignalNames, TraceForm

@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
-from verifai_jax.core.trace import Status
+from verifai_jax.core.values.trace import Status
 from verifai_jax.systems.base import Outcome
 from verifai_jax.systems.remote import connection, wire
 from verifai_jax.systems.remote.connection import Absence, Batch, Client, Point, Rules, keep_alive

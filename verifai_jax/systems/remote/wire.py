@@ -17,11 +17,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from verifai_jax.core.checks import is_number
-from verifai_jax.core.errors import check_names, unknown_name
-from verifai_jax.core.reaction import Reaction
-from verifai_jax.core.trace import Trace
-from verifai_jax.core.waveform import is_waveform
+from verifai_jax.core.messages.checks import is_number
+from verifai_jax.core.messages.errors import check_names, unknown_name
+from verifai_jax.core.values.reaction import Reaction
+from verifai_jax.core.values.trace import Trace
+from verifai_jax.core.values.waveform import is_waveform
 
 PROTOCOL = 1
 DTYPES = ("<f8", "<f4", "<i8", "<i4", "<i2", "|i1", "|u1", "|b1")

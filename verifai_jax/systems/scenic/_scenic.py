@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.features import Categorical, FeatureSpace
 from verifai_jax.features.domain import Domain
 from verifai_jax.systems.scenic.compilation import ProgramError

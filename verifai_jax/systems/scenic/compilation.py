@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from verifai_jax.core.errors import require
+from verifai_jax.core.messages.errors import require
 
 
 class ProgramError(ValueError):

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.features import FeatureSpace
 from verifai_jax.systems.base import Seed, System
 from verifai_jax.systems.blackbox import blackbox

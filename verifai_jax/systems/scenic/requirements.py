@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from verifai_jax.core.progress import write_line
+from verifai_jax.core.display.progress import write_line
 from verifai_jax.systems.scenic import geometry
 from verifai_jax.systems.scenic.compilation import Compiled
 from verifai_jax.systems.scenic.conditions import Condition, conditions

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import require, unknown_name
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.errors import require, unknown_name
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.systems.scenic.recipe import Recipe
 from verifai_jax.systems.scenic.sampling import LOCK, SEED, digest
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.targets import definitions, load_target
+from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.user_code.targets import definitions, load_target
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.testing.checking.check import BUDGET, Check, CheckOutcome, CounterexampleFound

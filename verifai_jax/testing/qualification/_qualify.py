@@ -9,9 +9,9 @@ import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
 
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.source_objects import PACKAGE
-from verifai_jax.core.text import one_line
+from verifai_jax.core.messages.errors import check_names
+from verifai_jax.core.messages.text import one_line
+from verifai_jax.core.user_code.source_objects import PACKAGE
 from verifai_jax.reports.provenance import versions
 from verifai_jax.testing.qualification.oracles import ORACLES
 from verifai_jax.testing.qualification.result import Outcome, Qualification

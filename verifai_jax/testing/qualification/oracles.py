@@ -22,7 +22,7 @@ import pandas as pd
 
 from verifai_jax import mtl
 from verifai_jax.analysis.counterexamples import shrink
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.estimation import estimate
 from verifai_jax.estimation.comparison import compare
 from verifai_jax.falsification import falsify, load, resume, simulate

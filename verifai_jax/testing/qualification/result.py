@@ -14,9 +14,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from verifai_jax.core.atomic_files import replacing
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.text import counted, format_seconds
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.messages.text import counted, format_seconds
+from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.reports.markup import Markup, element, paragraph, table
 from verifai_jax.reports.page import Page, Section, write_page
 from verifai_jax.reports.signing import signing_section

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from verifai_jax.core.sources import Sources, list_changes
-from verifai_jax.core.targets import NothingDefined, definitions, load_target, values_in
+from verifai_jax.core.user_code.sources import Sources, list_changes
+from verifai_jax.core.user_code.targets import NothingDefined, definitions, load_target, values_in
 from verifai_jax.falsification.model_changes import model_changes
 from verifai_jax.falsification.run_folder import RECORD, load
 from verifai_jax.mtl.requirements import Requirement, read_requirements

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from verifai_jax.core.notebook import Tabular
-from verifai_jax.core.text import counted, listed, shorten
+from verifai_jax.core.display.notebook import Tabular
+from verifai_jax.core.messages.text import counted, listed, shorten
 from verifai_jax.reports.markup import Child, element, paragraph, table
 from verifai_jax.reports.page import Page, Section, write_page
 

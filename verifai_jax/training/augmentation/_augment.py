@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import Any
 
 from verifai_jax._version import __version__
-from verifai_jax.core.checks import check_count, check_fraction
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.fingerprint import stable_text
-from verifai_jax.core.precision import reproducible_settings
-from verifai_jax.core.progress import ProgressBar
-from verifai_jax.core.source_collection import sources_of
+from verifai_jax.core.compute.fingerprint import stable_text
+from verifai_jax.core.compute.precision import reproducible_settings
+from verifai_jax.core.display.progress import ProgressBar
+from verifai_jax.core.messages.checks import check_count, check_fraction
+from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.store.cache import locked_cache
+from verifai_jax.core.user_code.source_collection import sources_of
 from verifai_jax.falsification.validation import check_search
 from verifai_jax.features import FeatureSpace
 from verifai_jax.search import Search, named

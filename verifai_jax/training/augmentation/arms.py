@@ -14,7 +14,7 @@ import pandas as pd
 from jaxtyping import Array, Key
 
 from verifai_jax.analysis import k_closest, pca, random_rows, rules
-from verifai_jax.core.errors import check_names
+from verifai_jax.core.messages.errors import check_names
 from verifai_jax.training.augmentation.examples import Examples, Workshop
 from verifai_jax.training.augmentation.task import SupervisedTask, TaskError, Weights
 

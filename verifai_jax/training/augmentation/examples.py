@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from verifai_jax.core.user_errors import explain_user_error
+from verifai_jax.core.user_code.user_errors import explain_user_error
 from verifai_jax.features import FeatureSpace
 from verifai_jax.training.augmentation.task import SupervisedTask, TaskError, Weights
 

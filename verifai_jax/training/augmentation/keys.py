@@ -3,7 +3,7 @@
 import jax
 from jaxtyping import Array, Key
 
-from verifai_jax.core.keys import run_keys
+from verifai_jax.core.compute.keys import run_keys
 
 INITIAL, TRAINING, FURTHER, SEARCH, CHOICE, TEST, MEASURES = range(7)
 """Purposes of random numbers in one repetition."""

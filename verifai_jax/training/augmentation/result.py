@@ -14,11 +14,11 @@ from typing import Any
 
 import pandas as pd
 
-from verifai_jax.core.errors import check_names, unknown_name
-from verifai_jax.core.figure import Figure
-from verifai_jax.core.lazy import lazy_import
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.precision import reproducible_settings
+from verifai_jax.core.compute.precision import reproducible_settings
+from verifai_jax.core.display.figure import Figure
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.messages.errors import check_names, unknown_name
 from verifai_jax.core.store.files import replacing_all
 from verifai_jax.core.store.locks import write_lock
 from verifai_jax.statistics.paired import PairedDifference

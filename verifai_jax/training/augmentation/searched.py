@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Array, Key
 
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.systems.base import System

@@ -20,11 +20,11 @@ import pandas as pd
 from jaxtyping import Array, Float, Key
 
 from verifai_jax._version import __version__
-from verifai_jax.core.progress import ProgressBar
+from verifai_jax.core.display.progress import ProgressBar
 from verifai_jax.core.store.cache import Cache
 from verifai_jax.core.store.files import plain
 from verifai_jax.core.store.log import Arrays
-from verifai_jax.core.user_errors import explain_user_error
+from verifai_jax.core.user_code.user_errors import explain_user_error
 from verifai_jax.falsification import falsify
 from verifai_jax.search import Search
 from verifai_jax.training.augmentation import keys

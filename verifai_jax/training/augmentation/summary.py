@@ -11,7 +11,7 @@ import math
 import numpy as np
 import pandas as pd
 
-from verifai_jax.core.text import counted, format_percent, one_line
+from verifai_jax.core.messages.text import counted, format_percent, one_line
 from verifai_jax.statistics.paired import PairedDifference
 from verifai_jax.training.augmentation.outcome import BASE, SHARES, TRAINED, Outcome
 

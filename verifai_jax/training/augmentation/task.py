@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PyTree
 
-from verifai_jax.core.checks import check_count
-from verifai_jax.core.precision import truncate_silently
-from verifai_jax.core.trace import Trace
-from verifai_jax.core.user_errors import defined_at, explain_user_error
+from verifai_jax.core.compute.precision import truncate_silently
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.user_code.user_errors import defined_at, explain_user_error
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.falsification.table import RESERVED
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.problem.problem import Problem

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from verifai_jax.core.checks import check_count, check_fraction
+from verifai_jax.core.messages.checks import check_count, check_fraction
 from verifai_jax.training.augmentation.task import Inputs, Labels, Transformation
 
 

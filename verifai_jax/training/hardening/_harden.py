@@ -21,12 +21,12 @@ import numpy as np
 import pandas as pd
 
 from verifai_jax._version import __version__
-from verifai_jax.core.checks import check_count, check_fraction
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.fingerprint import stable_text
-from verifai_jax.core.keys import run_keys
-from verifai_jax.core.precision import reproducible_settings
-from verifai_jax.core.progress import say_done, shows_progress
+from verifai_jax.core.compute.fingerprint import stable_text
+from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.compute.precision import reproducible_settings
+from verifai_jax.core.display.progress import say_done, shows_progress
+from verifai_jax.core.messages.checks import check_count, check_fraction
+from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.store.cache import Cache, locked_cache
 from verifai_jax.estimation.certification import Certificates, certify
 from verifai_jax.estimation.comparison import Comparison, compare
@@ -171,7 +171,7 @@ def harden(
     - `max_seconds`: after which no other round begins.
     - `folder`: keeps finished work: the same call goes on where it was interrupted.
     - `even_if_changed`: whether to go on with a folder although files of the model have changed.
-    - `progress`: whether to show one line of progress; see `core.progress` for the default.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** the result. Ctrl-C ends the call; with `folder` it may be repeated.
     **Raises:** before anything is trained, `HardeningError` for a task that cannot start with the
     features; `ValueError` for numbers out of range; as `Trainer.configuration`. `CacheError` for a

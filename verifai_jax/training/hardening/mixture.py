@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree, Shaped
 
 from verifai_jax.analysis.counterexamples.nominal import Nominal
-from verifai_jax.core.text import format_error
+from verifai_jax.core.messages.text import format_error
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 from verifai_jax.rl.batched_training import StaticTask, numbers_of

@@ -14,11 +14,11 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from verifai_jax.core.figure import Drawn
-from verifai_jax.core.notebook import Tabular
+from verifai_jax.core.display.figure import Drawn
+from verifai_jax.core.display.notebook import Tabular
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.core.store.files import replacing_all
 from verifai_jax.core.store.locks import write_lock
-from verifai_jax.core.text import format_percent
 from verifai_jax.estimation.certification import Certificate, Certificates
 from verifai_jax.estimation.comparison import Comparison
 from verifai_jax.rl.policy import Policy, save_policy

@@ -12,11 +12,11 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from verifai_jax.core.callbacks import Callback, check_callbacks
-from verifai_jax.core.checks import check_count, check_fraction, check_positive
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.executors import Executor
+from verifai_jax.core.compute.executors import Executor
+from verifai_jax.core.messages.checks import check_count, check_fraction, check_positive
+from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.store.cache import locked_cache
+from verifai_jax.core.user_code.callbacks import Callback, check_callbacks
 from verifai_jax.estimation.certification.attack import check_attack
 from verifai_jax.rl._evaluate import EPISODES
 from verifai_jax.search import Search

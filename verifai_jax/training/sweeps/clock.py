@@ -11,7 +11,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 
-from verifai_jax.core.progress import ProgressBar
+from verifai_jax.core.display.progress import ProgressBar
 
 TRAINING, COMPILING, CERTIFYING = "training", "compiling", "certifying"
 """Stages of a sweep, as its result names them."""

@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.core.compilation import power_of_two
-from verifai_jax.core.errors import check_names
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.compute.compilation import power_of_two
+from verifai_jax.core.messages.errors import check_names
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import Formula, parse, robustness
 from verifai_jax.mtl.formula import Interval
 from verifai_jax.mtl.resampling import resample

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from verifai_jax._version import __version__
-from verifai_jax.core.fingerprint import stable_text
+from verifai_jax.core.compute.fingerprint import stable_text
 from verifai_jax.features import FeatureSpace
 from verifai_jax.training.sweeps.study import Study
 

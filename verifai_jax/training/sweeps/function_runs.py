@@ -24,12 +24,12 @@ from typing import Any, cast
 import jax
 import numpy as np
 
-from verifai_jax.core.cores import available_cores
-from verifai_jax.core.executors import Executor, check_executor, gather
+from verifai_jax.core.compute.cores import available_cores
+from verifai_jax.core.compute.executors import Executor, check_executor, gather
+from verifai_jax.core.messages.text import format_error, one_line
 from verifai_jax.core.store.cache import Cache
 from verifai_jax.core.store.log import Arrays
-from verifai_jax.core.text import format_error, one_line
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.rl.policies import Policy
 from verifai_jax.rl.policies import policy as load
 from verifai_jax.rl.policies.onnx_graph import read_graph

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from verifai_jax.core.errors import check_names
+from verifai_jax.core.messages.errors import check_names
 
 RETURN, SAFETY = "return", "safety"
 """Criteria of halving."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from verifai_jax.core.errors import MissingExtra, require, unknown_name
+from verifai_jax.core.messages.errors import MissingExtra, require, unknown_name
 from verifai_jax.features import FeatureSpace
 from verifai_jax.features.domain import Domain
 from verifai_jax.training.sweeps.hyperparameters import (

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from verifai_jax.core.errors import require
+from verifai_jax.core.messages.errors import require
 from verifai_jax.features.domain import Domain
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from verifai_jax.core.errors import require
+from verifai_jax.core.messages.errors import require
 from verifai_jax.features import FeatureSpace
 from verifai_jax.features.domain import Domain, as_scalar
 from verifai_jax.training.sweeps.optuna_distributions import optuna_distribution

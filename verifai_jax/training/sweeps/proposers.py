@@ -14,8 +14,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from verifai_jax import search as searches
-from verifai_jax.core.cores import available_cores
-from verifai_jax.core.keys import run_keys
+from verifai_jax.core.compute.cores import available_cores
+from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.features import FeatureSpace
 from verifai_jax.search import Search
 from verifai_jax.search.proposals import Proposals

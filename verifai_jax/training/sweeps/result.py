@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.figure import Drawn, Reported
-from verifai_jax.core.sources import Change, list_changes
-from verifai_jax.core.targets import load_target
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.display.figure import Drawn, Reported
+from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.user_code.sources import Change, list_changes
+from verifai_jax.core.user_code.targets import load_target
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.falsification._falsify import falsify
 from verifai_jax.falsification.model_changes import changed_since, model_changes
 from verifai_jax.features import FeatureSpace

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from verifai_jax._version import __version__
-from verifai_jax.core.callbacks import Callback, notify
-from verifai_jax.core.executors import Executor
+from verifai_jax.core.compute.executors import Executor
 from verifai_jax.core.store.cache import Cache
 from verifai_jax.core.store.log import Arrays
+from verifai_jax.core.user_code.callbacks import Callback, notify
 from verifai_jax.estimation.certification._certify import certify
 from verifai_jax.estimation.certification.result import Certificate, Certificates
 from verifai_jax.rl._evaluate import batched_mean_returns

@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from verifai_jax.core.sources import Sources
+from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store import files
 from verifai_jax.core.store.files import DamagedError, checksum, plain
 from verifai_jax.core.store.locks import write_lock
-from verifai_jax.core.text import one_line
+from verifai_jax.core.user_code.sources import Sources
 from verifai_jax.features import FeatureSpace
 from verifai_jax.rl.policies import policy as load
 from verifai_jax.rl.policy import Policy, save_policy

@@ -15,11 +15,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from verifai_jax.core.checks import check_count, check_fraction
-from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.core.notebook import InNotebook
-from verifai_jax.core.source_collection import made_here, sources_of
-from verifai_jax.core.sources import Maker, Sources
+from verifai_jax.core.display.notebook import InNotebook
+from verifai_jax.core.messages.checks import check_count, check_fraction
+from verifai_jax.core.messages.errors import UnknownNameError
+from verifai_jax.core.user_code.source_collection import made_here, sources_of
+from verifai_jax.core.user_code.sources import Maker, Sources
 from verifai_jax.features import FeatureSpace
 from verifai_jax.features.domain import Domain
 from verifai_jax.mtl import Formula

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from verifai_jax.core.text import counted, format_features, format_percent
+from verifai_jax.core.messages.text import counted, format_features, format_percent
 from verifai_jax.statistics.confidence_sequences import verdict_kind
 from verifai_jax.training.sweeps import ranking
 from verifai_jax.training.sweeps.record import SweepRecord, algorithm_uses, error_message

@@ -19,8 +19,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Key
 
-from verifai_jax.core.checks import check_count, is_number
-from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.messages.checks import check_count, is_number
+from verifai_jax.core.messages.errors import unknown_name
 from verifai_jax.features import FeatureSpace
 from verifai_jax.rl import algorithms
 from verifai_jax.rl.algorithm import Algorithm

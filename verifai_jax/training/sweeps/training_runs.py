@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Key
 
-from verifai_jax.core.executors import Executor, Shipment, check_executor, gather, ship
+from verifai_jax.core.compute.executors import Executor, Shipment, check_executor, gather, ship
 from verifai_jax.core.store.cache import Cache, CacheError
 from verifai_jax.core.store.log import Arrays
 from verifai_jax.rl.batched_training import BatchedTraining, Configuration, policy_structure

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from verifai_jax.core.fingerprint import operands_of_scan
+from verifai_jax.core.compute.fingerprint import operands_of_scan
 from verifai_jax.verification.sets.arrays import together
 from verifai_jax.verification.sets.elementwise import of_rank, select
 from verifai_jax.verification.sets.form import Form

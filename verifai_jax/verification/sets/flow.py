@@ -25,9 +25,9 @@ from jax.experimental.jet import jet
 from jax.extend.core import Primitive
 from jaxtyping import Array, PyTree
 
-from verifai_jax.core.fingerprint import without_unused
-from verifai_jax.core.jaxprs import called, run_through
-from verifai_jax.core.user_errors import source_line
+from verifai_jax.core.compute.fingerprint import without_unused
+from verifai_jax.core.compute.jaxprs import called, run_through
+from verifai_jax.core.user_code.user_errors import source_line
 from verifai_jax.verification.sets.form import SLACK, Form, Reals, add, joined, scaled
 from verifai_jax.verification.sets.interpreter import (
     Equation,

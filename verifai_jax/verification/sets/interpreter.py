@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from verifai_jax.core.jaxprs import CUSTOM_CALLS, called, run_through
-from verifai_jax.core.user_errors import source_line
+from verifai_jax.core.compute.jaxprs import CUSTOM_CALLS, called, run_through
+from verifai_jax.core.user_code.user_errors import source_line
 from verifai_jax.verification.sets.form import Form
 from verifai_jax.verification.sets.whole import Whole
 

@@ -1,0 +1,1 @@
+"""The use of JAX: devices, compilation, keys, precision, identities of programs."""

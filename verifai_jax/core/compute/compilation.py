@@ -1,0 +1,319 @@
+"""Programs compiled side by side: XLA compiles outside of Python's lock, one program a core.
+
+    ask = compile_soon("the search", jax.jit(f).lower(state))   # at once, in the background
+    ask(state)                                          # waits until it is compiled, and calls it
+    describe_compilation()                              # "compiling the search, 3 s"
+    while_compiling(import_matplotlib)                  # at the first long wait, or never
+    ENGINES: Slot[EngineMode, Engine] = Slot("engines")
+    engine = problem.programs.get(ENGINES, mode, lambda: Engine(problem, *mode))
+
+What a program computes does not depend on when it was compiled, so neither do results. What is
+compiled for an object is kept and freed with it, in a slot that fixes the types of keys and values.
+Each shape compiles a program of its own, so numbers of rows become powers of two.
+
+XLA spends most of its time on making a program fast. One that runs a few dozen times is done sooner
+with less of that (`XlaOptimization`): it is compiled in a half to a fifth of the time.
+"""
+
+import gc
+import threading
+import time
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Generic, Literal, TypeVar, cast
+
+import jax
+import numpy as np
+
+from verifai_jax.core.compute.cores import available_cores
+from verifai_jax.core.compute.devices import enable_compile_cache
+
+K = TypeVar("K", bound=Hashable)
+V = TypeVar("V")
+
+
+@dataclass(frozen=True)
+class Slot(Generic[K, V]):
+    """A kind of cached value, by name; `K` is the type of its keys and `V` that of its values."""
+
+    name: str
+
+
+class ProgramCache:
+    """Values by slot and key, which are kept with the object that has the cache."""
+
+    def __init__(self) -> None:
+        self._slots: dict[str, dict[Hashable, object]] = {}
+
+    def get(self, slot: Slot[K, V], key: K, make: Callable[[], V]) -> V:
+        """Return the value of this key, which `make` makes the first time.
+
+        What `make` raises is raised, and nothing is kept.
+        """
+        values = self._slots.setdefault(slot.name, {})
+        if key not in values:
+            values[key] = make()
+        return cast(V, values[key])
+
+    def peek(self, slot: Slot[K, V], key: K) -> V | None:
+        """Return the value of this key, or None before it is made."""
+        return cast("V | None", self._slots.get(slot.name, {}).get(key))
+
+    def clear(self) -> None:
+        """Forget everything, so that its memory can be freed."""
+        self._slots.clear()
+
+
+def power_of_two(count: int) -> int:
+    """Return the least power of two that is at least `count`, and at least 1."""
+    return 1 << max(count - 1, 0).bit_length()
+
+
+def pad_rows(rows: Any, count: int | None = None) -> np.ndarray:
+    """Return rows followed by copies of the last one.
+
+    **Arguments:**
+    - `rows`: an array `[n, ...]`; an empty one stays as it is.
+    - `count`: rows of the result, at least `n`; the next power of two when left out.
+    """
+    rows = np.asarray(rows)
+    missing = (power_of_two(len(rows)) if count is None else count) - len(rows)
+    if not missing:
+        return rows
+    return np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)])
+
+
+XlaOptimization = Literal["most", "little", "least"]
+"""How much XLA does to make a program fast on a processor. `little` computes what `most` does, on
+some processors to the last bit, in programs without long chains of products and sums; `least`
+rounds each product."""
+_OPTIONS: dict[XlaOptimization, dict[str, Any]] = {
+    "most": {},
+    "little": {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1},
+    "least": {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0},
+}
+_WHOLE_LOOPS = {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
+"""Without the pass that splits a loop over cores: each time it is waited for takes longer than a
+step of a simulation."""
+_WIDE = {"xla_cpu_prefer_vector_width": 512}
+"""The widest vectors of any processor, of which XLA takes half by itself: with them simulations ran
+up to 1.25 times as fast."""
+_running: dict[int, tuple[str, float]] = {}
+"""What is being compiled: a name for people, and when it began."""
+_lock = threading.Lock()
+_waited = 0.0
+"""Seconds that this process has waited for programs."""
+LONG = 0.4
+"""Seconds of waiting for a program, from which on work is done that is needed later only: it would
+delay a result for which programs need but be loaded."""
+_meanwhile: dict[Callable[[], object], float] = {}
+"""What is done at the next wait for a program, and after how many seconds of it."""
+
+
+class Compilation:
+    """A program that is being compiled, or is already; calling it waits until it is.
+
+    - `name`: the name of the program, for people.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        lowered: jax.stages.Lowered,
+        effort: XlaOptimization = "most",
+        splits: bool = True,
+        wide: bool = False,
+    ) -> None:
+        self.name = name
+        self._how: tuple[XlaOptimization, bool, bool] = effort, splits, wide
+        self._lowered: jax.stages.Lowered | None = lowered
+        self._future: Future[jax.stages.Compiled] = _pool().submit(
+            _compiled, name, lowered, *self._how
+        )
+        self._program: jax.stages.Compiled | None = None
+
+    def result(self) -> jax.stages.Compiled:
+        """Return the compiled program, once it is compiled.
+
+        **Raises:** what the compiler raised.
+        """
+        if self._program is None:
+            began = time.perf_counter()
+            try:
+                for work, after in sorted(_meanwhile.items(), key=lambda each: each[1]):
+                    wait([self._future], after)
+                    if self._future.done():
+                        break
+                    if _meanwhile.pop(work, None) is not None:
+                        work()
+                self._program = self._future.result()
+            except CancelledError:
+                assert self._lowered is not None
+                self._program = _compiled(self.name, self._lowered, *self._how)
+            except KeyboardInterrupt:
+                # Or else the process would not end before all others are compiled.
+                _pool().shutdown(wait=False, cancel_futures=True)
+                _pool.cache_clear()
+                raise
+            finally:
+                _count_waiting(time.perf_counter() - began)
+            self._lowered = None
+        return self._program
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the program."""
+        return (self._program or self.result())(*arguments)
+
+
+def seconds_waited() -> float:
+    """Return the seconds that this process has waited for programs, all of its threads together."""
+    return _waited
+
+
+def _count_waiting(seconds: float) -> None:
+    global _waited
+    with _lock:
+        _waited += seconds
+
+
+def compile_soon(
+    name: str,
+    lowered: jax.stages.Lowered,
+    effort: XlaOptimization = "most",
+    splits: bool = True,
+    wide: bool = False,
+) -> Compilation:
+    """Compile a program in the background.
+
+    **Arguments:**
+    - `name`: the name of the program, for people: "the search".
+    - `lowered`: the program, lowered by JAX.
+    - `effort`: how much XLA does to make it fast; accelerators always do the most.
+    - `splits`: whether its loops may be split over cores; not of a program that runs on all of
+      them.
+    - `wide`: whether it may have the widest vectors of the processor; only a program without
+      functions of XLA's own, of which one is wrong with these.
+    """
+    enable_compile_cache()
+    return Compilation(name, lowered, effort, splits, wide)
+
+
+def while_compiling(work: Callable[[], object], after: float = LONG) -> None:
+    """Have work done once where this process next waits for a program; never where it does not.
+
+    **Arguments:**
+    - `work`: what will be needed anyway, such as an import; nothing that results depend on.
+    - `after`: seconds of the wait before; 0 for what a first result needs.
+    """
+    _meanwhile[work] = after
+
+
+@contextmanager
+def tracing(name: str = "") -> Iterator[None]:
+    """Return a context, or a decorator, for tracing programs: the garbage collector waits.
+
+    What is traced is millions of small objects that live until all is compiled. The collector
+    would look at all of them again and again, for a fifth of the time.
+
+    **Arguments:**
+    - `name`: the name of the program, which `describe_compilation` then says already; none by
+      default.
+    """
+    with _said(name) if name else nullcontext():
+        if not gc.isenabled():
+            yield
+            return
+        gc.disable()
+        try:
+            yield
+        finally:
+            gc.enable()
+
+
+@contextmanager
+def _said(name: str) -> Iterator[None]:
+    """Return a context in which this thread is said to compile the program."""
+    index = threading.get_ident()
+    with _lock:
+        before = _running.get(index)
+        _running[index] = (name, time.perf_counter())
+    try:
+        yield
+    finally:
+        with _lock:
+            if before is None:
+                del _running[index]
+            else:
+                _running[index] = before
+
+
+def describe_compilation() -> str:
+    """Say what is being compiled and for how long so far; empty if nothing is."""
+    with _lock:
+        running = list(_running.values())
+    if not running:
+        return ""
+    names = dict.fromkeys(name for name, _ in running)
+    seconds = time.perf_counter() - min(began for _, began in running)
+    return f"compiling {' and '.join(names)}, {seconds:z.0f} s"
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(available_cores(), "compile")
+
+
+def _compiled(
+    name: str, lowered: jax.stages.Lowered, effort: XlaOptimization, splits: bool, wide: bool
+) -> jax.stages.Compiled:
+    with _said(name):
+        options = _wanted_options(effort, splits, wide)
+        if not options:
+            return lowered.compile()
+        try:
+            return lowered.compile(options)
+        except jax.errors.JaxRuntimeError:
+            # An XLA that does not know one of the options; asking before takes longer.
+            known = known_options(options)
+            if known == options:
+                raise
+            return lowered.compile(known)
+
+
+def _wanted_options(
+    effort: XlaOptimization, splits: bool = True, wide: bool = False
+) -> dict[str, Any]:
+    # The user of this switch wants the least of all programs.
+    if jax.default_backend() != "cpu" or jax.config.read("jax_disable_most_optimizations"):
+        return {}
+    return _OPTIONS[effort] | ({} if splits else _WHOLE_LOOPS) | (_WIDE if wide else {})
+
+
+@cache
+def options_of(effort: XlaOptimization) -> dict[str, Any] | None:
+    """Return the options for this effort that XLA knows; None without any."""
+    return known_options(_wanted_options(effort)) or None
+
+
+def known_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those of XLA's compile options that the XLA of this process knows.
+
+    XLA adds options and drops them from one version to the next, refuses a program with one that
+    it does not know, and ends a process that gets it in `XLA_FLAGS`.
+
+    **Arguments:**
+    - `options`: values by their names.
+    """
+    nothing = jax.jit(lambda: np.float32(0)).lower()
+
+    def is_known(name: str) -> bool:
+        try:
+            nothing.compile(compiler_options={name: options[name]})
+        except jax.errors.JaxRuntimeError:
+            return False
+        return True
+
+    return {name: options[name] for name in options if is_known(name)}

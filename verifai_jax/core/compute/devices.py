@@ -1,0 +1,118 @@
+"""The machine: work spread over devices, and a compile cache that outlives the process.
+
+XLA runs the small loop bodies of a rollout on one thread. Splitting the batch over one host
+device per core (`core.compute.cores`) is what keeps all cores busy.
+
+Environment variables: `VERIFAI_JAX_CORES` (how many cores to use), `VERIFAI_JAX_CACHE` (a folder
+for compiled programs, or `off`).
+"""
+
+import os
+import platform
+import shutil
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+Device: TypeAlias = jax.Device  # pyright: ignore[reportInvalidTypeForm]
+"""A device of JAX; its own name of the class is a variable to type checkers."""
+
+
+def spread_over_devices(
+    function: Callable[..., Any], split: Sequence[bool], devices: Sequence[Any] | None = None
+) -> Callable[..., Any]:
+    """Split the leading axis of some arguments, and of all results, over devices.
+
+    **Arguments:**
+    - `function`: the function of arrays whose leading axes are a device's share.
+    - `split`: for each argument whether its leading axis is split; the others are given whole.
+    - `devices`: JAX devices; all of this process when left out. Leading axes must be multiples of
+      their number.
+    **Returns:** a function of the whole arrays, to be traced by `jax.jit`; `function` itself where
+    there is one device.
+    """
+    devices = jax.local_devices() if devices is None else devices
+    if len(devices) == 1:
+        return function
+    part, whole = PartitionSpec("row"), PartitionSpec()
+    return jax.shard_map(
+        function,
+        mesh=_mesh(devices),
+        in_specs=tuple(part if each else whole for each in split),
+        out_specs=part,
+        # A user's scan need not say that its carry differs between devices.
+        check_vma=False,
+    )
+
+
+@cache
+def describe_processor() -> str:
+    """Describe what decides the last digits of results: processor, device and version of JAX."""
+    device = jax.local_devices()[0]
+    kind = device.device_kind
+    if device.platform == "cpu":
+        kind = platform.processor() or platform.machine()
+        try:
+            lines = Path("/proc/cpuinfo").read_text().splitlines()
+        except OSError:
+            lines = []
+        names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+        kind = next(names, kind)
+    return f"{kind} with JAX {jax.__version__}"
+
+
+def split_sharding(devices: Sequence[Device]) -> NamedSharding:
+    """Return where arrays lie whose leading axis is split as `spread_over_devices` does.
+
+    An array that lies elsewhere would have a compiled program compiled again.
+    """
+    return NamedSharding(_mesh(devices), PartitionSpec("row"))
+
+
+def _mesh(devices: Sequence[Device]) -> Mesh:
+    return Mesh(np.array(devices), ("row",))
+
+
+def _setting(name: str) -> Any:
+    return getattr(jax.config, name)
+
+
+def cache_folder() -> Path | None:
+    """Folder of the persistent compile cache; None when it is switched off."""
+    setting = os.environ.get("VERIFAI_JAX_CACHE", "").strip()
+    if setting.lower() in ("off", "0", "no", "false"):
+        return None
+    if setting:
+        return Path(setting).expanduser()
+    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(base).expanduser() / "verifai_jax" / "compiled"
+
+
+CACHE_ROOM = 64 * 2**20
+"""Bytes that must be free to keep compiled programs. On a full disk JAX leaves halves of programs,
+which it warns of in each later process and never replaces; a run's programs are a few MiB."""
+
+
+def enable_compile_cache() -> None:
+    """Keep compiled programs on disk, unless the user has configured JAX's cache already."""
+    folder = cache_folder()
+    if folder is None or _setting("jax_compilation_cache_dir") is not None:
+        return
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if shutil.disk_usage(folder).free < CACHE_ROOM:
+            return
+    except OSError:
+        return  # A read-only home costs compile time, not results; `doctor` reports it.
+    from jax.experimental.compilation_cache import compilation_cache
+
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    # JAX decides once whether it has a cache; anything compiled before now said no.
+    compilation_cache.reset_cache()

@@ -1,0 +1,1 @@
+"""The display of results: notebooks, figures, progress, names that are imported late."""

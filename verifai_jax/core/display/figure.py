@@ -1,0 +1,97 @@
+"""Matplotlib figures that belong to no window and show themselves in a notebook."""
+
+import contextlib
+import functools
+import io
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from verifai_jax.core.display.lazy import lazy_import
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
+else:
+    # Importing matplotlib takes longer than importing everything else here.
+    Axes = Figure = object
+
+
+class Drawn:
+    """A result that has a picture.
+
+    - `_picture`: a module of `verifai_jax.reports.plotting`, and its function that draws it.
+    """
+
+    _picture: ClassVar[tuple[str, str]]
+
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw the result.
+
+        **Arguments:**
+        - `path`: file that the picture is written to, if given.
+        **Returns:** the Matplotlib figure.
+        """
+        module, function = self._picture
+        return lazy_import(f"verifai_jax.reports.plotting.{module}", function)(self, path)
+
+
+class Reported:
+    """A result on which an evidence report can be written."""
+
+    def report(self, path: str | Path, **options: Any) -> Path:
+        """Write the evidence report as one HTML file, and its claims as JSON next to it.
+
+        **Arguments:**
+        - `path`: the path of the HTML file.
+        - `options`: the options of `reports.write_report` for a result of this kind: of a run
+          `units` and `reasons` of features, `traces`, `studies`, `modes`, `odd`, `assessment`; of a
+          sweep `units` and `reasons` of hyper-parameters; of a transfer `units` and `reasons` of
+          features, and of any other result its `problem`, too; of an estimate and a comparison also
+          `errors`.
+        **Returns:** the path of the HTML file.
+        """
+        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
+
+
+def new_figure(**options: Any) -> Figure:
+    """Return an empty figure: nothing pops up, and nothing has to be closed.
+
+    As the last value of a notebook cell it is drawn, with or without `%matplotlib inline`.
+
+    **Arguments:**
+    - `options`: those of `matplotlib.figure.Figure`.
+    """
+    return _figure_class()(**options)
+
+
+def load() -> None:
+    """Import what figures are drawn with, which takes half a second."""
+    _figure_class()
+
+
+@contextlib.contextmanager
+def missing_glyphs() -> Iterator[None]:
+    """Draw characters that the font lacks as boxes, without a warning for each."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)
+        yield
+
+
+@functools.cache
+def _figure_class() -> Any:
+    # Made on demand: importing matplotlib takes longer than importing everything else here.
+    from matplotlib.figure import Figure
+
+    class NotebookFigure(Figure):
+        def savefig(self, *arguments: Any, **options: Any) -> None:
+            with missing_glyphs():
+                super().savefig(*arguments, **options)
+
+        def _repr_png_(self) -> bytes:
+            buffer = io.BytesIO()
+            self.savefig(buffer, format="png", dpi=72)
+            return buffer.getvalue()
+
+    return NotebookFigure

@@ -1,0 +1,56 @@
+"""Late binding: names that are imported when they are first used.
+
+    plot_replay = lazy_import("verifai_jax.reports.plotting.replay", "plot_replay")
+    plot_replay(replay, path)                           # the module is imported now, not before
+
+A result lies below the pictures and analyses of it. Its methods reach them through `lazy_import`,
+so that imports point downwards and a reader finds every exception by its name. `attach` does the
+same for all names of a package.
+"""
+
+import importlib
+import re
+import sys
+from collections.abc import Callable
+from typing import Any
+
+
+def lazy_import(module: str, name: str) -> Any:
+    """Import `module` now and return what it calls `name`, which may be a module within it."""
+    return getattr(__import__(module, fromlist=[name]), name)
+
+
+def attach(
+    package: str, *others: str
+) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """Return `__getattr__`, `__dir__` and `__all__` of a package whose names are imported late.
+
+    The names are those that the package imports for type checkers, as `from a.b import c as c`:
+    they are read from its source, so that each stands there once.
+
+    **Arguments:**
+    - `package`: the name of the package, which is being imported.
+    - `others`: names that it has already.
+    """
+    source = sys.modules[package].__loader__.get_source(package)  # pyright: ignore
+    begin = source.index("if TYPE_CHECKING:")
+    imports = re.findall(r"    from (\S+) import ([^(\n]+|\([^)]*\))\n", source[begin:])
+    module_of = {
+        name: module for module, names in imports for name in re.findall(r"(\w+) as", names)
+    }
+    known = [*others, *module_of]
+
+    def get(name: str) -> Any:
+        if name not in module_of:
+            from verifai_jax.core.messages.errors import nearest_names
+
+            raise AttributeError(f"{package} has no {name!r}{nearest_names(name, known)}")
+        module = module_of[name]
+        if module == package:
+            value = importlib.import_module(f"{package}.{name}")
+        else:
+            value = lazy_import(module, name)
+        setattr(sys.modules[package], name, value)
+        return value
+
+    return get, lambda: sorted(known), known

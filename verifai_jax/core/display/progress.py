@@ -1,0 +1,370 @@
+"""Progress: what a verb is doing, how much is done, how fast, and how much time is left.
+
+    @shows_progress("comparing")                        # a line for all that `compare` takes
+    def compare(baseline, ..., progress: bool | None = None): ...
+
+    with SimulationProgress("cartpole", budget, show=None) as progress:
+        progress.update(simulations, counterexamples, best)
+
+Rich draws a line on the error stream, on a terminal or in a notebook that has ipywidgets.
+Elsewhere, such as in a pipe, a line is written once a minute. What is begun within another verb
+takes its line over for as long as it lasts.
+"""
+
+import contextlib
+import functools
+import importlib.util
+import inspect
+import io
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
+from dataclasses import dataclass
+from typing import IO, TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
+
+from verifai_jax.core.messages.text import printable
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, Task, TaskID
+    from rich.text import Text
+P = ParamSpec("P")
+R = TypeVar("R")
+EVERY = 60.0
+"""Seconds between two lines where nothing is drawn."""
+MOMENT = 2.0
+"""Seconds after which work is worth going on with: what takes less is as soon done anew."""
+_ongoing: ContextVar["ProgressBar | None"] = ContextVar("ongoing", default=None)
+"""The bar of the verb that was called; the others within it show themselves there."""
+
+
+class _Stream:
+    """The error stream, to which writing never fails: a run outlives the terminal that shows it."""
+
+    def __init__(self) -> None:
+        # Within another bar it stands in for the stream itself.
+        self._stream = getattr(sys.stderr, "rich_proxied_file", sys.stderr) or io.StringIO()
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@dataclass
+class _Stage:
+    """A part of a computation; a `total` of None is not known."""
+
+    name: str
+    total: float | None
+    unit: str
+    began: float
+    done: float = 0.0
+    # From the first count on: what is compiled before it would hide the speed.
+    first: float = 0.0
+    counted: float = 0.0
+    figures: str = ""
+    task: "TaskID | None" = None
+
+    @property
+    def amount(self) -> str:
+        """The work that is done: `200/1,000 simulations`."""
+        if self.total is None:
+            return f"{self.done:z,.0f} {self.unit}" if self.done else ""
+        return f"{self.done:z,.0f}/{self.total:z,.0f} {self.unit}"
+
+    def line(self, compiling: str) -> str:
+        """Write what is going on in one line."""
+        minutes = (time.perf_counter() - self.began) / 60
+        parts = [self.amount, compiling or self.figures, f"{minutes:z.1f} min so far"]
+        return f"{self.name}: {', '.join(part for part in parts if part)}"
+
+
+class ProgressBar:
+    """One line, for one stage of a computation at a time; a context manager around all of them.
+
+    **Arguments:**
+    - `show`: whether to show it; None decides by where the error stream goes, False shows nothing.
+    """
+
+    def __init__(self, show: bool | None = None) -> None:
+        self.show = show
+        self._display: Progress | None = None
+        self._stages: list[_Stage] = []
+        # Stages begin on the bar of the verb that this is a part of, where there is one.
+        self._shared: ProgressBar | None = None
+        self._own = 0
+        self._over = threading.Event()
+
+    def __enter__(self) -> "ProgressBar":
+        outer = _ongoing.get()
+        if (
+            outer is not None
+            and self.show is not False
+            and (outer.show is not False or not self.show)
+        ):
+            self._shared = outer
+        elif self.show is not False:
+            if self.show or has_viewer():
+                self._draw()
+            if not has_viewer():
+                threading.Thread(target=self._write_lines, daemon=True).start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        while self._own:
+            self.end()
+        self._over.set()
+        if self._display is not None:
+            self._display.stop()
+
+    def _draw(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+        from rich.text import Text
+
+        class Figures(TextColumn):
+            """The figures of a stage, or what is being compiled and for how long so far."""
+
+            def render(self, task: "Task") -> "Text":
+                task.fields["shown"] = _compiling() or task.fields["figures"]
+                return super().render(task)
+
+        class Time(TimeRemainingColumn):
+            """The time left, or the time so far if the total is unknown."""
+
+            def render(self, task: "Task") -> "Text":
+                if task.total is None:
+                    return Text(f"{task.elapsed or 0.0:z.0f} s", style="progress.remaining")
+                return super().render(task)
+
+        self._display = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.fields[amount]}"),
+            Figures("{task.fields[shown]}"),
+            Time(),
+            console=Console(file=cast("IO[str]", _Stream())),
+            transient=True,
+        )
+        self._display.start()
+
+    def _write_lines(self) -> None:
+        stream = _Stream()
+        while not self._over.wait(EVERY):
+            stages = self._stages[-1:]
+            if stages:
+                stream.write(printable(stages[0].line(_compiling())) + "\n")
+                stream.flush()
+
+    def begin(self, name: str, total: float | None, unit: str) -> None:
+        """Begin a stage of `total` units of work, None if unknown; a stage may lie in another."""
+        self._own += 1
+        bar = self._shared or self
+        stage = _Stage(name, total, unit, time.perf_counter())
+        if bar._display is not None:
+            if bar._stages and bar._stages[-1].task is not None:
+                bar._display.update(bar._stages[-1].task, visible=False)
+            stage.task = bar._display.add_task(
+                name, total=total, amount=stage.amount, figures="", shown=""
+            )
+        bar._stages.append(stage)
+
+    def end(self) -> None:
+        """End the present stage; the one that it lies in goes on."""
+        if not self._own:
+            return
+        self._own -= 1
+        bar = self._shared or self
+        stage = bar._stages.pop()
+        if bar._display is not None and stage.task is not None:
+            bar._display.remove_task(stage.task)
+            if bar._stages and bar._stages[-1].task is not None:
+                bar._display.update(bar._stages[-1].task, visible=True)
+
+    def advance(self, amount: float, figures: str = "") -> None:
+        """Count `amount` more units as done, and show `figures` next to the bar."""
+        if self._own:
+            stage = (self._shared or self)._stages[-1]
+            self.update(stage.done + amount, figures=figures)
+
+    def update(self, done: float, total: float | None = None, figures: str = "") -> None:
+        """Set the units that are done, and their total where it has changed."""
+        if self._own:
+            self._set((self._shared or self)._stages[-1], done, total, figures)
+
+    def count(self, amount: float) -> None:
+        """Count units as done of the outermost stage, whatever goes on within it."""
+        if self._stages:
+            stage = self._stages[0]
+            # A total is what somebody allowed; more than that is done by what is not counted in it.
+            self._set(stage, stage.done + amount, None, stage.figures)
+
+    def _set(self, stage: _Stage, done: float, total: float | None, figures: str) -> None:
+        stage.done, stage.figures = done, figures
+        if not stage.counted:
+            stage.first, stage.counted = done, time.perf_counter()
+        stage.total = stage.total if total is None else total
+        display = (self._shared or self)._display
+        if display is not None and stage.task is not None:
+            display.update(
+                stage.task, completed=done, total=stage.total, amount=stage.amount, figures=figures
+            )
+
+    def note(self, text: str) -> None:
+        """Write a line above the bar, which stays."""
+        display = (self._shared or self)._display
+        if display is not None:
+            display.console.print(f"note: {printable(text)}", markup=False, highlight=False)
+
+    @property
+    def speed(self) -> float:
+        """Units per second of the present stage."""
+        bar = self._shared or self
+        if not self._own:
+            return 0.0
+        stage = bar._stages[-1]
+        if bar._display is not None:
+            return next((t.speed or 0.0 for t in bar._display.tasks if t.id == stage.task), 0.0)
+        return (stage.done - stage.first) / max(time.perf_counter() - stage.counted, 1e-9)
+
+
+def _compiling() -> str:
+    """Say what is being compiled; the module that knows is not imported where nothing was."""
+    compilation: Any = sys.modules.get("verifai_jax.core.compute.compilation")
+    return "" if compilation is None else compilation.describe_compilation()
+
+
+def shows_progress(
+    doing: str, unit: str = "simulations", *, of_budget: bool = True
+) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Let a verb say what it is doing while it runs, in one line.
+
+    Its option `progress` decides as in `ProgressBar`; one that is a function of the caller's shows
+    nothing by itself. The total is its option `budget`, where it has one. What `count_done` counts
+    is done.
+
+    **Arguments:**
+    - `doing`: a word for the verb, before the name of its first argument: "comparing".
+    - `unit`: name of what is counted.
+    - `of_budget`: whether its option `budget` is the total, and not that of a part.
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        signature = inspect.signature(function)
+        first = next(iter(signature.parameters))
+
+        @functools.wraps(function)
+        def shown(*arguments: P.args, **options: P.kwargs) -> R:
+            if _ongoing.get() is not None:
+                return function(*arguments, **options)
+            try:
+                given = signature.bind(*arguments, **options)
+            except TypeError:
+                return function(*arguments, **options)  # It says itself what does not fit.
+            given.apply_defaults()
+            bound = given.arguments
+            show, budget = bound.get("progress"), bound.get("budget")
+            subject = (
+                bound[first] if isinstance(bound[first], str) else getattr(bound[first], "name", "")
+            )
+            with ProgressBar(False if callable(show) else show) as bar:
+                total = budget if of_budget and isinstance(budget, int) else None
+                bar.begin(f"{doing} {subject}".rstrip(), total, unit)
+                token = _ongoing.set(bar)
+                try:
+                    return function(*arguments, **options)
+                finally:
+                    _ongoing.reset(token)
+
+        return shown
+
+    return decorate
+
+
+def count_done(amount: float) -> None:
+    """Count so many units as done by the verb that was called."""
+    if (bar := _ongoing.get()) is not None:
+        bar.count(amount)
+
+
+def say_done(done: float, total: float | None = None, figures: str = "") -> None:
+    """Set how much the verb that was called has done, of how much, with figures next to it."""
+    if (bar := _ongoing.get()) is not None:
+        bar.update(done, total, figures)
+
+
+class SimulationProgress:
+    """The bar of a run: simulations per second, least robustness, counterexamples, time left.
+
+    **Arguments:**
+    - `name`: text in front of the bar.
+    - `budget`: simulations in all.
+    - `show`: whether to draw; None decides by where the error stream goes.
+    """
+
+    def __init__(self, name: str, budget: int, show: bool | None = None) -> None:
+        self.name, self.budget = name, budget
+        self.bar = ProgressBar(show)
+
+    def __enter__(self) -> "SimulationProgress":
+        self.bar.__enter__()
+        self.bar.begin(self.name, self.budget, "simulations")
+        return self
+
+    def __exit__(self, *reason: object) -> None:
+        self.bar.__exit__(*reason)
+
+    def note(self, text: str) -> None:
+        """Write a line above the bar, which stays."""
+        self.bar.note(text)
+
+    def update(self, simulations: int, counterexamples: int, best: float) -> None:
+        """Show the simulations made, the counterexamples among them and the least robustness."""
+        figures = f"{self.bar.speed:z,.0f}/s  best {best:z.3g}  {counterexamples} counterexamples"
+        self.bar.update(simulations, figures=figures)
+
+
+def write_line(text: str) -> None:
+    """Write a line to the error stream, above any bar, on what takes long where there is no bar."""
+    stream = _Stream()
+    stream.write(f"{printable(text)}\n")
+    stream.flush()
+
+
+def has_viewer() -> bool:
+    """Return whether the error stream is a terminal or a notebook that can draw a bar."""
+    if sys.stderr is not None and not sys.stderr.closed and sys.stderr.isatty():
+        return True
+    # In a notebook rich draws through ipywidgets, and without it warns instead.
+    return "ipykernel" in sys.modules and importlib.util.find_spec("ipywidgets") is not None
+
+
+@contextlib.contextmanager
+def goes_on_with(command: str, kept: Callable[[], bool]) -> Iterator[None]:
+    """Say after a moment which command resumes the work, since a killed process cannot say it.
+
+    **Arguments:**
+    - `kept`: whether there is anything to go on with by now.
+    """
+    over = threading.Event()
+
+    def say() -> None:
+        while not over.wait(MOMENT):
+            if kept():
+                write_line(f"note: if this is killed, go on with: {command}")
+                return
+
+    threading.Thread(target=say, daemon=True).start()
+    try:
+        yield
+    finally:
+        over.set()

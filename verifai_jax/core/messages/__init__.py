@@ -1,0 +1,1 @@
+"""Texts for people: errors with value and remedy, checks of arguments, numbers as text."""

@@ -1,0 +1,126 @@
+"""Checks of numbers that a user gives; each error names the argument, its range and its value.
+
+>>> check_fraction("confidence", 95)
+Traceback (most recent call last):
+ValueError: confidence must lie between 0 and 1; got 95
+"""
+
+import math
+import operator
+from typing import SupportsIndex, TypeGuard
+
+import numpy as np
+
+from verifai_jax.core.messages.text import is_control
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Return whether this is a real number of Python or NumPy, and no truth value."""
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+
+
+def check_name(
+    what: str, name: object, *, lines: bool = False, error: type[ValueError] = ValueError
+) -> str:
+    """Check a name that tables and files can hold.
+
+    **Arguments:**
+    - `what`: what it names, for the message: `the name of a signal`.
+    - `lines`: whether it may have line breaks and other control characters.
+    - `error`: type of the error to raise.
+    **Raises:** `error` for anything but a text that is not empty and that UTF-8 can hold.
+    """
+    if not isinstance(name, str) or not name:
+        raise error(f"{what} must be a text that is not empty; got {name!r}")
+    try:
+        name.encode()
+    except UnicodeEncodeError as cause:
+        raise error(
+            f"{what} must be a text that UTF-8 can hold; {name!r} has the lone surrogate "
+            f"{cause.object[cause.start]!r}"
+        ) from None
+    if not lines and any(is_control(character) for character in name):
+        raise error(
+            f"{what} must be one line without control characters, as people read it in summaries; "
+            f"got {name!r}"
+        )
+    return name
+
+
+def check_fraction(
+    name: str,
+    value: object,
+    *,
+    zero: bool = False,
+    one: bool = False,
+    error: type[ValueError] = ValueError,
+) -> float:
+    """Check a probability or another share of one.
+
+    **Arguments:**
+    - `name`: name of the argument in the error message.
+    - `zero`: whether 0 itself is allowed.
+    - `one`: whether 1 itself is allowed.
+    - `error`: type of the error to raise.
+    **Raises:** `error` unless `0 < value < 1`, or the value is an end that is allowed.
+    """
+    if is_number(value) and (0 < value < 1 or (zero and value == 0) or (one and value == 1)):
+        return value
+    allowed = "must lie between 0 and 1"
+    if zero or one:
+        allowed = f"must be in {'[' if zero else '('}0, 1{']' if one else ')'}"
+    raise error(f"{name} {allowed}; got {value!r}")
+
+
+def check_positive(
+    name: str, value: object, *, finite: bool = False, error: type[ValueError] = ValueError
+) -> float:
+    """Check a number above zero.
+
+    **Arguments:**
+    - `name`: name of the argument in the error message.
+    - `finite`: whether infinity is refused too.
+    - `error`: type of the error to raise.
+    **Raises:** `error` unless `value > 0`.
+    """
+    if not (is_number(value) and value > 0 and not (finite and math.isinf(value))):
+        raise error(f"{name} must be positive{' and finite' if finite else ''}; got {value!r}")
+    return value
+
+
+def check_count(
+    name: str, value: object, minimum: int = 1, *, error: type[ValueError] = ValueError
+) -> int:
+    """Check an integer that counts something.
+
+    **Arguments:**
+    - `name`: name of the argument in the error message.
+    - `value`: value to check; NumPy's integers are welcome, truth values and floats are not.
+    - `minimum`: smallest value allowed.
+    - `error`: type of the error to raise.
+    **Returns:** the value as a Python integer.
+    **Raises:** `error` for anything but an integer of at least `minimum`.
+    """
+    count = None
+    if isinstance(value, SupportsIndex) and not isinstance(value, bool | np.bool_):
+        try:
+            count = operator.index(value)
+        except TypeError:  # An array of floats, or of several numbers.
+            count = None
+    if count is None or count < minimum:
+        raise error(f"{name} must be an integer of at least {minimum}; got {value!r}")
+    return count
+
+
+def check_options(
+    budget: object, batch: object, seed: object, max_seconds: object, stop_after: object
+) -> None:
+    """Refuse numbers out of range."""
+    for name, value in (("budget", budget), ("batch", batch), ("stop_after", stop_after)):
+        if name == "stop_after" and value is None:
+            continue
+        check_count(name, value)
+    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or not 0 <= seed < 2**63:
+        raise ValueError(f"seed must be an integer from 0 to 2**63 - 1; got {seed!r}")
+    if max_seconds is not None:
+        check_positive("max_seconds", max_seconds)

@@ -1,0 +1,277 @@
+"""The record of what a result was made of: hashes of the files of its model, and versions.
+
+    then.changes(now)                                   # which files are others by now
+
+The files are those of the user: the module that makes the problem, modules of the user that it
+imports and that its functions come from, and the data that they open or name. The hash of a module
+is that of the file as it was imported, so that a module which is edited and not imported again is
+what it was. Python, this package and what is installed are recorded by their versions.
+"""
+
+import hashlib
+import os
+import platform
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from verifai_jax.core.user_code.reads import files_read_by, modules_loaded_by
+
+PACKAGES = (
+    *(
+        "verifai_jax",
+        "jax",
+        "jaxlib",
+        "numpy",
+        "scipy",
+        "pandas",
+        "sklearn",
+        "mujoco",
+        "brax",
+        "gymnax",
+    ),
+    *("gymnasium", "diffrax", "scenic", "torch"),
+)
+"""Packages whose versions decide numbers; the version of one that is imported is recorded."""
+PROBLEM, CALLER, IMPORTED = "the problem", "calls what makes the problem", "imported"
+FUNCTION, READ, NAMED, MODEL = "a function", "read", "named in a program", "part of a model"
+"""Roles of a file. That of a caller counts only where the same caller makes the problem again."""
+SHOWN = 12
+"""Digits of a hash in a sentence."""
+MAX_SHOWN = 3
+"""Changes that a sentence lists."""
+tree_commits: dict[Path, str] = {}
+"""Folders with the project's files at commits of git, while they exist."""
+
+
+class Source(NamedTuple):
+    """A file by its name, its role, and the SHA-256 of its content.
+
+    The name is the path from the working directory, absolute where the file lies elsewhere.
+    """
+
+    name: str
+    role: str
+    sha256: str
+
+
+class Maker(NamedTuple):
+    """A module whose code makes a problem: its path, hash and role; no path for a notebook."""
+
+    file: str
+    sha256: str
+    role: str
+
+
+class Change(NamedTuple):
+    """A file that is another one by now: its hash then, None for one that had no part in it, and
+    its hash now, None for one that is missing.
+    """
+
+    name: str
+    was: str | None
+    now: str | None
+
+    def __str__(self) -> str:
+        if self.was is None:
+            return f"{self.name} makes it now, and had no part in it then"
+        now = "it is missing now" if self.now is None else f"{self.now[:SHOWN]} now"
+        return f"{self.name} (SHA-256 {self.was[:SHOWN]} then, {now})"
+
+
+@dataclass(frozen=True)
+class Sources:
+    """The files and versions that a result was made of, as they were then.
+
+    - `files`: the files of the model, with their hashes.
+    - `versions`: by the name of the package.
+    - `without_file`: what of the model is in no file, such as cells of a notebook.
+    - `root`: the working directory, from which names of files go out.
+    - `first`: the row of a table from which on this is what it was made of.
+    - `commit`: the commit of git, at which the files were taken; empty for those of the working
+      directory.
+    """
+
+    files: tuple[Source, ...]
+    versions: Mapping[str, str]
+    without_file: tuple[str, ...] = ()
+    root: str = ""
+    first: int = 0
+    commit: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as plain data."""
+        return {
+            "first": self.first,
+            "root": self.root,
+            "commit": self.commit,
+            "files": [list(file) for file in self.files],
+            "without_file": list(self.without_file),
+            "versions": dict(self.versions),
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> "Sources":
+        """Read what `to_json` wrote.
+
+        **Raises:** `ValueError` for anything else.
+        """
+        try:
+            files = tuple(Source(*map(str, file)) for file in data["files"])
+            versions = {str(name): str(value) for name, value in data["versions"].items()}
+            without = tuple(map(str, data["without_file"]))
+            root, first, commit = str(data["root"]), int(data["first"]), str(data["commit"])
+            return cls(files, versions, without, root, first, commit)
+        except (KeyError, TypeError, AttributeError, ValueError) as error:
+            raise ValueError("the record of the files of a model has another form") from error
+
+    def settled(self, begun: float) -> "Sources":
+        """Return it at the end of the work that it is the record of.
+
+        Files of data that have been written since the work began are what came of it, such as the
+        state of a simulator, and no part of the model. Files that were read by then are, and
+        modules that were imported by then.
+
+        **Arguments:**
+        - `begun`: seconds since the epoch.
+        """
+        files = {file.name: file for file in self.files}
+        waiting = [file.name for file in self.files if file.role in (PROBLEM, IMPORTED)]
+        while waiting:
+            module = os.path.join(self.root, waiting.pop())
+            opened = ((modules_loaded_by(module), IMPORTED), (files_read_by(module), READ))
+            for path, role in ((path, role) for paths, role in opened for path in sorted(paths)):
+                if os.path.isfile(path) and (name := shown_path(path)) not in files:
+                    files[name] = Source(name, role, file_hash(Path(path)))
+                    waiting += [name] * (role == IMPORTED)
+        written = {
+            file.name
+            for file in files.values()
+            if file.role in (READ, NAMED) and not self._is_older(file.name, begun)
+        }
+        without = [f"{name} was written in the meantime, and is not recorded" for name in written]
+        return replace(
+            self,
+            files=tuple(file for name, file in files.items() if name not in written),
+            without_file=tuple(dict.fromkeys((*self.without_file, *sorted(without)))),
+        )
+
+    def _is_older(self, name: str, moment: float) -> bool:
+        try:
+            return os.stat(os.path.join(self.root, name)).st_mtime < moment
+        except OSError:
+            return False
+
+    @property
+    def code(self) -> str:
+        """One hash of the modules, functions and models.
+
+        Data that these read or name are not in it: they may be finished work that is written there.
+        """
+        roles = (PROBLEM, IMPORTED, FUNCTION, MODEL)
+        hashes = sorted(file.sha256 for file in self.files if file.role in roles)
+        return hashlib.sha256("\n".join(hashes).encode()).hexdigest()
+
+    def changes(self, now: "Sources | None" = None) -> tuple[Change, ...]:
+        """Return the files that are others by now.
+
+        **Arguments:**
+        - `now`: what the problem is made of now; what lies on the disk counts when left out, and
+          for files that the problem of now does not have.
+        """
+        if self.commit:
+            return ()  # It stays what it is.
+        found = []
+        present = {} if now is None else {file.name: file for file in now.files}
+        for file in self.files:
+            match = _same_name(file.name, present)
+            if match is None and file.role == CALLER:
+                continue  # Somebody else may call what makes the problem.
+            if match is None and file.role == FUNCTION and now is None:
+                continue  # It lies nowhere but in the problem.
+            sha256 = self._on_disk(file.name) if match is None else present[match].sha256
+            if sha256 != file.sha256:
+                found.append(Change(file.name, file.sha256, sha256))
+        own = {file.name: file for file in self.files}
+        for file in present.values():
+            if file.role == PROBLEM and _same_name(file.name, own) is None:
+                found.append(Change(file.name, None, file.sha256))
+        return tuple(found)
+
+    def other_versions(self, now: "Sources") -> tuple[str, ...]:
+        """Return the packages whose version has changed, as text."""
+        return tuple(
+            f"{name} {was} then, {now.versions[name]} now"
+            for name, was in self.versions.items()
+            if name in now.versions and now.versions[name] != was
+        )
+
+    def _on_disk(self, name: str) -> str | None:
+        paths = [Path(name), Path(self.root) / name]
+        return next((file_hash(path) for path in paths if path.is_file()), None)
+
+
+def _same_name(name: str, others: Mapping[str, Source]) -> str | None:
+    """Return the one of some names that stands for the same file, seen from another folder."""
+    if name in others:
+        return name
+    found = [other for other in others if name.endswith(f"/{other}") or other.endswith(f"/{name}")]
+    return found[0] if len(found) == 1 else None
+
+
+def list_changes(changes: Sequence[Change]) -> str:
+    """Write changes in one line."""
+    listed = ", ".join(map(str, changes[:MAX_SHOWN]))
+    more = len(changes) - MAX_SHOWN
+    return f"{listed} and {more} more" if more > 0 else listed
+
+
+"""Hashes of modules as they were first seen, by their specs, which a reload replaces."""
+
+
+def file_hash(file: Path) -> str:
+    """Return the SHA-256 of a file; read again only where its size or its time has changed."""
+    about = os.stat(file)
+    return _hash(os.path.abspath(file), about.st_mtime_ns, about.st_size, about.st_ino)
+
+
+@lru_cache(maxsize=4096)
+def _hash(file: str, changed: int, size: int, number: int) -> str:
+    with open(file, "rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python, of this package and of others that are imported."""
+    found = {"Python": platform.python_version()}
+    for name in PACKAGES:
+        version = getattr(sys.modules.get(name), "__version__", None)
+        if isinstance(version, str):
+            found[name] = version
+    return found
+
+
+def shown_path(file: str) -> str:
+    """Return the path of a file: relative to the working directory, or absolute if elsewhere."""
+    path = Path(file)
+    for root in (tree_of(file), Path.cwd(), Path.cwd().resolve()):
+        if root is not None and path.is_relative_to(root):
+            return path.relative_to(root).as_posix()
+    return path.as_posix()
+
+
+def add_tree(folder: Path, commit: str) -> None:
+    """Let names of files below a folder go out from there, and imports of them be found there."""
+    tree_commits[folder] = commit
+
+
+def remove_tree(folder: Path) -> None:
+    """End what `add_tree` began."""
+    del tree_commits[folder]
+
+
+def tree_of(file: str) -> Path | None:
+    return next((tree for tree in tree_commits if Path(file).is_relative_to(tree)), None)

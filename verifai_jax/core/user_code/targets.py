@@ -1,0 +1,205 @@
+"""Objects named by the Python file or module that defines them.
+
+    load_target("specs/cartpole.py:balance", Problem)
+    definitions("specs/cartpole.py", Problem, Study)     # {"balance": Problem(...), ...}
+
+Loading a target runs the Python file that it names, as a test runner does. `target_of_project`
+keeps a folder that came from elsewhere from choosing which file is run.
+"""
+
+import importlib
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Protocol, TypeVar
+
+from verifai_jax.core.messages.errors import MissingExtra, unknown_name
+from verifai_jax.core.user_code.user_errors import explain_user_error
+
+
+class Named(Protocol):
+    """An object that a target can name."""
+
+    @property
+    def name(self) -> str:
+        """Name of the object, after the colon of a target."""
+        ...
+
+
+Kind = TypeVar("Kind", bound=Named)
+
+
+class TargetError(ValueError):
+    """A target that cannot be loaded, or that is not a file of the user's own project."""
+
+
+class NothingDefined(TargetError):
+    """A file or module without an object of the kind that was looked for."""
+
+
+def definitions(location: str, *kinds: type[Kind]) -> dict[str, Kind]:
+    """Return the objects of some classes that a file or module defines.
+
+    **Arguments:**
+    - `location`: file (`specs/cartpole.py`) or module (`specs.cartpole`); it is run.
+    - `kinds`: classes to look for.
+    **Returns:** the objects in the order of their definition, by their names; by their variables,
+    where several have one name.
+    **Raises:** `TargetError` where there is no such file or module, or it cannot be run;
+    `NothingDefined` where it defines no such object.
+    """
+    return _by_name(_variables(location, *kinds))
+
+
+def values_in(location: str) -> tuple[object, ...]:
+    """Return all values that a file or module defines; it is run.
+
+    **Raises:** `TargetError` where there is no such file or module, or it cannot be run.
+    """
+    return tuple(vars(_import(location)).values())
+
+
+def _variables(location: str, *kinds: type[Kind]) -> dict[str, Kind]:
+    """Return the objects of some classes that a file or module defines, by their variables."""
+    variables = {
+        name: value for name, value in vars(_import(location)).items() if isinstance(value, kinds)
+    }
+    if not variables:
+        nouns = " and no ".join(kind.__name__ for kind in kinds)
+        raise NothingDefined(f"{location} defines no {nouns}")
+    return variables
+
+
+def _by_name(variables: dict[str, Kind]) -> dict[str, Kind]:
+    """Return the objects, once each, by their names or, where several have one, by variables."""
+    once = {id(value): variable for variable, value in reversed(variables.items())}
+    kept = {variable: value for variable, value in variables.items() if once[id(value)] == variable}
+    names = [value.name for value in kept.values()]
+    return {
+        value.name if names.count(value.name) == 1 else variable: value
+        for variable, value in kept.items()
+    }
+
+
+def load_target(target: str, kind: type[Kind]) -> Kind:
+    """Load the object that a target names.
+
+    **Arguments:**
+    - `target`: `FILE.py:NAME` or `MODULE:NAME`, with the name of the object or of its variable;
+      the name may be left out where the file defines one object of this kind.
+    - `kind`: class of the object.
+    **Raises:** `TargetError` where there is no such file or module, or no single object to take;
+    `UnknownNameError` for a name that the file does not define, with those that it does.
+    """
+    location, colon, name = target.rpartition(":")
+    if not colon:
+        location, name = target, ""
+    variables = _variables(location, kind)
+    objects = _by_name(variables)
+    noun = kind.__name__.lower()
+    if name in objects:
+        return objects[name]
+    if name in variables:
+        return variables[name]
+    if name:
+        raise unknown_name(f"{noun} in {location}", name, dict.fromkeys((*objects, *variables)))
+    if len(objects) == 1:
+        return next(iter(objects.values()))
+    plural = noun.removesuffix("y") + "ies" if noun.endswith("y") else f"{noun}s"
+    raise TargetError(
+        f"{location} has {len(objects)} {plural}; name one: "
+        + ", ".join(f"{location}:{known}" for known in objects)
+    )
+
+
+def target_of_project(target: object, folder: Path, *, kind: str, remedy: str) -> str:
+    """Return a recorded target if it names a file of the user's own project.
+
+    Loading a target runs its file, so a folder that came from elsewhere must not choose one: the
+    target is the path of a Python file that exists, below the current folder, and outside of
+    whatever holds results: the folder that names it, those next to and above it, any that is called
+    `runs` or `sweeps`, and any with the files of a run or a sweep.
+
+    **Arguments:**
+    - `target`: the target that the folder records, of any type.
+    - `folder`: folder that records it.
+    - `kind`: noun of the object, such as `"problem"`, for the message.
+    - `remedy`: words on how to name the target by hand, for the message.
+    **Raises:** `TargetError` for any other target.
+    """
+    if isinstance(target, str):
+        location, colon, _ = target.rpartition(":")
+        if _is_of_project(location if colon else target, folder.resolve()):
+            return target
+    raise TargetError(
+        f"{folder} does not say which {kind} of this project it is of; give it: {remedy}"
+    )
+
+
+RESULTS = ("runs", "sweeps")
+"""Names of the folders in which the command line keeps results."""
+_OF_RESULTS = ("run.json", "sweep.json", "sweep.cache")
+
+
+def _is_of_project(location: str, folder: Path) -> bool:
+    """Return whether a place is a Python file of the project, and of no folder of results."""
+    here = Path.cwd().resolve()
+    # Anything else than an existing file would be imported as a module, from wherever it lies.
+    if not location.endswith(".py") or "\0" in location or not Path(location).is_file():
+        return False
+    file = Path(location).resolve()
+    if not file.is_relative_to(here) or file.is_relative_to(folder):
+        return False
+    folders = file.relative_to(here).parts[:-1]
+    if any(name in RESULTS for name in folders):
+        return False
+    # Files of the same archive lie next to the folder.
+    inside = folder.relative_to(here).parts[:1] if folder.is_relative_to(here) else ()
+    if inside and inside == folders[:1]:
+        return False
+    inner = file.parents[: len(folders)]
+    return not any((each / name).exists() for each in inner for name in _OF_RESULTS)
+
+
+def _import(location: str) -> ModuleType:
+    # The file's own imports (`from envs import cartpole`) start where the user stands.
+    if sys.path[0] != str(Path.cwd()):
+        sys.path.insert(0, str(Path.cwd()))
+    path = Path(location)
+    if not (location.endswith(".py") or path.exists()):
+        try:
+            return importlib.import_module(location)
+        except ModuleNotFoundError as error:
+            if error.name is not None and location.startswith(error.name):
+                raise TargetError(
+                    f"no file and no module {location!r}; give FILE.py:NAME, "
+                    "such as specs/cartpole.py:balance"
+                ) from error
+            raise
+    if path.is_dir():
+        raise TargetError(f"{location} is a folder; give a file in it: {_python_files(path)}")
+    if not path.exists():
+        raise TargetError(f"no file {location}; {path.parent}/ has {_python_files(path.parent)}")
+    name = f"_target_{path.resolve().stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise TargetError(f"{location} is not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except MissingExtra:
+        raise
+    except SyntaxError as error:
+        raise TargetError(f"{location} is not Python: {error}") from error
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        raise TargetError(f"{location} cannot be run: {explain_user_error(error)}") from error
+    return module
+
+
+def _python_files(folder: Path) -> str:
+    files = sorted(p.name for p in folder.glob("*.py") if p.name != "__init__.py")
+    return ", ".join(files) or "no Python file"

@@ -1,0 +1,124 @@
+"""Masked and missing samples as gaps: NaN, which gets no verdict.
+
+with_gaps("x", np.ma.masked_array([0.0, 9e9], mask=[False, True]))      # [0, nan]
+"""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from verifai_jax.core.messages.checks import is_number
+
+
+def with_gaps(name: str, signal: Any) -> Any:
+    """Return a signal whose masked and missing samples are NaN; any other one as it is.
+
+    NumPy's own conversions show what lies under a mask. A list becomes an array.
+
+    **Raises:** `TypeError` for what holds no real numbers, such as texts and dates; `ValueError`
+    for rows of several lengths.
+    """
+    plain = isinstance(signal, jax.Array | jax.ShapeDtypeStruct) or type(signal) is np.ndarray
+    if plain and getattr(signal.dtype, "kind", "") != "O":
+        return signal if isinstance(signal, jax.Array) else _real(name, signal)
+    if isinstance(signal, list | tuple):
+        signal = _listed(name, signal)
+    if isinstance(signal, np.ma.MaskedArray):
+        if not np.ma.getmaskarray(signal).any():
+            return np.asarray(signal.data)
+        numbers = np.asarray(signal.data)
+        numbers = np.where(numbers, 1.0, -1.0) if numbers.dtype == bool else numbers.astype(float)
+        return np.where(np.ma.getmaskarray(signal), np.nan, numbers)
+    if getattr(signal, "dtype", None) is None:
+        return signal
+    if np.asarray(signal).dtype != object:
+        return _real(name, signal)
+    return _numbers_of_objects(name, np.asarray(signal))
+
+
+def _listed(name: str, rows: list[Any] | tuple[Any, ...]) -> Any:
+    """Return a list of samples as an array; one of values that JAX traces as it is."""
+    if any(_is_masked(row) for row in rows):
+        return np.ma.array(rows)
+    if any(isinstance(row, Tracer) for row in jax.tree.leaves(rows)):
+        return rows
+    try:
+        return np.asarray(rows)
+    except ValueError as error:
+        raise ValueError(
+            f"signal {name!r} must be an array [time] or [time, k]; its rows have several lengths"
+        ) from error
+
+
+def _real(name: str, signal: Any) -> Any:
+    """Return a signal of real numbers or truth values.
+
+    **Raises:** `TypeError` for any other.
+    """
+    dtype = signal.dtype
+    kind = getattr(dtype, "kind", "f")
+    # Types of half precision that NumPy does not know, such as bfloat16, are without a kind.
+    if kind not in "biuf" and not (kind == "V" and "float" in getattr(dtype, "name", "")):
+        hint = ": give seconds or other numbers in place of dates" if kind in "mM" else ""
+        raise TypeError(f"signal {name!r} must hold real numbers; got {dtype}{hint}")
+    # NumPy's long doubles are no numbers for JAX.
+    return signal.astype(np.float64) if dtype == np.longdouble else signal
+
+
+def _is_masked(value: object) -> bool:
+    return isinstance(value, np.ma.MaskedArray) and bool(np.ma.getmaskarray(value).any())
+
+
+def _numbers_of_objects(name: str, values: np.ndarray) -> np.ndarray:
+    """Return objects as numbers, a missing one as NaN."""
+    numbers = np.full(values.shape, np.nan)
+    for index, value in np.ndenumerate(values):
+        if _is_missing(value):
+            continue
+        if isinstance(value, bool | np.bool_):
+            numbers[index] = 1.0 if value else -1.0
+        elif isinstance(value, int | float | np.number):
+            numbers[index] = value
+        else:
+            raise TypeError(
+                f"signal {name!r} must hold real numbers; sample {index[0]} is {value!r}"
+            )
+    return numbers
+
+
+def known_times(times: Any) -> Any:
+    """Return sample times as numbers, none of which is masked or missing.
+
+    Integers of 8 and 16 bits become floats, since their differences would wrap.
+
+    **Raises:** `ValueError` that names the first one that is masked or missing; `TypeError` for
+    anything but an array of numbers.
+    """
+    if isinstance(times, jax.Array | jax.ShapeDtypeStruct):
+        return times
+    if not isinstance(times, np.ma.MaskedArray):
+        times = np.asarray(times)
+    masked = np.ma.getmaskarray(times)
+    if times.dtype == object:
+        masked = masked | np.array([_is_missing(value) for value in np.ravel(times)])
+    if masked.any():
+        raise ValueError(
+            f"sample times must be known; that of sample {int(np.argmax(masked))} is masked or "
+            "missing: leave out the samples without a time"
+        )
+    known = np.asarray(times.data if isinstance(times, np.ma.MaskedArray) else times)
+    if known.dtype == object:
+        known = known.astype(float) if all(map(is_number, np.ravel(known))) else known
+    if known.dtype.kind not in "iuf":
+        hint = ""
+        if known.dtype.kind == "M":
+            hint = ": give seconds since the first, (times - times[0]) / np.timedelta64(1, 's')"
+        raise TypeError(f"sample times must be numbers of seconds; got {known.dtype}{hint}")
+    return known.astype(float) if known.dtype.itemsize < 4 and known.dtype.kind != "f" else known
+
+
+def _is_missing(value: object) -> bool:
+    # pandas.NA by its name: pandas need not be imported for it.
+    return value is None or value is np.ma.masked or type(value).__name__ == "NAType"
