@@ -1,4 +1,4 @@
-"""Descriptions of faults: a channel, when one begins and ends, and numbers for how bad it is.
+"""Descriptions of faults: the channel, the time, and numbers that say how severe they are.
 
 Each number is fixed, or a domain, which makes it a feature of the problem.
 """
@@ -27,15 +27,16 @@ def number(low: float = -math.inf, high: float = math.inf, default: Any = MISSIN
 
 
 class Moment(NamedTuple):
-    """The things that a fault knows at an instant.
+    """The instant at which a fault acts, and its numbers there.
 
     - `xp`: `jax.numpy`, or `numpy` on the host.
-    - `number`: its numbers by name.
-    - `live`: whether the instant lies in its time; `since`: seconds since its onset, from 0 on.
+    - `number`: the numbers of the fault by name.
+    - `live`: whether the onset has passed and the end has not; `since`: seconds since the onset, at
+      least 0.
     - `time`, `period`: of the instant, and between two instants, in seconds.
     - `first`: whether nothing passed before; `acts`: whether the channel is part of an action.
-    - `other`: the numbers of the channel that it reads instead, if it does.
-    - `uniform`: makes so many random numbers of this instant between 0 and 1.
+    - `other`: the values of the channel `source` of `WrongChannel`.
+    - `uniform(count)`: random numbers of this instant, between 0 and 1.
     """
 
     xp: Any

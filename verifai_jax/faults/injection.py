@@ -238,8 +238,7 @@ class OnHost:
             channels = Channels(links, period, features, np)
             self._loops[side] = channels, channels.begin(None, None, seed)
         channels, states = self._loops[side]
-        pass_on = channels.observation if side == "observation" else channels.action
-        value, states = pass_on(states, value, time)
+        value, states = getattr(channels, side)(states, value, time)
         self._loops[side] = channels, states
         return value
 

@@ -54,7 +54,7 @@ class HeldAction(Fault, severity="hold", holds=True):
 class Delay(Fault, severity="seconds", late=("seconds", "swing")):
     """The channel is `seconds` late, in whole periods.
 
-    It swings by `swing` seconds up and down once in `cycle` seconds.
+    The delay swings up and down by `swing` seconds, once in `cycle` seconds.
     """
 
     seconds: Number = number(0)
@@ -86,7 +86,7 @@ class PacketLoss(Fault, severity="loss", draws=True, holds=True):
         held = at.xp.where(lost, memory, good)
         if at.xp is np or good.dtype.kind != "f":
             return held, held
-        # On average: the derivative of the probability with which the older value is used.
+        # The derivative of the mean: the older value is used with probability `loss`.
         expected = held + (memory - good) * at.number["loss"]
         constant = (memory - good) * jax.lax.stop_gradient(at.number["loss"])
         return straight(held, expected - constant), held
@@ -144,7 +144,7 @@ class Quantisation(Fault, severity="step", choices=False):
         rounded = at.xp.round(exact) * step
         if at.xp is np:
             return rounded, memory
-        # Rounding has no slope: the value is followed, and the remainder grows with the step.
+        # Rounding has no slope: it is 1 by the value, and the remainder's by the step.
         left = jax.lax.stop_gradient(at.xp.round(exact) - exact)
         return straight(rounded, good + left * step), memory
 
@@ -189,7 +189,7 @@ def _late(good: Vector, line: Any, seconds: Any, at: Moment) -> tuple[Vector, An
     """Return the value of some seconds ago, in whole periods, and the line with the newest."""
     xp, line = at.xp, moved_up(line, good, at.xp)
     if not at.acts:
-        # Before the first observation there was none other; before the first action, no action.
+        # The line begins with the first observation; before the first action there is none.
         line = jax.tree.map(lambda values: xp.where(at.first, good, values), line)
     latest = len(line) - 1
     periods = xp.clip(seconds / at.period, 0, latest)

@@ -112,12 +112,13 @@ def fmea(
             first, last = last, last + len(points)
             known_rates = [] if rates is None else [rates[name] for name in effect.faults]
             chance = math.prod(-math.expm1(-one * (mission_time or 0.0)) for one in known_rates)
-            numbers = (chance * rows.probability(effect, confidence, budget)).tolist()
-            within = dict(zip(("low", "high", "probability"), numbers, strict=True))
+            given = rows.probability(effect, confidence, budget)
+            low, high, probability = (chance * given).tolist()
             if run is not None:
                 own = {row: verdicts[row] for row in range(first, last) if row in verdicts}
                 effect = with_counterexample(effect, run, own, known)
-            effects.append(replace(effect, occurrence=chance, **within))
+            bounds = {"probability": probability, "low": low, "high": high}
+            effects.append(replace(effect, occurrence=chance, **bounds))
     effects.sort(key=lambda effect: (-effect.fails, -effect.probability, effect.faults))
     return FailureTable(
         faulty.name, tuple(effects), run, rates, mission_time, confidence, bool(healthy),

@@ -20,7 +20,7 @@ class Effect:
     """The effect of a fault, or of a pair of faults.
 
     - `faults`: their names.
-    - `fails`: whether any simulation with it, and without another fault, breaks the property.
+    - `fails`: whether any simulation with these faults alone breaks the property.
     - `failures`, `simulations`: the samples of the fault's prior that `probability` rests on.
     - `undecided`: those among them without a verdict.
     - `severity`: the lowest at which it fails, by the name of the number; empty if it never does.
@@ -29,7 +29,7 @@ class Effect:
     - `broken`: the name of the formula.
     - `delay`: seconds from the onset to the violation.
     - `shown_by`: the signal that differs first from the same simulation without the fault;
-      `shown_after` seconds from the onset.
+      `shown_after`: seconds from the onset until it does.
     - `occurrence`: probability that it happens in a mission.
     - `probability`, `low`, `high`: of a mission that fails by it, with the interval.
     - `command`: what simulates the counterexample again.

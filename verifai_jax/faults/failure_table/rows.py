@@ -1,7 +1,8 @@
-"""Simulations for a failure table: samples of faults, searches, and the least that still fails."""
+"""Simulations for a failure table: samples of faults, searches, and the weakest failures."""
 
 import zlib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,35 +22,33 @@ from verifai_jax.statistics.binomial import clopper_pearson
 if TYPE_CHECKING:
     from verifai_jax.core.compute.executors import Executor
 LEVELS = 33
-"""Severities of one line at once; two lines, one within the other, tell a thousandth apart."""
+"""Severities on one line at once; two lines, one within the other, resolve a thousandth."""
 FOLLOWED = 6
 """Failing samples of a fault whose severity is lowered."""
 FEW = 10
 """Failing samples below which a search looks for others, and importance sampling or splitting
 estimates the probability."""
 TRIED = 32
-"""Failing samples that are simulated again beside the lowered ones: at the edge of failure another
+"""Failing samples that are simulated again with the lowered ones: at the edge of failure another
 step, or another random key, may decide otherwise."""
 Points = Float[np.ndarray, "n d"]
 
 
+@dataclass(eq=False)
 class Rows:
     """Simulations of one problem with all faults; what was simulated before is remembered."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        faults: Mapping[str, Fault],
-        cache: Cache,
-        seed: int,
-        executor: "Executor | None",
-    ) -> None:
-        self.problem, self.faults, self.cache = problem, faults, cache
-        self.rng, self.seed, self.executor = np.random.default_rng(seed), seed, executor
-        self.nominal = Nominal.of(problem)
+    problem: Problem
+    faults: Mapping[str, Fault]
+    cache: Cache
+    seed: int
+    executor: "Executor | None"
+
+    def __post_init__(self) -> None:
+        self.rng, self.nominal = np.random.default_rng(self.seed), Nominal.of(self.problem)
         self.groups: dict[str, Int[np.ndarray, " k"]] = dict(self.nominal.groups)
-        self.draws = depends_on_key(problem)
-        self._evaluate = Evaluator(problem, 512, seed=seed, executor=executor)
+        self.draws = depends_on_key(self.problem)
+        self._evaluate = Evaluator(self.problem, 512, seed=self.seed, executor=self.executor)
         self._count = 0
 
     def coordinate(self, fault: str, number: str) -> int:
@@ -79,12 +78,12 @@ class Rows:
         violated, proper = self(f"samples/{'+'.join(names)}", points)
         failing = points[violated]
         if len(failing) < FEW and budget:
-            # A few failures by chance may all be refuted: the worst of a search are less so.
+            # A few failures by chance may all be refuted; the worst of a search seldom are.
             failing = np.concatenate([failing, self._searched(names, budget)])
         if len(failing):
             failing = self._lowered(names, failing)
-        fails, failures = len(failing) > 0, int(violated.sum())
-        return Effect(names, fails, failures, samples, int((~proper).sum())), failing
+        failures, undecided = int(violated.sum()), int((~proper).sum())
+        return Effect(names, len(failing) > 0, failures, samples, undecided), failing
 
     def probability(self, effect: Effect, confidence: float, budget: int) -> Float[np.ndarray, "3"]:
         """Return the interval and the probability of a failure, given that the faults happen."""
