@@ -1,4 +1,4 @@
-"""A fault in the loop of a system: the link that observations or actions pass through."""
+"""Faults in the loop of a system: links through which observations or actions pass."""
 
 import operator
 import zlib
@@ -55,11 +55,6 @@ class Injected(Link):
     def check(self, features: PyTree) -> None:
         check_names("feature", self.features, features)
 
-    def numbers(self, features: PyTree) -> dict[str, Any]:
-        """Return the numbers of the fault in one simulation."""
-        drawn = features[self.fault.name] if self.fault.domains else {}
-        return {name: drawn.get(name, value) for name, value in self.fault.numbers.items()}
-
     def valid(self, features: PyTree) -> Any:
         numbers = [(name, features[self.fault.name][name]) for name in self.fault.domains]
         return reduce(operator.and_, starmap(_can_be, numbers), True)
@@ -79,15 +74,16 @@ class Injected(Link):
         good = np.zeros(self.entries.count) if host else self.entries.take(value, jnp)
         memory = self.fault.memory(now.xp.zeros_like(good), now.period)
         if not self.draws:
-            return memory
+            return None, memory
         if host:
             return np.array([int(key or 0), number], np.uint32), memory
         key = jax.random.key(0) if key is None else key
         return jax.random.key_data(jax.random.fold_in(key, number))[-2:], memory
 
     def through(self, state: PyTree, value: PyTree, now: Instant) -> tuple[PyTree, PyTree]:
-        xp, number, possible = now.xp, self.numbers(now.features), self._happens(now.features)
-        seed, memory = state if self.draws else (None, state)
+        xp, (seed, memory), possible = now.xp, state, self._happens(now.features)
+        drawn = now.features[self.fault.name] if self.fault.domains else {}
+        number = {**self.fault.numbers, **drawn}
         other = None if self.other is None else self.other.take(value, xp)
         leaves, form = jax.tree.flatten(value)
         parts = [xp.asarray(leaves[i]) for i, _ in self.entries.parts]
@@ -99,7 +95,7 @@ class Injected(Link):
         parts, memory = change(passing, given)
         for (i, _), part in zip(self.entries.parts, parts, strict=True):
             leaves[i] = part
-        return jax.tree.unflatten(form, leaves), memory if seed is None else (seed, memory)
+        return jax.tree.unflatten(form, leaves), (seed, memory)
 
     def _severe(self, number: Mapping[str, Any]) -> Any:
         """Return whether it acts at any time."""

@@ -5,7 +5,6 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import replace
 
-import jax
 import numpy as np
 
 from verifai_jax.core.compute.keys import run_keys
@@ -35,16 +34,15 @@ def with_counterexample(
     row = min(verdicts, key=lambda row: verdicts[row] != "confirmed", default=None)
     if row is None or run.problem is None:
         return effect
-    again, space = run.replay(row), run.problem.space
+    again, own = run.replay(row), {name: faults[name] for name in effect.faults}
     columns = again.columns()
-    fixed = {f"{n}.onset": faults[n].numbers["onset"] for n in effect.faults}
+    fixed = {f"{name}.onset": fault.numbers["onset"] for name, fault in own.items()}
     onset = min(float({**fixed, **columns}[name]) for name in fixed)
-    healthy = {**again.features, **{n: space.domains[n].nominal for n in effect.faults}}
-    batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], space.coerce(healthy))
-    one = {name: np.asarray(column)[0] for name, column in space.rows(batch).items()}
-    without = simulate_again(run.problem, one, run_keys(run.seed)[1], row, run.precision)
+    off = {f"{name}.{n}": fault.weakest(n) for name, fault in own.items() for n in fault.domains}
+    key = run_keys(run.seed)[1]
+    without = simulate_again(run.problem, {**columns, **off}, key, row, run.precision)
     shown_by, shown = _first_difference(again.trace, without.trace)
-    grades = [f"{name}.{faults[name].grade}" for name in effect.faults]
+    grades = [f"{name}.{fault.grade}" for name, fault in own.items()]
     return replace(
         effect, row=row, severity={number: float(columns[number]) for number in grades},
         verdict=verdicts[row], broken=again.worst,

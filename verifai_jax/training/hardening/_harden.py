@@ -349,24 +349,17 @@ class Work:
             tie=plan.p, progress=False, remember=self.cache.remember,
         )  # fmt: skip
         end_if_interrupted(final.stopped)
+        returns = {arm: self.returns[arm, at] for arm, at in chosen.items()}
         return Hardening(
-            problem=self.untrained.name,
-            table=pd.DataFrame(self.rows),
+            problem=self.untrained.name, table=pd.DataFrame(self.rows),
             added=pd.concat(self.added, ignore_index=True) if self.added else pd.DataFrame(),
-            start=start,
-            policy=finalists[1],
-            policies=self.policies,
-            chosen=chosen,
-            certificates=final,
-            comparison=comparison,
-            returns={"start": self.returns[HARDENED, 0]}
-            | {arm: self.returns[arm, at] for arm, at in chosen.items()},
-            stopped=stopped,
-            seconds=time.perf_counter() - began,
+            start=start, policy=finalists[1], policies=self.policies, chosen=chosen,
+            certificates=final, comparison=comparison,
+            returns={"start": self.returns[HARDENED, 0], **returns},
+            stopped=stopped, seconds=time.perf_counter() - began,
             options={**vars(plan), "attack": stable_text(plan.attack)},
-            notes=tuple(notes),
-            version=__version__,
-        )
+            notes=tuple(notes), version=__version__,
+        )  # fmt: skip
 
 
 def _as_study(
