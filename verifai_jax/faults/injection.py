@@ -11,10 +11,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Key, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
+from verifai_jax.core.compute.keys import mixed_bits
 from verifai_jax.core.messages.errors import check_names
-from verifai_jax.faults.chance import uniform
 from verifai_jax.faults.fault import AtMost, Fault, FaultFeatures, Moment
 from verifai_jax.faults.kinds import WrongChannel
 from verifai_jax.faults.smoothing import blend
@@ -120,7 +120,7 @@ class Injected(Link):
         on = live & self._severe(number)
         at = Moment(
             xp, number, live, xp.maximum(since, 0.0), time, now.period, now.step == 0,
-            self.side == "action", other, lambda count: uniform(seed, now.step, count, xp),
+            self.side == "action", other, lambda count: _uniform(seed, now.step, count, xp),
         )  # fmt: skip
         bad, after = self.fault.corrupt(good, memory, at)
         if xp is not np:
@@ -144,6 +144,19 @@ def _can_be(name: str, number: Any) -> Any:
     """Return whether a number of a fault is finite, and a duration not negative."""
     finite = abs(number) < np.inf
     return finite & (number >= 0) if name == "duration" else finite
+
+
+def _uniform(seed: Any, step: Any, count: int, xp: Any) -> Float[Any, " count"]:
+    """Return numbers between 0 and 1, the same for the same seed (two words) and step.
+
+    JAX's generator would cost more than a step of a small plant, even for a fault that is off. Two
+    rounds of a hash over 32 bits suffice for noise, and NumPy gives the same numbers.
+    """
+    entry = xp.arange(count, dtype=np.uint32) * xp.uint32(0x9E3779B9)
+    word = mixed_bits(entry + xp.asarray(step).astype(np.uint32) ^ seed[0])
+    word = mixed_bits(word + seed[1])
+    # Of 24 bits, which float32 holds; never 0 nor 1.
+    return ((word >> 8).astype(np.float32) + xp.float32(0.5)) * xp.float32(2**-24)
 
 
 def inject(fault: Fault, passing: Passing, choice: tuple[str, int] | None = None) -> Injected:

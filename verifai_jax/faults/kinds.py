@@ -6,9 +6,9 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.lax import erf_inv
 from jaxtyping import PyTree
 
-from verifai_jax.faults.chance import normal
 from verifai_jax.faults.fault import Fault, Moment, Number, Vector, number
 from verifai_jax.faults.smoothing import straight
 from verifai_jax.systems.delays import entry, moved_up
@@ -116,8 +116,8 @@ class Noise(Fault, severity="std", choices=False, draws=True):
     std: Number = number(0)
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
-        noise = normal(at.uniform(len(good)), at.xp)
-        return good + at.number["std"] * noise, memory
+        normal = at.xp.asarray(erf_inv(2 * at.uniform(len(good)) - 1)) * np.float32(2**0.5)
+        return good + at.number["std"] * normal, memory
 
 
 class Spikes(Fault, severity="height", choices=False, draws=True):
